@@ -1,0 +1,55 @@
+"""What every table of the lake is. Nothing but polars and pandera is imported here."""
+
+from schemas.columns import StructureError, Table, column
+from schemas.findings import FINDINGS
+from schemas.ingestion import INGEST_LOG, REJECTS
+from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
+from schemas.samples import NEIGHBORS, SAMPLE_DROPS, SAMPLES
+from schemas.splits import SPLIT_BALANCE, SPLITS
+from schemas.subsets import SUBSET_STATUS, SUBSETS
+from schemas.tracks import TRACKS
+from schemas.vehicles import VEHICLE_STARTS, VEHICLES
+
+SCHEMA_VERSION = 1
+"""Counts changes of the tables below that an older lake cannot be read with."""
+
+TABLES: tuple[Table, ...] = (
+    TRACKS,
+    VEHICLES,
+    VEHICLE_STARTS,
+    SUBSETS,
+    SUBSET_STATUS,
+    INGEST_LOG,
+    REJECTS,
+    FINDINGS,
+    START_CUTOFFS,
+    MISSING_STARTS,
+    SAMPLES,
+    SAMPLE_DROPS,
+    NEIGHBORS,
+    SPLITS,
+    SPLIT_BALANCE,
+)
+
+__all__ = [
+    "FINDINGS",
+    "INGEST_LOG",
+    "MISSING_STARTS",
+    "NEIGHBORS",
+    "REJECTS",
+    "SAMPLES",
+    "SAMPLE_DROPS",
+    "SCHEMA_VERSION",
+    "SPLITS",
+    "SPLIT_BALANCE",
+    "START_CUTOFFS",
+    "SUBSETS",
+    "SUBSET_STATUS",
+    "TABLES",
+    "TRACKS",
+    "VEHICLES",
+    "VEHICLE_STARTS",
+    "StructureError",
+    "Table",
+    "column",
+]

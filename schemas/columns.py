@@ -1,0 +1,183 @@
+"""Units, dtypes and what a table is.
+
+A table is declared once, as data: its columns, dtypes, meanings, units, key and structural rules. The writer, the
+catalog, the validation and the documentation all read that one declaration.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import pandera.polars as pa
+import polars as pl
+from pandera.errors import SchemaErrors
+
+FOOT_M = 0.3048
+"""Metres in one international foot, exactly."""
+
+Dataset = Literal["ngsim", "highd"]
+DATASETS: tuple[Dataset, ...] = get_args(Dataset)
+VEHICLE_CLASSES = ("car", "truck", "motorcycle")
+SEVERITIES = ("error", "warning", "info")
+PARTS = ("train", "val", "eval")
+LATERAL_MANEUVERS = ("keep", "left", "right")
+LONGITUDINAL_MANEUVERS = ("normal", "brake")
+
+DType = type[pl.DataType] | pl.DataType
+
+
+def column(
+    dtype: DType,
+    description: str,
+    *,
+    unit: str | None = None,
+    nullable: bool = False,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+    isin: tuple[str, ...] | None = None,
+) -> pa.Column:
+    """Declare one column.
+
+    Args:
+        dtype: Polars dtype, exact.
+        description: what a value means: origin, sign, and null where it needs saying.
+        unit: SI symbol, or None for a pure number, a name or a flag.
+        nullable: whether null is a legal value; NaN never is.
+        ge: least value; a value outside these bounds is a wrong unit or a wrong column, not a bad measurement.
+        gt: bound that a value exceeds.
+        le: greatest value.
+        lt: bound that a value stays under.
+        isin: the only values.
+    """
+    bounds: list[pa.Check] = []
+    if ge is not None:
+        bounds.append(pa.Check.ge(ge))
+    if gt is not None:
+        bounds.append(pa.Check.gt(gt))
+    if le is not None:
+        bounds.append(pa.Check.le(le))
+    if lt is not None:
+        bounds.append(pa.Check.lt(lt))
+    if isin is not None:
+        bounds.append(pa.Check.isin(list(isin)))
+    return pa.Column(
+        dtype,
+        checks=bounds,
+        nullable=nullable,
+        description=description,
+        metadata={"unit": unit},
+    )
+
+
+DATASET = column(pl.String, "ngsim or highd", isin=DATASETS)
+SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording")
+PROTOCOL = column(pl.String, "named, hashed recipe of sampling, split and metrics")
+
+
+def key_increases(key: tuple[str, ...]) -> pl.Expr:
+    """True where a row's key is lexicographically greater than that of the row before (and in the first row).
+
+    One such check over a whole table proves that it is sorted, that its key is unique and that frames increase
+    within a vehicle, for the price of one comparison per key column.
+    """
+    increases = pl.lit(value=False)
+    for name in reversed(key):
+        now, before = pl.col(name), pl.col(name).shift(1)
+        increases = (now > before) | (now.eq_missing(before) & increases)
+    return increases | (pl.int_range(pl.len()) == 0)
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of the lake, declared.
+
+    Args:
+        name: what SQL calls it.
+        meaning: what one row is.
+        key: unique, and the order in which every file is sorted.
+        columns: in order.
+        partition: the hive folders; these columns stand in a file's path and not in the file.
+    """
+
+    name: str
+    meaning: str
+    key: tuple[str, ...]
+    columns: Mapping[str, pa.Column]
+    partition: tuple[str, ...] = ("dataset", "subset")
+
+    @cached_property
+    def dtypes(self) -> dict[str, pl.DataType]:
+        """Column names and Polars dtypes, in order."""
+        return {name: declared.dtype.type for name, declared in self.schema.columns.items()}
+
+    @cached_property
+    def schema(self) -> pa.DataFrameSchema:
+        """The table as a pandera schema: exactly these columns, no silent casts, the key sorted and unique."""
+        return pa.DataFrameSchema(
+            columns=dict(self.columns),
+            checks=[
+                pa.Check(
+                    lambda data: data.lazyframe.select(key_increases(self.key)),
+                    name="key_is_unique_and_sorted",
+                    error=f"({', '.join(self.key)}) strictly increases from row to row",
+                )
+            ],
+            strict=True,
+            coerce=False,
+            name=self.name,
+            description=self.meaning,
+        )
+
+    def empty(self) -> pl.DataFrame:
+        """A frame of no rows."""
+        return pl.DataFrame(schema=self.dtypes)
+
+    def conform(self, frame: pl.LazyFrame) -> pl.LazyFrame:
+        """Select the table's columns in order and cast them; a missing column is an error, a lossy cast as well."""
+        return frame.select(pl.col(name).cast(dtype) for name, dtype in self.dtypes.items())
+
+    def validate(self, frame: pl.DataFrame, *, where: str) -> pl.DataFrame:
+        """Check a frame against every structural rule and return it.
+
+        Args:
+            frame: all columns of the table.
+            where: the recording or file it came from, for the message.
+
+        Raises:
+            StructureError: naming the table, the place, each broken rule, how many rows break it and one of them.
+        """
+        try:
+            return self.schema.validate(frame, lazy=True)
+        except SchemaErrors as broken:
+            raise StructureError(self, where, broken) from None
+
+    def describe(self) -> list[dict[str, str]]:
+        """Rows of documentation: column, dtype, unit, null, meaning."""
+        return [
+            {
+                "column": name,
+                "dtype": str(self.dtypes[name]),
+                "unit": (declared.metadata or {}).get("unit") or "",
+                "null": "yes" if declared.nullable else "",
+                "meaning": declared.description or "",
+            }
+            for name, declared in self.columns.items()
+        ]
+
+
+class StructureError(ValueError):
+    """A frame breaks the structural rules of its table; the recording it came from cannot enter the lake."""
+
+    def __init__(self, table: Table, where: str, broken: SchemaErrors) -> None:
+        """Put pandera's failure cases (never printed whole: one row per bad value) into a few lines."""
+        cases: Any = broken.failure_cases
+        lines = [
+            f"  {column_name or 'table'}: {check}: {rows} row(s), for example {example}"
+            for column_name, check, rows, example in cases.group_by("column", "check", maintain_order=True)
+            .agg(pl.len().alias("rows"), pl.col("failure_case").first().alias("example"))
+            .iter_rows()
+        ]
+        super().__init__(f"{where}: the table `{table.name}` breaks its schema\n" + "\n".join(lines))

@@ -1,0 +1,111 @@
+"""`tracks`: one row per entry, in the canonical frame."""
+
+import polars as pl
+
+from schemas.columns import DATASET, SUBSET, Table, column
+
+# Bounds: what physics and the camera systems' fields of view forbid.
+
+TRACKS = Table(
+    "tracks",
+    "One row per (vehicle, frame) at the source's own frame rate, in SI units: x_m runs in the direction of travel, y_m "
+    "the driver's right; both are those of the vehicle's FRONT CENTRE.",
+    key=("vehicle_id", "frame"),
+    columns={
+        "dataset": DATASET,
+        "subset": SUBSET,
+        "vehicle_id": column(
+            pl.Int32,
+            "unique within the subset; the source's own id unless that was reused",
+            ge=0,
+        ),
+        "frame": column(pl.Int32, "the source's frame number", ge=0),
+        "time_s": column(pl.Float64, "since the recording's first frame", unit="s", ge=0),
+        "x_m": column(
+            pl.Float64,
+            "front centre along the direction of travel",
+            unit="m",
+            ge=-2_000,
+            le=20_000,
+        ),
+        "y_m": column(
+            pl.Float64,
+            "front centre from the carriageway's left edge, positive to the driver's right",
+            unit="m",
+            ge=-500,
+            le=500,
+        ),
+        "lane": column(
+            pl.Int16,
+            "1 is the driver's leftmost; null where the source has none",
+            nullable=True,
+        ),
+        "speed_mps": column(
+            pl.Float32,
+            "recorded, signed along the direction of travel: negative is backwards",
+            unit="m/s",
+            ge=-40,
+            le=100,
+        ),
+        "accel_mps2": column(
+            pl.Float32,
+            "recorded, signed along the direction of travel: negative is braking; null where the source has none",
+            unit="m/s2",
+            nullable=True,
+            ge=-200,
+            le=200,
+        ),
+        "speed_cd_mps": column(
+            pl.Float32,
+            "central difference of x_m over the neighbouring frames; null at track ends and beside frame gaps",
+            unit="m/s",
+            nullable=True,
+        ),
+        "accel_cd_mps2": column(
+            pl.Float32,
+            "central difference of speed_cd_mps; null at track ends and beside frame gaps",
+            unit="m/s2",
+            nullable=True,
+        ),
+        "lateral_speed_mps": column(
+            pl.Float32,
+            "positive to the driver's right; recorded where the source has it, else central difference of y_m",
+            unit="m/s",
+            nullable=True,
+        ),
+        "speed_10hz_mps": column(
+            pl.Float32,
+            "central difference of x_m 0.1 s before and after (linear between frames); null where those are missing",
+            unit="m/s",
+            nullable=True,
+        ),
+        "accel_10hz_mps2": column(
+            pl.Float32,
+            "central difference of speed_10hz_mps 0.1 s before and after; null where those are missing",
+            unit="m/s2",
+            nullable=True,
+        ),
+        "leader_id": column(
+            pl.Int32,
+            "vehicle ahead in the lane, as recorded; null = none",
+            nullable=True,
+        ),
+        "follower_id": column(
+            pl.Int32,
+            "vehicle behind in the lane, as recorded; null = none",
+            nullable=True,
+        ),
+        "gap_m": column(
+            pl.Float64,
+            "leader's front - leader's length - own front, rounded to 1 mm; negative = overlap; null = no leader",
+            unit="m",
+            nullable=True,
+        ),
+        "headway_recorded_m": column(
+            pl.Float32,
+            "the source's own distance headway; null = no leader",
+            unit="m",
+            nullable=True,
+        ),
+    },
+)
