@@ -131,6 +131,23 @@ class Table:
             description=self.meaning,
         )
 
+    @cached_property
+    def bounds(self) -> dict[str, tuple[float | None, float | None]]:
+        """Least and greatest value of the columns that declare one (`ge`, `le`)."""
+        found: dict[str, tuple[float | None, float | None]] = {}
+        for name, declared in self.columns.items():
+            limits: dict[str, float] = {}
+            for check in declared.checks:
+                limits |= check.statistics or {}
+            if "min_value" in limits or "max_value" in limits:
+                found[name] = (limits.get("min_value"), limits.get("max_value"))
+        return found
+
+    @cached_property
+    def required(self) -> frozenset[str]:
+        """Columns in which null is no legal value."""
+        return frozenset(name for name, declared in self.columns.items() if not declared.nullable)
+
     def empty(self) -> pl.DataFrame:
         """A frame of no rows."""
         return pl.DataFrame(schema=self.dtypes)

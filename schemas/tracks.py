@@ -1,15 +1,13 @@
-"""`tracks`: one row per entry, in the canonical frame."""
+"""`tracks`: one row per entry, in the canonical frame. Bounds are what physics and the fields of view forbid."""
 
 import polars as pl
 
 from schemas.columns import DATASET, SUBSET, Table, column
 
-# Bounds: what physics and the camera systems' fields of view forbid.
-
 TRACKS = Table(
     "tracks",
-    "One row per (vehicle, frame) at the source's own frame rate, in SI units: x_m runs in the direction of travel, y_m "
-    "the driver's right; both are those of the vehicle's FRONT CENTRE.",
+    "One row per (vehicle, frame) at the source's own frame rate, in SI units: x_m runs in the direction of "
+    "travel, y_m to the driver's right; both are those of the vehicle's FRONT CENTRE.",
     key=("vehicle_id", "frame"),
     columns={
         "dataset": DATASET,

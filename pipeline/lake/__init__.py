@@ -1,0 +1,28 @@
+"""The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
+
+from pipeline.lake.catalog import connect, query
+from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
+from pipeline.lake.files import is_intact, scan, write_folder, write_table
+from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
+from pipeline.lake.writer import Writer, open_for_writing
+
+__all__ = [
+    "Entry",
+    "LakeError",
+    "LakeFile",
+    "LakeLockedError",
+    "LakeMissingError",
+    "LakeVersionError",
+    "Manifest",
+    "QueryError",
+    "Writer",
+    "connect",
+    "is_intact",
+    "load",
+    "open_for_writing",
+    "query",
+    "scan",
+    "write_aside",
+    "write_folder",
+    "write_table",
+]

@@ -1,0 +1,21 @@
+"""What can be wrong with a lake, as its user should read it."""
+
+
+class LakeError(Exception):
+    """A lake cannot be used as asked; the message says why and what to do."""
+
+
+class LakeMissingError(LakeError):
+    """There is no lake where one was named."""
+
+
+class LakeLockedError(LakeError):
+    """Another process is writing to the lake."""
+
+
+class LakeVersionError(LakeError):
+    """The lake was built by another version of the tables."""
+
+
+class QueryError(LakeError):
+    """A SQL statement was refused or failed."""

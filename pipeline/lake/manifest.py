@@ -1,0 +1,176 @@
+"""manifest.json: the live files of every table, and what each was built from."""
+
+import json
+import os
+import uuid
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
+from schemas import SCHEMA_VERSION
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class LakeFile:
+    """One live file.
+
+    Args:
+        path: relative to the lake's root, with forward slashes.
+        rows: of a table; None for anything else (reports, tensors).
+        bytes: size, so that a truncated file is noticed.
+    """
+
+    path: str
+    rows: int | None
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one stage made of one recording (or of the whole lake), as committed.
+
+    Args:
+        key: `stage/dataset/recording`, or `stage` for a stage over the whole lake.
+        fingerprint: of the inputs, settings and code version; part of every file's name.
+        files: by table.
+        built_from: sources with sha256, upstream fingerprints, settings, versions.
+        info: small facts later stages plan with (subsets, counts, notes).
+    """
+
+    key: str
+    fingerprint: str
+    files: dict[str, list[LakeFile]]
+    built_from: dict[str, Any] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> str:
+        """The stage that made it."""
+        return self.key.split("/", 1)[0]
+
+
+@dataclass(frozen=True)
+class Retired:
+    """A file that is no longer live, kept for readers that opened the lake before it was replaced."""
+
+    path: str
+    generation: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The state of a lake: replaced as a whole, never edited in place.
+
+    Args:
+        lake_id: made with the lake; results cached elsewhere are bound to it.
+        generation: counts the writing sessions that changed something.
+        entries: by key.
+        sources: by sha256: which dataset, dialect and recordings a raw file holds.
+        retired: files to delete two generations after they were replaced.
+    """
+
+    lake_id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    generation: int = 0
+    entries: dict[str, Entry] = field(default_factory=dict)
+    sources: dict[str, dict[str, Any]] = field(default_factory=dict)
+    retired: tuple[Retired, ...] = ()
+
+    def live(self, table: str) -> list[LakeFile]:
+        """The live files of a table, sorted by path."""
+        files = [file for entry in self.entries.values() for file in entry.files.get(table, [])]
+        return sorted(files, key=lambda file: file.path)
+
+    def live_paths(self) -> set[str]:
+        """Paths of all live files."""
+        return {file.path for entry in self.entries.values() for files in entry.files.values() for file in files}
+
+    def of_stage(self, stage: str) -> list[Entry]:
+        """The entries of a stage, sorted by key."""
+        return sorted((entry for entry in self.entries.values() if entry.stage == stage), key=lambda entry: entry.key)
+
+    def committing(self, entry: Entry, generation: int) -> "Manifest":
+        """The manifest with an entry added or replaced; what it replaces is retired."""
+        before = self.entries.get(entry.key)
+        entries = {**self.entries, entry.key: entry}
+        changed = replace(self, entries=entries, generation=generation)
+        if before is None:
+            return changed
+        gone = {file.path for files in before.files.values() for file in files} - changed.live_paths()
+        kept = tuple(item for item in self.retired if item.path not in changed.live_paths())
+        return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(gone)))
+
+
+def load(root: Path) -> Manifest:
+    """Read a lake's manifest.
+
+    Raises:
+        LakeMissingError: no manifest there.
+        LakeVersionError: tables of another schema version.
+        LakeError: not a manifest of ours.
+    """
+    path = root / MANIFEST
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError):
+        raise LakeMissingError(
+            f"{root}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake {root}`, "
+            "or name another with --lake or TRACKLAKE_LAKE."
+        ) from None
+    try:
+        document = json.loads(text)
+        version = document["schema_version"]
+    except (json.JSONDecodeError, KeyError, TypeError) as broken:
+        raise LakeError(
+            f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
+        ) from broken
+    if version != SCHEMA_VERSION:
+        raise LakeVersionError(
+            f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
+            f"{SCHEMA_VERSION}. Rebuild it from the raw files: `tracklake run SOURCE --lake NEW_FOLDER`."
+        )
+    entries = {
+        key: Entry(
+            key=key,
+            fingerprint=entry["fingerprint"],
+            files={table: [LakeFile(**file) for file in files] for table, files in entry["files"].items()},
+            built_from=entry["built_from"],
+            info=entry["info"],
+        )
+        for key, entry in document["entries"].items()
+    }
+    return Manifest(
+        lake_id=document["lake_id"],
+        generation=document["generation"],
+        entries=entries,
+        sources=document["sources"],
+        retired=tuple(Retired(**item) for item in document["retired"]),
+    )
+
+
+def store(root: Path, manifest: Manifest) -> None:
+    """Replace a lake's manifest: the moment at which a commit happens."""
+    document = {"schema_version": SCHEMA_VERSION, **asdict(manifest)}
+    write_aside(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())
+
+
+def write_aside(target: Path, content: bytes) -> None:
+    """Write a whole file beside its target, sync it, and rename it into place."""
+    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+    with aside.open("wb") as handle:
+        handle.write(content)
+        handle.flush()
+        os.fsync(handle.fileno())
+    aside.replace(target)
+    sync_folder(target.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in a folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,103 @@
+"""What became of every row: exact duplicates, the ingest log, the rejects."""
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from pipeline.sources.base import Part
+from pipeline.sources.lines import LINE, REJECT_SCHEMA, fetch_lines
+from schemas import INGEST_LOG, REJECTS
+
+FILE = "file_index"
+DUPLICATE = "duplicate row"
+CONFLICT = "another row has the same vehicle and frame"
+
+
+def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Part rows from exact repetitions of earlier ones.
+
+    Args:
+        rows: values, with FILE and LINE saying where each row stands.
+        key: columns that sort equal rows next to each other.
+
+    Returns:
+        (first occurrences, repetitions), sorted by key, then file and line.
+    """
+    values = [name for name in rows.columns if name not in (FILE, LINE)]
+    rest = [name for name in values if name not in key]
+    rows = rows.sort([*key, FILE, LINE], maintain_order=False)
+    # Sorting by every column costs seconds and is needed only where a key repeats at all.
+    repeated = pl.all_horizontal(pl.col(name).eq_missing(pl.col(name).shift(1)) for name in key)
+    if not rows.select(repeated.slice(1).any()).item():
+        return rows, rows.clear()
+    rows = rows.sort([*key, *rest, FILE, LINE], maintain_order=False)
+    same = pl.all_horizontal(pl.col(name).eq_missing(pl.col(name).shift(1)) for name in values)
+    rows = rows.with_columns((same & (pl.int_range(pl.len()) > 0)).alias("repeats"))
+    first, again = rows.filter(~pl.col("repeats")).drop("repeats"), rows.filter("repeats").drop("repeats")
+    return first, again
+
+
+def account(
+    dataset: str,
+    recording: str,
+    parts: Sequence[Part],
+    rows_parsed: Sequence[int],
+    dropped: Sequence[tuple[pl.DataFrame, str]],
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The ingest log and the rejects of one recording.
+
+    Args:
+        dataset: of the recording.
+        recording: its name.
+        parts: its files.
+        rows_parsed: of each part, the rows that were read as entries.
+        dropped: rows (FILE, LINE) of those that were dropped afterwards, each set with its reason.
+
+    Returns:
+        (schemas.INGEST_LOG with one row per file, schemas.REJECTS); read = kept + dropped in each row.
+    """
+    later = [rows.select(FILE, LINE, reason=pl.lit(reason)) for rows, reason in dropped]
+    rejects, log = [], []
+    for index, (part, parsed) in enumerate(zip(parts, rows_parsed, strict=True)):
+        at_parsing = part.rejects if part.rejects is not None else pl.DataFrame(schema=REJECT_SCHEMA)
+        mine = pl.concat([rows.filter(pl.col(FILE) == index) for rows in later] or [pl.DataFrame(schema=_LATER)])
+        if not mine.is_empty():
+            mine = mine.join(fetch_lines(part.file.path, mine[LINE]), on=LINE, how="left")
+        refused = pl.concat([at_parsing, mine.select(*REJECT_SCHEMA)] if not mine.is_empty() else [at_parsing])
+        log.append(
+            {
+                "dataset": dataset,
+                "recording": recording,
+                "file": part.file.name,
+                "sha256": part.file.sha256,
+                "dialect": part.file.dialect,
+                "rows_read": parsed + at_parsing.height,
+                "rows_kept": parsed - mine.height,
+                "rows_dropped": refused.height,
+                "dropped_by_reason": count_reasons(refused),
+            }
+        )
+        rejects.append(refused.with_columns(file=pl.lit(part.file.name)))
+    return pl.DataFrame(log, schema=INGEST_LOG.dtypes).sort(INGEST_LOG.key), to_rejects(
+        pl.concat(rejects), dataset, recording
+    )
+
+
+_LATER = {FILE: pl.Int64(), LINE: pl.Int64(), "reason": pl.String()}
+
+
+def count_reasons(rejects: pl.DataFrame) -> list[dict[str, object]]:
+    """Rows by reason, as the log's list of structs."""
+    return rejects.group_by("reason").agg(pl.len().cast(pl.Int64).alias("rows")).sort("reason").to_dicts()
+
+
+def to_rejects(rejects: pl.DataFrame, dataset: str, recording: str | None) -> pl.DataFrame:
+    """Rejected lines as rows of schemas.REJECTS; one line that fails twice stands there once."""
+    return (
+        rejects.with_columns(dataset=pl.lit(dataset), recording=pl.lit(recording, pl.String))
+        .lazy()
+        .pipe(REJECTS.conform)
+        .unique(subset=["file", "line"], keep="first", maintain_order=True)
+        .sort(REJECTS.key)
+        .collect()
+    )

@@ -1,0 +1,80 @@
+"""Canonical entries to the tables of a subset: what every source does the same way."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import polars as pl
+
+from pipeline.sources.base import RawFile, Subset
+from pipeline.transforms.kinematics import add_gaps, add_kinematics, central_difference
+from schemas import SUBSETS, TRACKS, VEHICLES
+from schemas.columns import Dataset
+
+
+def assemble_subset(
+    entries: pl.DataFrame,
+    sizes: pl.DataFrame,
+    *,
+    dataset: Dataset,
+    name: str,
+    facts: Mapping[str, Any],
+    use_recorded_headway: bool,
+    files: Sequence[RawFile],
+) -> Subset:
+    """Compute what follows from the oriented entries and cast everything to the schemas.
+
+    Args:
+        entries: sorted by vehicle_id, frame; x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
+            headway_recorded_m, and lateral_speed_mps where the source has it.
+        sizes: per vehicle_id: source_vehicle_id, class, length_m, width_m, entries_announced.
+        dataset: of the subset.
+        name: of the subset.
+        facts: recording, site, direction, freeway, frame_rate_hz, lanes, seconds, first_frame, on_ramp_lanes,
+            lane_markings_m, ids_split, columns_missing.
+        use_recorded_headway: see `add_gaps`.
+        files: the raw files of the recording.
+    """
+    rate_hz, first_frame = facts["frame_rate_hz"], facts["first_frame"]
+    entries = add_kinematics(entries, rate_hz).with_columns(
+        dataset=pl.lit(dataset), subset=pl.lit(name), time_s=(pl.col("frame") - first_frame) / rate_hz
+    )
+    if "lateral_speed_mps" not in entries.columns:
+        entries = entries.with_columns(lateral_speed_mps=central_difference("y_m", rate_hz))
+    entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)
+    tracks = entries.lazy().pipe(TRACKS.conform).collect()
+    vehicles = _summarise(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
+    vehicles = (
+        vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()
+    )
+    lanes = facts["lanes"]
+    row = {
+        **facts,
+        "dataset": dataset,
+        "subset": name,
+        "last_frame": tracks["frame"].max(),
+        "vehicles": vehicles.height,
+        "entries": tracks.height,
+        "flow": None if lanes is None else vehicles.height / lanes / facts["seconds"],
+        "source_files": [{"file": file.name, "sha256": file.sha256} for file in files],
+    }
+    return Subset(name, tracks, vehicles, pl.DataFrame([row], schema=SUBSETS.dtypes))
+
+
+def _summarise(tracks: pl.DataFrame) -> pl.DataFrame:
+    lane = pl.col("lane")
+    changes = (lane != lane.shift(1)).sum()
+    return (
+        tracks.lazy()
+        .group_by("vehicle_id", maintain_order=True)
+        .agg(
+            first_frame=pl.col("frame").first(),
+            last_frame=pl.col("frame").last(),
+            entries=pl.len(),
+            start_x_m=pl.col("x_m").first(),
+            end_x_m=pl.col("x_m").last(),
+            start_lane=lane.first(),
+            mean_speed_mps=pl.col("speed_mps").cast(pl.Float64).mean(),
+            lane_changes=pl.when(lane.is_not_null().all()).then(changes),
+        )
+        .collect()
+    )

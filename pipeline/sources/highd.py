@@ -1,0 +1,248 @@
+"""highD: drone recordings of German motorways, 25 Hz, three CSV files per recording."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import polars as pl
+
+from pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
+from pipeline.sources.assemble import assemble_subset
+from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
+from pipeline.sources.lines import LINE, Chunk, Layout, read_chunks
+from pipeline.transforms.orientation import LOWER, UPPER, orient_highd
+from schemas import Table
+from schemas.raw_highd import (
+    RAW_HIGHD_RECORDING,
+    RAW_HIGHD_TRACKS,
+    RAW_HIGHD_VEHICLES,
+    RAW_RECORDING_FIELDS,
+    RAW_TRACKS_FIELDS,
+    RAW_VEHICLES_FIELDS,
+)
+
+RECORDING, VEHICLES, TRACKS = "highd-recordingMeta", "highd-tracksMeta", "highd-tracks"
+FIELDS = {RECORDING: RAW_RECORDING_FIELDS, VEHICLES: RAW_VEHICLES_FIELDS, TRACKS: RAW_TRACKS_FIELDS}
+RAW = {RECORDING: RAW_HIGHD_RECORDING, VEHICLES: RAW_HIGHD_VEHICLES, TRACKS: RAW_HIGHD_TRACKS}
+FIRST_FRAME = 1
+"""Frames count from 1, so time_s = 0 there even where the first vehicle comes later."""
+
+CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
+CLASSES = {"Car": "car", "Truck": "truck"}
+
+
+def detect(head: bytes, _name: str) -> str | None:
+    """Recognise one of the three files by its header."""
+    line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
+    header = tuple(field.strip().strip('"') for field in line.split(","))
+    return next((dialect for dialect, fields in FIELDS.items() if header == fields), None)
+
+
+def group(files: Sequence[RawFile]) -> Grouping:
+    """Gather each recording's three files by folder and number (`NN_tracks.csv`); incomplete ones are refused."""
+    gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
+    refusals = []
+    for file in sorted(files, key=lambda file: file.name):
+        number = re.match(r"(\d+)_", file.path.name)
+        if number is None:
+            refusals.append(
+                f"{file.name}: has the columns of a highD {_kind(file.dialect)} file, but its name does not begin with "
+                f"the recording's number. Expected `NN_{_kind(file.dialect)}.csv`, as shipped; rename it."
+            )
+            continue
+        gathered.setdefault((str(file.path.parent), number.group(1)), {})[file.dialect] = file
+    units: list[Unit] = []
+    for (_, digits), found in sorted(gathered.items(), key=lambda item: item[0][::-1]):
+        recording = f"{int(digits):02d}"
+        missing = [f"{digits}_{_kind(dialect)}.csv" for dialect in FIELDS if dialect not in found]
+        there = ", ".join(file.name for file in found.values())
+        if missing:
+            refusals.append(
+                f"recording {recording}: {' and '.join(missing)} missing beside {there}. A highD recording needs its "
+                "three files in one folder; put the missing one there and run again."
+            )
+        elif any(unit.recording == recording for unit in units):
+            refusals.append(
+                f"recording {recording}: a second set of files ({there}); the first was taken. Remove one of them."
+            )
+        else:
+            units.append(Unit((found[RECORDING], found[VEHICLES], found[TRACKS]), recording))
+    return Grouping(tuple(units), tuple(refusals))
+
+
+def _kind(dialect: str) -> str:
+    return dialect.removeprefix("highd-")
+
+
+def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
+    """Turn a recording's three files into its tables.
+
+    Args:
+        parts: recordingMeta, tracksMeta, tracks, in this order.
+        recording: its name, the number in the files' names.
+    """
+    meta_file, vehicles_file, tracks_file = (part.file for part in parts)
+    meta_rows, vehicles, tracks = (_read(part.file) for part in parts)
+    meta = _only_row(meta_rows.frame, meta_file)
+    if f"{meta['id']:02d}" != recording:
+        raise SourceError(
+            f"{meta_file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
+            "Two recordings' files are mixed; restore the originals."
+        )
+    entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
+    conflicting = (pl.col("id") == pl.col("id").shift(1)) & (pl.col("frame") == pl.col("frame").shift(1))
+    entries = entries.with_columns(conflicting.fill_null(value=False).alias("conflicts"))
+    conflicts, entries = entries.filter("conflicts"), entries.filter(~pl.col("conflicts"))
+    if entries.is_empty():
+        raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
+    _require_known(entries, vehicles.frame, tracks_file, vehicles_file)
+    rejected = [
+        Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
+    ]
+    parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
+    log, rejects = account("highd", recording, rejected, parsed, [(again, DUPLICATE), (conflicts, CONFLICT)])
+    files = [part.file for part in parts]
+    subsets = [
+        _to_subset(entries, vehicles.frame, direction, recording, meta, meta_file, files) for direction in CARRIAGEWAYS
+    ]
+    found = tuple(subset for subset in subsets if subset is not None)
+    return Canonical(found, log, rejects, tuple(_remark(found, meta)))
+
+
+def _read(file: RawFile) -> Chunk:
+    raw = RAW[file.dialect]
+    layout = _layout(file.dialect, raw)
+    chunks = list(read_chunks(file.path, layout))
+    if not chunks:
+        raise SourceError(
+            f"{file.name}: empty. Expected the header {','.join(layout.names[:4])}, ... and rows under it."
+        )
+    frame = pl.concat([chunk.frame for chunk in chunks]).select(*raw.dtypes)
+    rejects = pl.concat([chunk.rejects for chunk in chunks])
+    return Chunk(raw.validate(frame, where=file.name), rejects, sum(chunk.rows_read for chunk in chunks))
+
+
+def _layout(dialect: str, raw: Table) -> Layout:
+    wanted = [name for name in raw.dtypes if name != LINE]
+    return Layout(
+        names=FIELDS[dialect],
+        dtypes={name: raw.dtypes[name] for name in wanted},
+        required=frozenset(wanted),
+        bounds={name: limits for name, limits in raw.bounds.items() if name != LINE},
+        choices={"class": ("car", "truck")} if dialect == VEHICLES else {},
+    )
+
+
+def _only_row(meta: pl.DataFrame, file: RawFile) -> dict[str, Any]:
+    if meta.height != 1:
+        raise SourceError(f"{file.name}: expected one readable row under the header, got {meta.height}.")
+    return meta.row(0, named=True)
+
+
+def _require_known(entries: pl.DataFrame, vehicles: pl.DataFrame, tracks_file: RawFile, vehicles_file: RawFile) -> None:
+    strangers = entries.join(vehicles, on="id", how="anti")
+    if not strangers.is_empty():
+        first = strangers.row(0, named=True)
+        raise SourceError(
+            f"{tracks_file.name}, line {first[LINE]}: vehicle {first['id']} has no row in {vehicles_file.name} "
+            f"({strangers['id'].n_unique()} such vehicles). The files do not belong together or one is cut short; "
+            "restore the originals."
+        )
+
+
+def _markings(text: str, file: RawFile) -> list[float]:
+    try:
+        values = [float(value) for value in text.split(";")]
+    except ValueError:
+        values = []
+    if len(values) < 2 or values != sorted(values):
+        raise SourceError(
+            f"{file.name}, line 2: expected lane markings as increasing numbers separated by `;`, got {text!r}."
+        )
+    return values
+
+
+def _to_subset(
+    entries: pl.DataFrame,
+    vehicles: pl.DataFrame,
+    direction: int,
+    recording: str,
+    meta: dict[str, Any],
+    meta_file: RawFile,
+    files: Sequence[RawFile],
+) -> Subset | None:
+    mine = vehicles.filter(pl.col("drivingDirection") == direction)
+    entries = entries.join(mine.select("id"), on="id", how="semi", maintain_order="left")
+    if entries.is_empty():
+        return None
+    upper_m = _markings(meta["upperLaneMarkings"], meta_file)
+    lower_m = _markings(meta["lowerLaneMarkings"], meta_file)
+    markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
+    leader = pl.when(pl.col("precedingId") != 0)
+    canonical = orient_highd(entries, direction, upper_m, lower_m).select(
+        "frame",
+        "x_m",
+        "y_m",
+        "lane",
+        "speed_mps",
+        "accel_mps2",
+        "lateral_speed_mps",
+        vehicle_id="id",
+        leader_id=leader.then(pl.col("precedingId")),
+        follower_id=pl.when(pl.col("followingId") != 0).then(pl.col("followingId")),
+        headway_recorded_m=leader.then(pl.col("dhw")),
+    )
+    sizes = mine.select(
+        pl.col("class").replace_strict(CLASSES, return_dtype=pl.String),
+        vehicle_id="id",
+        source_vehicle_id="id",
+        length_m="width",
+        width_m="height",
+        entries_announced="numFrames",
+    )
+    return assemble_subset(
+        canonical,
+        sizes,
+        dataset="highd",
+        name=f"{recording}-{CARRIAGEWAYS[direction]}",
+        facts={
+            "recording": recording,
+            "site": f"location-{meta['locationId']}",
+            "direction": CARRIAGEWAYS[direction],
+            "freeway": True,
+            "frame_rate_hz": meta["frameRate"],
+            "lanes": len(markings) - 1,
+            "seconds": meta["duration"],
+            "first_frame": FIRST_FRAME,
+            "on_ramp_lanes": [],
+            "lane_markings_m": markings,
+            "ids_split": 0,
+            "columns_missing": [],
+        },
+        use_recorded_headway=False,
+        files=files,
+    )
+
+
+def _remark(subsets: Sequence[Subset], meta: dict[str, Any]) -> list[str]:
+    found = sum(subset.vehicles.height for subset in subsets)
+    notes = []
+    if found != meta["numVehicles"]:
+        notes.append(
+            f"{meta['id']:02d}: recordingMeta announces {meta['numVehicles']} vehicles, the tracks have {found}"
+        )
+    return notes
+
+
+HIGHD = Source(
+    name="highd",
+    title="highD: naturalistic vehicle trajectories on German highways",
+    licence="non-commercial, on request from levelXdata (highd-dataset.com)",
+    citation="Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset. IEEE ITSC. "
+    "doi.org/10.1109/ITSC.2018.8569552",
+    looks_like="highD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with the headers as shipped",
+    version=1,
+    detect=detect,
+    group=group,
+    to_canonical=to_canonical,
+)

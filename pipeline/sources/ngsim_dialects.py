@@ -1,0 +1,173 @@
+"""NGSIM's dialects as data: which fields a file has, what it calls them, and how its recordings are named."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+from pipeline.sources.lines import Layout
+from schemas.raw_ngsim import RAW_NGSIM
+
+TEXT_FIELDS = (
+    *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y"),
+    *("v_length", "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID"),
+    *("Preceding", "Following", "Space_Headway", "Time_Headway"),
+)
+"""The 18 fields of the original text files, in order."""
+
+EXPORT_FIELDS = (
+    *TEXT_FIELDS[:14],
+    *("O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement"),
+    *TEXT_FIELDS[14:],
+    "Location",
+)
+"""The 25 columns of the portal's export, in order."""
+
+ALIASES = {
+    "tot_frames": "Total_Frames",
+    "epoch_ms": "Global_Time",
+    "veh_len": "v_length",
+    "veh_wid": "v_Width",
+    "veh_class": "v_Class",
+    "veh_velocity": "v_Vel",
+    "vehicle_acc": "v_Acc",
+    "org_zone": "O_Zone",
+    "dest_zone": "D_Zone",
+    "intersection": "Int_ID",
+    "section": "Section_ID",
+    "preceding_veh": "Preceding",
+    "following_veh": "Following",
+    "spacing": "Space_Headway",
+    "headway": "Time_Headway",
+    **{name.lower(): name for name in EXPORT_FIELDS},
+}
+"""Every name a header has used, in lower case, and what the raw schema calls it."""
+
+THOUSANDS = frozenset({"Total_Frames", "Preceding", "Following", "Space_Headway", "Time_Headway"})
+LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
+ESSENTIAL = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel")
+TEXT, CSV = "ngsim-text", "ngsim-csv"
+
+
+@dataclass(frozen=True)
+class Site:
+    """A place NGSIM recorded.
+
+    Args:
+        name: as in Location.
+        freeway: or an arterial with several directions.
+        direction: of travel on a freeway.
+        lanes: main lanes of a freeway.
+        on_ramp_lanes: lanes that are on-ramps.
+        day: on which it was recorded, local date.
+    """
+
+    name: str
+    freeway: bool
+    direction: str | None
+    lanes: int | None
+    on_ramp_lanes: tuple[int, ...]
+    day: str
+
+
+SITES = {
+    site.name: site
+    for site in (
+        Site("us-101", True, "south", 5, (7,), "2005-06-15"),
+        Site("i-80", True, "north", 6, (7,), "2005-04-13"),
+        Site("lankershim", False, None, None, (), "2005-06-16"),
+        Site("peachtree", False, None, None, (), "2006-11-08"),
+    )
+}
+
+RECORDINGS = {
+    1113433134900: "i-80-1600",
+    1113436766900: "i-80-1700",
+    1113437564900: "i-80-1715",
+    1118846978900: "us-101-0750",
+    1118847842000: "us-101-0805",
+    1118848757000: "us-101-0820",
+    1118936699900: "lankershim-0845",
+    1163018600: "peachtree-1245",
+    1163030300: "peachtree-1600",
+}
+"""Published recordings by Global_Time - 100 * Frame_ID, named by site and scheduled start, local time.
+
+Peachtree's clock counts seconds since 1970 (shifted by a time zone) yet advances by 100 a frame: its keys lie 11,700
+apart, the 3 h 15 min between its two periods.
+"""
+
+_LOCAL = ZoneInfo("America/Los_Angeles")
+
+
+def name_recording(key: int, location: str | None) -> tuple[str, str]:
+    """(recording, site) of a Global_Time - 100 * Frame_ID.
+
+    Unknown keys are a recording of their own, named by site, local date and local time of frame 1. Where the file does
+    not say the site, it is the one that was recorded on that day, else `unknown`.
+    """
+    if key in RECORDINGS:
+        recording = RECORDINGS[key]
+        return recording, recording.rpartition("-")[0]
+    start_ms = key + 100
+    try:
+        start = datetime.fromtimestamp(start_ms / 1000, tz=UTC).astimezone(_LOCAL)
+    except (OverflowError, ValueError, OSError):
+        return f"{location or 'unknown'}-{key}", location or "unknown"
+    by_day = {site.day: site.name for site in SITES.values()}
+    site = location or by_day.get(f"{start:%Y-%m-%d}", "unknown")
+    rest = f"-{start_ms % 1000:03d}" if start_ms % 1000 else ""
+    return f"{site}-{start:%Y%m%d-%H%M%S}{rest}", site
+
+
+def detect(head: bytes, _name: str) -> str | None:
+    """Recognise an NGSIM trajectory file by its first lines.
+
+    A header that names the essential columns, or a line of 18 numbers: separated by commas, or by blanks.
+    """
+    lines = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", errors="replace").splitlines()[:25]
+    if not lines:
+        return None
+    header = _canonical_names(lines[0])
+    if set(ESSENTIAL) <= set(header):
+        return CSV
+    if any(_are_numbers(line.split(",")) for line in lines):
+        return f"{CSV}-no-header"
+    return TEXT if any(_are_numbers(line.split()) for line in lines) else None
+
+
+def layout_of(head: bytes, dialect: str) -> Layout:
+    """How to read a file of a dialect, given its first bytes."""
+    if dialect == CSV:
+        line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace")
+        names = tuple(_canonical_names(line))
+    else:
+        names = TEXT_FIELDS
+    wanted = [name for name in RAW_NGSIM.columns if name in names]
+    # The last field tells a cut line from a whole one, so it may not be empty even where the schema would let it.
+    required = (RAW_NGSIM.required & set(wanted)) | {names[-1]} & set(wanted)
+    if dialect != CSV:
+        required = frozenset(wanted)
+    return Layout(
+        names=names,
+        dtypes={name: RAW_NGSIM.dtypes[name] for name in wanted},
+        required=required,
+        thousands=THOUSANDS & set(names) if dialect == CSV else frozenset(),
+        bounds={name: limits for name, limits in RAW_NGSIM.bounds.items() if name in wanted},
+        choices={"Location": LOCATIONS} if "Location" in names else {},
+        header_lines=1 if dialect == CSV else 0,
+        blanks=dialect == TEXT,
+    )
+
+
+def _canonical_names(line: str) -> list[str]:
+    names = [field.strip().strip('"') for field in line.rstrip("\r\n").split(",")]
+    return [ALIASES.get(name.lower(), name) for name in names]
+
+
+def _are_numbers(fields: list[str]) -> bool:
+    if len(fields) != len(TEXT_FIELDS):
+        return False
+    try:
+        return all(float(field) >= float("-inf") for field in fields)
+    except ValueError:
+        return False

@@ -1,0 +1,1 @@
+"""Pure functions, frame in, frame out: no file, no clock, no lake."""
