@@ -24,7 +24,7 @@ ARRAYS = (
     Array("x_m", "float32", "N", "front centre along the direction of travel, m"),
     Array("y_m", "float32", "N", "front centre from the carriageway's left edge, positive to the right, m"),
     Array("speed_mps", "float32", "N", "recorded speed along the direction of travel, m/s"),
-    Array("lane", "int16", "N", "1 is the driver's leftmost"),
+    Array("lane", "int16", "N", "1 is the driver's leftmost; 0 where the source has none"),
     Array("subset", "int32", "N", "position in index.json's `subsets`"),
     Array("vehicle_id", "int32", "N", "unique within the subset"),
     Array("tick", "int32", "N", "time_s = tick / rate_hz"),
@@ -39,6 +39,7 @@ ARRAYS = (
     Array("neighbor_cell", "int8", "K", "13 * column + row of the 13 x 3 grid"),
 )
 """Rows are sorted by (subset, vehicle_id, tick). Beside them stands `index.json`: version, split, protocol (its
-parameters and digest), subsets (dataset, subset, frame_rate_hz), and the sizes N, S, K."""
+parameters and digest), subsets (dataset, subset, frame_rate_hz), blocks (the split's rows), the sizes N, S, K, and
+samples_by_part."""
 
 TENSORS_VERSION = 1

@@ -1,0 +1,43 @@
+"""A query's result, for people or for programs."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.terminal import Terminal, show_relation
+
+if TYPE_CHECKING:
+    import duckdb
+
+FORMATS = ("table", "csv", "json", "parquet")
+
+
+def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | None, terminal: Terminal) -> None:
+    """Write a result to a file, or to standard output.
+
+    Args:
+        relation: of `pipeline.lake.query`.
+        form: table (the first rows, aligned), csv (with header), json (an array of objects) or parquet.
+        out: the file; none: standard output.
+        terminal: for tables.
+
+    Raises:
+        ValueError: Parquet, which is no text, was asked for on a terminal.
+    """
+    if form == "table" and out is None:
+        show_relation(relation, terminal)
+        return
+    if form == "parquet" and out is None and sys.stdout.isatty():
+        raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
+    frame = relation.pl()
+    target = out or sys.stdout.buffer
+    if form == "csv":
+        frame.write_csv(target)
+    elif form == "json":
+        frame.write_json(target)
+    elif form == "parquet":
+        frame.write_parquet(target)
+    else:
+        raise ValueError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
+    if out is None:
+        sys.stdout.buffer.flush()

@@ -1,0 +1,249 @@
+"""Prefect flows: ingest, quality, and the whole run; one task per (stage, recording), records in and records out.
+
+The only importer of Prefect. What a task does is a pure plan-and-build of `pipeline.stages`; what is done already was
+decided before (`pipeline.work`), so an idle rerun never comes here.
+"""
+
+import logging
+import os
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+# Prefect reads these on import. Its telemetry shares the embedded server's database and locks it.
+os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+os.environ.setdefault("DO_NOT_TRACK", "1")
+
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE, CacheKeyFnPolicy
+from prefect.futures import PrefectFuture, as_completed
+from prefect.logging.handlers import PrefectConsoleHandler
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.task_runners import ThreadPoolTaskRunner
+
+from pipeline.lake import Entry, LakeFile, Writer, is_intact, open_for_writing
+from pipeline.progress import reporter
+from pipeline.settings import Settings
+from pipeline.sources import RawFile, SourceError
+from pipeline.stages import ingest
+from pipeline.stages.base import Job, pending
+from pipeline.stages.registry import STAGE_BY_NAME
+from pipeline.work import ALL_STEPS, INGEST, QUALITY_STEPS, Order, Outcome, explain_left_out, outstanding, survey
+from schemas import StructureError
+
+Results = Iterable[tuple[str, dict[str, Any] | BaseException]]
+
+
+def _is_io_error(_task: Any, _run: Any, state: Any) -> bool:  # noqa: ANN401 - Prefect's own signature
+    """Retry what a busy disk or a network share may cause; nothing else becomes right by being tried again."""
+    return isinstance(state.result(raise_on_failure=False), OSError)
+
+
+def _content_key(_context: Any, parameters: dict[str, Any]) -> str:  # noqa: ANN401 - Prefect's own signature
+    """The fingerprint covers the inputs' sha256, the settings and the code; the lake's id, where the files stand."""
+    return f"tracklake-{parameters['lake_id']}-{parameters['job']['fingerprint']}"
+
+
+RETRIES: dict[str, Any] = {"retries": 2, "retry_delay_seconds": 1, "retry_condition_fn": _is_io_error}
+
+
+@task(task_run_name="read {title}", cache_policy=NO_CACHE, **RETRIES)
+def read_file(title: str, lake: str, dataset: str, file: dict[str, str]) -> dict[str, Any]:
+    """Read one file that holds several recordings into the staging folder."""
+    del title
+    raw = RawFile(Path(file["path"]), file["name"], file["dialect"], file["sha256"])
+    return ingest.read_file(Path(lake), dataset, raw)
+
+
+@task(
+    task_run_name="{stage} {title}",
+    cache_policy=CacheKeyFnPolicy(cache_key_fn=_content_key),
+    persist_result=True,
+    **RETRIES,
+)
+def build(
+    stage: str, title: str, lake: str, lake_id: str, job: dict[str, Any], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """One stage's work on one recording: read, transform, validate, write; returns the entry to commit."""
+    del title, lake_id
+    record = Job(**job)
+    if stage == INGEST:
+        return asdict(ingest.build(Path(lake), record))
+    return asdict(STAGE_BY_NAME[stage].build(Path(lake), record, Settings(**settings)))
+
+
+def _entry(record: dict[str, Any]) -> Entry:
+    files = {table: [LakeFile(**file) for file in group] for table, group in record["files"].items()}
+    return Entry(**{**record, "files": files})
+
+
+def _settle(futures: dict[PrefectFuture[Any], str]) -> Results:
+    """(title, record or what went wrong) of each future as it ends."""
+    for future in as_completed(list(futures)):
+        future.wait()
+        yield futures[future], future.state.result(raise_on_failure=False)
+
+
+def _blame(title: str, error: BaseException, outcome: Outcome) -> None:
+    """Sort an error: bad input is refused and the others go on; anything else is a failure."""
+    if isinstance(error, SourceError | StructureError):
+        outcome.refused.append(str(error))
+    else:
+        outcome.failed.append(f"{title}: {type(error).__name__}: {error}")
+
+
+def _build_all(writer: Writer, stage: str, jobs: list[Job], order: Order, outcome: Outcome) -> None:
+    """Run a stage's jobs and commit each as it ends."""
+    if not jobs:
+        return
+    show = reporter()
+    show.begin(stage, len(jobs))
+
+    settings = order.get_settings().model_dump(mode="json")
+
+    def submit(job: Job, *, refresh: bool = False) -> PrefectFuture[Any]:
+        chosen = build.with_options(refresh_cache=True) if refresh else build
+        return chosen.submit(stage, job.title, order.lake, writer.manifest.lake_id, asdict(job), settings)
+
+    by_title = {job.title: job for job in jobs}
+    for title, record in _settle({submit(job): job.title for job in jobs}):
+        if isinstance(record, dict) and not is_intact(writer.root, _files(_entry(record))):
+            # A cached record whose files were swept since: the work is done again.
+            again = submit(by_title[title], refresh=True)
+            again.wait()
+            record = again.state.result(raise_on_failure=False)
+        if isinstance(record, dict):
+            entry = _entry(record)
+            writer.commit(entry)
+            outcome.built[stage] = outcome.built.get(stage, 0) + 1
+            outcome.notes += entry.info.get("notes", [])
+        else:
+            _blame(title, record, outcome)
+        show.advance(stage, title)
+
+
+def _files(entry: Entry) -> list[LakeFile]:
+    return [file for group in entry.files.values() for file in group]
+
+
+def _ingest(writer: Writer, order: Order, outcome: Outcome) -> None:
+    """Read what must be read to know its recordings, then make each recording that is not in the lake."""
+    discovery = survey(order)
+    outcome.refused += discovery.refusals
+    outcome.passed_by += discovery.passed_by
+    unknown = ingest.files_to_read(discovery, writer.manifest)
+    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, order, outcome)
+    jobs = pending(writer.root, writer.manifest, ingest.plan(discovery, writer.manifest))
+    needed = {
+        file.sha256: (job.inputs["dataset"], file)
+        for job in jobs
+        if ingest.needs_spill(job)
+        for file in ingest.files_of(job)
+        if not ingest.spill_folder(writer.root, file).exists()
+    }
+    _read_all(writer, needed, order, outcome)
+    _build_all(writer, INGEST, jobs, order, outcome)
+
+
+def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Order, outcome: Outcome) -> None:
+    if not files:
+        return
+    show = reporter()
+    show.begin("read", len(files))
+    futures = {
+        read_file.submit(
+            file.name,
+            order.lake,
+            dataset,
+            {"path": str(file.path), "name": file.name, "dialect": file.dialect, "sha256": sha256},
+        ): sha256
+        for sha256, (dataset, file) in files.items()
+    }
+    contents = {}
+    for sha256, record in _settle(futures):
+        if isinstance(record, dict):
+            contents[sha256] = record
+        else:
+            _blame(files[sha256][1].name, record, outcome)
+        show.advance("read", files[sha256][1].name)
+    writer.remember_sources(contents)
+
+
+def _work(order: Order) -> dict[str, Any]:
+    outcome = Outcome()
+    with open_for_writing(order.root) as writer:
+        if INGEST in order.steps:
+            _ingest(writer, order, outcome)
+        for stage in order.stages():
+            if outcome.failed:
+                break
+            _build_all(
+                writer,
+                stage.name,
+                outstanding(stage, writer.root, writer.manifest, order.get_settings()),
+                order,
+                outcome,
+            )
+        if set(order.steps) & {"repair", "samples", "split", "tensors"}:
+            outcome.notes += explain_left_out(writer.manifest)
+    return asdict(outcome)
+
+
+@flow(name="tracklake-run", validate_parameters=False)
+def run(lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
+    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}))
+
+
+@flow(name="tracklake-ingest", validate_parameters=False)
+def ingest_files(
+    lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Raw files to tracks, vehicles and subsets."""
+    return _work(Order(lake, (INGEST,), source, dataset, settings or {}))
+
+
+@flow(name="tracklake-quality", validate_parameters=False)
+def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Findings, late starts and the report over what is in the lake."""
+    return _work(Order(lake, QUALITY_STEPS, settings=settings or {}))
+
+
+@flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False)
+def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+    """One stage over what is in the lake."""
+    return _work(Order(lake, (stage,), settings=settings or {}))
+
+
+def execute(order: Order) -> Outcome:
+    """Run an order as the flow that fits it, on threads, with nothing of Prefect's on the terminal."""
+    parameters: dict[str, Any] = {"lake": order.lake, "settings": order.settings}
+    chosen: Any = run_stage
+    if INGEST in order.steps:
+        chosen = run if tuple(order.steps) == ALL_STEPS else ingest_files
+        parameters |= {"source": order.source, "dataset": order.dataset}
+    else:
+        (parameters["stage"],) = order.steps
+    _mute_console()
+    # The heartbeat's thread costs a second at the end of every flow, and nobody listens for it here.
+    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        runner: ThreadPoolTaskRunner[Any] = ThreadPoolTaskRunner(max_workers=order.get_settings().workers)
+        return Outcome(**chosen.with_options(task_runner=runner)(**parameters))
+
+
+def _mute_console() -> None:
+    """Take Prefect's lines off the terminal; its server still gets them, and the user gets ours."""
+    for name in (None, "prefect", *logging.root.manager.loggerDict):
+        logger = logging.getLogger(name)
+        for handler in list(logger.handlers):
+            if isinstance(handler, PrefectConsoleHandler):
+                logger.removeHandler(handler)
+
+
+def serve_deployments() -> None:
+    """Serve the flows as deployments until interrupted; runs are started from Prefect's UI, CLI or schedules."""
+    from prefect import serve
+
+    flows: dict[str, Any] = {"run": run, "ingest": ingest_files, "quality": quality}
+    serve(*(served.to_deployment(name, description=served.__doc__) for name, served in flows.items()))

@@ -1,0 +1,304 @@
+"""Known defects, put into clean tracks on purpose, each written down.
+
+A vehicle carries one defect at most, and neither does the leader into which a vehicle is shifted; the one exception
+is that of an NGSIM overlap whose leader also misses frames, declared as both.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from pipeline.sample.neighbors import find_surroundings
+from pipeline.sample.scenarios import Plan
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+DEEPEST_START_M = 200.0
+SHALLOWEST_START_M = 20.0
+NEAREST_LEADER_M = 30.0
+ROLLING_MPS = 1.6
+"""Only vehicles slower than this swing back; the acceleration of that stays below 3.05 m/s2."""
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One injected defect.
+
+    Args:
+        name: late_start, overlap, backward, acceleration_spike, frozen_slow_speed, frame_gap, overlap_unseen.
+        vehicle: whose.
+        first_frame: of the damaged or missing entries.
+        last_frame: of them.
+        entries: how many.
+        value: late_start the x_m of the first entry kept; overlap and overlap_unseen the depth in m; backward the
+            lowest speed in m/s; acceleration_spike the acceleration in m/s2; frozen_slow_speed the speed in m/s.
+    """
+
+    name: str
+    vehicle: int
+    first_frame: int
+    last_frame: int
+    entries: int
+    value: float | None = None
+
+
+@dataclass
+class _Work:
+    """Columns being damaged, and who has been."""
+
+    rate_hz: float
+    random: np.random.Generator
+    vehicle: Integers
+    frame: Integers
+    lane: Integers
+    x: Floats
+    length: Floats
+    speed: Floats
+    accel: Floats
+    leader: Integers
+    begins: Integers
+    ends: Integers
+    never_written: npt.NDArray[np.bool_]
+    lost_later: npt.NDArray[np.bool_]
+    used: set[int] = field(default_factory=set)
+    defects: list[Defect] = field(default_factory=list)
+
+    def seconds(self, least: float, most: float) -> int:
+        """A random number of frames, at least one."""
+        return max(1, round(self.random.uniform(least, most) * self.rate_hz))
+
+    def free(self) -> list[int]:
+        """Vehicles (their places) without a defect, shuffled."""
+        return [int(place) for place in self.random.permutation(len(self.begins)) if int(place) not in self.used]
+
+    def rows(self, place: int) -> slice:
+        return slice(int(self.begins[place]), int(self.ends[place]))
+
+    def note(self, name: str, first: int, last: int, value: float | None = None) -> None:
+        """Declare the entries from row `first` to row `last` of one vehicle damaged."""
+        self.defects.append(
+            Defect(
+                name,
+                int(self.vehicle[first]),
+                int(self.frame[first]),
+                int(self.frame[last]),
+                last - first + 1,
+                None if value is None else float(value),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Injected:
+    """Damaged tracks.
+
+    Args:
+        tracks: as before, with a column `lost` (Boolean): entries that are seen, so that others name them as their
+            leader, but are missing from the file.
+        defects: all of them.
+    """
+
+    tracks: pl.DataFrame
+    defects: list[Defect]
+
+
+def inject(
+    tracks: pl.DataFrame,
+    plan: Plan,
+    *,
+    rate_hz: float,
+    on_ramp_lane: int | None,
+    unseen_leaders: bool,
+    random: np.random.Generator,
+) -> Injected:
+    """Damage the tracks of one subset.
+
+    Args:
+        tracks: sorted by vehicle, frame, without gaps.
+        plan: how many of which.
+        rate_hz: frames per second.
+        on_ramp_lane: whose vehicles begin in mid-section by nature and so cannot start late.
+        unseen_leaders: make one overlap with a leader that misses frames (formats that record a headway to it).
+        random: draws the same vehicles for the same seed.
+    """
+    vehicle = tracks["vehicle"].to_numpy().astype(np.int64)
+    begins = np.flatnonzero(np.diff(vehicle, prepend=-1))
+    work = _Work(
+        rate_hz=rate_hz,
+        random=random,
+        vehicle=vehicle,
+        frame=tracks["frame"].to_numpy().astype(np.int64),
+        lane=tracks["lane"].to_numpy().astype(np.int64),
+        x=tracks["x"].to_numpy().copy(),
+        length=tracks["length"].to_numpy(),
+        speed=tracks["speed"].to_numpy().copy(),
+        accel=tracks["accel"].to_numpy().copy(),
+        leader=find_surroundings(tracks).leader,
+        begins=begins,
+        ends=np.append(begins[1:], len(vehicle)),
+        never_written=np.zeros(len(vehicle), bool),
+        lost_later=np.zeros(len(vehicle), bool),
+    )
+    backward = int(plan.backward_share * len(begins))
+    for each, count in (
+        (_overlap(unseen_leaders), plan.overlaps),
+        (_late_start(on_ramp_lane), plan.late_starts),
+        (_backward, backward),
+        (_frozen, plan.frozen),
+        (_spike, plan.spikes),
+        (_gap, plan.gaps),
+    ):
+        _spread(work, each, count)
+    damaged = tracks.with_columns(
+        pl.Series("x", work.x),
+        pl.Series("speed", work.speed),
+        pl.Series("accel", work.accel),
+        pl.Series("lost", work.lost_later),
+    ).filter(~pl.Series(work.never_written))
+    return Injected(damaged, work.defects)
+
+
+Inflict = Callable[[_Work, int], bool]
+
+
+def _spread(work: _Work, inflict: Inflict, count: int) -> None:
+    """Damage up to `count` vehicles; those on which the defect makes no sense are passed by."""
+    for place in work.free():
+        if count == 0:
+            return
+        if place not in work.used and inflict(work, place):
+            work.used.add(place)
+            count -= 1
+
+
+def _run(work: _Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
+    """A random run of `wanted` rows at least `margin` rows from both ends of the track: first and last row."""
+    rows = work.rows(place)
+    room = rows.stop - rows.start - 2 * margin - wanted
+    if room < 0:
+        return None
+    first = rows.start + margin + int(work.random.integers(room + 1))
+    return first, first + wanted - 1
+
+
+def _slowest(work: _Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
+    """The run of `wanted` rows around the slowest row that is not near an end."""
+    rows = work.rows(place)
+    inner = work.speed[rows][margin : max(margin, rows.stop - rows.start - margin - wanted)]
+    if not len(inner):
+        return None
+    first = rows.start + margin + int(np.argmin(inner))
+    return first, first + wanted - 1
+
+
+def _late_start(on_ramp_lane: int | None) -> Inflict:
+    def inflict(work: _Work, place: int) -> bool:
+        """The first part of the track was never seen."""
+        rows = work.rows(place)
+        start = work.random.uniform(SHALLOWEST_START_M, DEEPEST_START_M)
+        first = rows.start
+        if work.frame[first] <= work.rate_hz + 1 or work.lane[first] == on_ramp_lane or work.x[first] > 5:
+            return False
+        kept = rows.start + int(np.argmax(work.x[rows] >= start))
+        if kept == first or rows.stop - kept < work.rate_hz:
+            return False
+        work.never_written[first:kept] = True
+        work.note("late_start", first, kept - 1, work.x[kept])
+        return True
+
+    return inflict
+
+
+def _overlap(unseen_leaders: bool) -> Inflict:
+    unseen = [unseen_leaders]
+
+    def inflict(work: _Work, place: int) -> bool:
+        """For a while the vehicle is recorded inside its leader."""
+        run = _run(work, place, work.seconds(0.4, 1.6), margin=round(work.rate_hz / 2))
+        if run is None:
+            return False
+        rows = slice(run[0], run[1] + 1)
+        leaders = work.leader[rows]
+        if (leaders < 0).any() or len(np.unique(work.vehicle[leaders])) > 1:
+            return False
+        ahead = int(np.searchsorted(work.begins, leaders[0], side="right")) - 1
+        rear = work.x[leaders] - work.length[leaders]
+        if ahead in work.used or (rear - work.x[rows] > NEAREST_LEADER_M).any():
+            return False
+        depth = float(work.random.uniform(0.4, 0.5 * min(4.0, work.length[leaders[0]])))
+        work.x[rows] = rear + depth
+        work.used.add(ahead)
+        work.note("overlap", *run, depth)
+        if unseen[0]:
+            # Some of the leader's entries are lost, but the headway to it has been recorded.
+            unseen[0] = False
+            lost = leaders[: max(1, len(leaders) // 2)]
+            work.lost_later[lost] = True
+            work.note("frame_gap", int(lost[0]), int(lost[-1]))
+            work.note("overlap_unseen", run[0], run[0] + len(lost) - 1, depth)
+        return True
+
+    return inflict
+
+
+def _backward(work: _Work, place: int) -> bool:
+    """The vehicle rolls back: a smooth swing where it is slow, wrong signs in its recorded speed where it is not."""
+    wanted = work.seconds(4.0, 5.0)
+    run = _slowest(work, place, wanted, margin=round(work.rate_hz / 2))
+    if run is None:
+        return False
+    rows = slice(run[0], run[1] + 1)
+    if work.speed[rows].max() < ROLLING_MPS:
+        # x falls back by `depth` m and returns; speed and acceleration are the derivatives of that.
+        lasts = wanted / work.rate_hz
+        depth = (work.speed[rows][: wanted // 2].max() + 0.3) * lasts / np.pi
+        phase = 2 * np.pi * (np.arange(wanted) + 1) / (wanted + 1)
+        work.x[rows] -= depth / 2 * (1 - np.cos(phase))
+        work.speed[rows] -= depth * np.pi / lasts * np.sin(phase)
+        work.accel[rows] -= depth * 2 * np.pi**2 / lasts**2 * np.cos(phase)
+        # Rounded to nothing in the file, these would be slow and without acceleration by chance.
+        work.accel[rows] = np.where(np.abs(work.accel[rows]) < 0.02, 0.02, work.accel[rows])
+    else:
+        rows = slice(run[0], run[0] + max(1, wanted // 6))
+        work.speed[rows] = -work.random.uniform(0.1, 0.6)
+    below = np.flatnonzero(work.speed[rows] < -0.02) + rows.start
+    work.speed[rows] = np.where(np.abs(work.speed[rows]) <= 0.02, 0.05, work.speed[rows])
+    for part in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1):
+        work.note("backward", int(part[0]), int(part[-1]), work.speed[part].min())
+    return True
+
+
+def _frozen(work: _Work, place: int) -> bool:
+    """A slow speed stays the same for a while, with exactly no acceleration."""
+    run = _slowest(work, place, work.seconds(0.4, 1.2), margin=round(work.rate_hz / 2))
+    if run is None:
+        return False
+    rows = slice(run[0], run[1] + 1)
+    work.speed[rows] = work.random.uniform(0.1, 1.45)
+    work.accel[rows] = 0.0
+    work.note("frozen_slow_speed", *run, work.speed[run[0]])
+    return True
+
+
+def _spike(work: _Work, place: int) -> bool:
+    """The recorded acceleration is beyond what cars do."""
+    run = _run(work, place, work.seconds(0.05, 0.5), margin=2)
+    if run is None:
+        return False
+    work.accel[run[0] : run[1] + 1] = work.random.uniform(3.2, 9.0)
+    work.note("acceleration_spike", *run, work.accel[run[0]])
+    return True
+
+
+def _gap(work: _Work, place: int) -> bool:
+    """Some frames in the middle of the track are missing."""
+    run = _run(work, place, work.seconds(0.1, 1.0), margin=round(work.rate_hz))
+    if run is None:
+        return False
+    work.lost_later[run[0] : run[1] + 1] = True
+    work.note("frame_gap", *run)
+    return True

@@ -1,0 +1,165 @@
+"""What is recorded: roads, traffic and how many defects of each kind, as data."""
+
+from dataclasses import dataclass, field
+
+FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata")
+"""Every raw format the generator writes."""
+
+DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata")
+"""What a sample holds unless told otherwise."""
+
+LEAST_MINUTES = 0.1
+MOST_MINUTES = 15.0
+"""The NGSIM-like recordings begin 15 minutes apart."""
+
+
+@dataclass(frozen=True)
+class Road:
+    """A straight carriageway; x runs in the direction of travel from the recorded window's entrance.
+
+    Args:
+        lanes: main lanes.
+        lane_width_m: of each of them.
+        window_m: length of the recorded window.
+        rate_hz: frames per second, which is also the simulation's clock.
+        limit_mps: speed limit.
+        ramp: an on-ramp joins: its lane (main lanes + 2) ends in an auxiliary lane (main lanes + 1).
+    """
+
+    lanes: int
+    lane_width_m: float
+    window_m: float
+    rate_hz: float
+    limit_mps: float
+    ramp: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many vehicles of a subset get which defect; fewer where a short recording offers no more.
+
+    Args:
+        late_starts: vehicles that lose the first part of their track.
+        overlaps: vehicles shifted into their leader for a while.
+        backward_share: greatest share of the vehicles that drive backwards for a while.
+        spikes: vehicles with some recorded accelerations beyond 3.05 m/s2.
+        frozen: vehicles with some recorded slow speeds of exactly no acceleration.
+        gaps: vehicles that lose frames in the middle of their track.
+    """
+
+    late_starts: int = 3
+    overlaps: int = 2
+    backward_share: float = 0.0
+    spikes: int = 3
+    frozen: int = 2
+    gaps: int = 2
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Who drives on a carriageway.
+
+    Args:
+        arrivals: vehicles per main lane and second.
+        trucks: their share.
+        bottleneck_mps: speed in the zone behind the window that holds the traffic up; None = free flow.
+        pulsing: for 15 of every 40 s that zone admits hardly anybody, so that waves of standing traffic run upstream.
+        ramp_arrivals: vehicles per second on the on-ramp, where there is one.
+        plan: the defects of this subset.
+    """
+
+    arrivals: float
+    trucks: float = 0.15
+    bottleneck_mps: float | None = None
+    pulsing: bool = False
+    ramp_arrivals: float = 0.0
+    plan: Plan = field(default_factory=Plan)
+
+    @property
+    def warm_up_s(self) -> float:
+        """Simulated before frame 1: long enough for the queue to reach the window, or the first vehicles its end."""
+        return 60.0 if self.bottleneck_mps is None else 200.0
+
+
+@dataclass(frozen=True)
+class HighdScenario:
+    """One recording over two carriageways.
+
+    Args:
+        recording: two digits.
+        location_id: of the site.
+        road: each carriageway.
+        share: its length in units of `minutes`.
+        month: `MM.YYYY`.
+        week_day: three letters.
+        start_time: `HH:MM`.
+        upper: traffic driving left.
+        lower: traffic driving right.
+        exponent: write the duration as a careless printf would (`5.400000e+01`), as some published files do.
+        damaged: insert duplicates and malformed lines into the tracks file.
+    """
+
+    recording: str
+    location_id: int
+    road: Road
+    share: float
+    month: str
+    week_day: str
+    start_time: str
+    upper: Traffic
+    lower: Traffic
+    exponent: bool = False
+    damaged: bool = False
+
+
+@dataclass(frozen=True)
+class NgsimScenario:
+    """One recording of the freeway.
+
+    Args:
+        start_time: local time of frame 1 on 2005-06-15, `HH:MM`.
+        first_vehicle_id: ids count from here.
+        share: its length in units of `minutes`.
+        traffic: who drives.
+    """
+
+    start_time: str
+    first_vehicle_id: int
+    share: float
+    traffic: Traffic
+
+
+TWO_LANES = Road(lanes=2, lane_width_m=3.75, window_m=420.0, rate_hz=25.0, limit_mps=34.0)
+THREE_LANES = Road(lanes=3, lane_width_m=3.75, window_m=420.0, rate_hz=25.0, limit_mps=34.0)
+FREEWAY = Road(lanes=5, lane_width_m=3.6576, window_m=640.0, rate_hz=10.0, limit_mps=27.0, ramp=True)
+
+RAMP_VISIBLE_M = 60.0
+WEAVE_BEGINS_M = 180.0
+WEAVE_ENDS_M = 430.0
+"""Where the on-ramp comes into view, where it becomes the auxiliary lane, and where that ends."""
+
+HIGHD = (
+    HighdScenario("01", 1, TWO_LANES, 1.9, "09.2017", "Tue", "08:38", Traffic(0.25), Traffic(0.36, trucks=0.2)),
+    HighdScenario(
+        "02", 2, THREE_LANES, 1.1, "10.2017", "Wed", "11:10",
+        Traffic(0.30),
+        Traffic(0.42, trucks=0.12, bottleneck_mps=11.0, plan=Plan(backward_share=0.01)),
+        exponent=True, damaged=True,
+    ),
+    HighdScenario(
+        "03", 1, TWO_LANES, 0.5, "09.2017", "Tue", "16:52",
+        Traffic(0.40, bottleneck_mps=2.5, pulsing=True, plan=Plan(backward_share=0.12)),
+        Traffic(0.30),
+    ),
+    HighdScenario("04", 2, THREE_LANES, 0.37, "11.2017", "Fri", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
+)  # fmt: skip
+
+_NGSIM_PLAN = Plan(late_starts=4, overlaps=3, backward_share=0.01, spikes=5, frozen=4, gaps=4)
+_MORNING = Traffic(0.30, trucks=0.1, bottleneck_mps=9.0, ramp_arrivals=0.12, plan=_NGSIM_PLAN)
+_QUEUE = Traffic(0.32, trucks=0.12, bottleneck_mps=5.0, pulsing=True, ramp_arrivals=0.10, plan=_NGSIM_PLAN)
+_LATER = Traffic(0.30, trucks=0.1, ramp_arrivals=0.15, plan=_NGSIM_PLAN)
+
+NGSIM_TEXT = (NgsimScenario("09:30", 1, 1.0, _MORNING),)
+NGSIM_SOCRATA = (NgsimScenario("09:45", 1, 0.8, _QUEUE), NgsimScenario("10:00", 951, 0.52, _LATER))
+NGSIM_CSV = (NgsimScenario("10:15", 1, 0.6, _LATER),)
+"""Which recordings a format holds; the published ones of that day lie at 07:50, 08:05 and 08:20."""

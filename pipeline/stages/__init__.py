@@ -1,0 +1,1 @@
+"""The stages: what each makes of a recording, planned from the manifest and free of any orchestrator."""

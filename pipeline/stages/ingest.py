@@ -1,0 +1,217 @@
+"""Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from pipeline.lake import Entry, LakeFile, Manifest, write_table
+from pipeline.lake.files import STAGING
+from pipeline.sources import SOURCES, RawFile, Source, SourceError
+from pipeline.sources.accounting import count_reasons, to_rejects
+from pipeline.sources.base import Canonical, Part
+from pipeline.stages.base import Job, make_entry, make_job
+from pipeline.stages.discovery import Discovery
+from schemas import INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
+
+VERSION = 1
+REJECTS_FILE = "rejects.parquet"
+_PLANNING_FACTS = ("subset", "site", "freeway", "vehicles", "entries")
+SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
+
+
+@dataclass(frozen=True)
+class FileContents:
+    """What reading a spilled file told: a small record the manifest remembers by the file's sha256."""
+
+    dataset: str
+    version: int
+    rows_read: int
+    recordings: list[str]
+    unassigned: int
+
+
+def files_to_read(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
+    """Files that hold several recordings and whose contents the manifest does not know."""
+    return [
+        (source, unit.files[0])
+        for source, unit in discovery.units
+        if source.spill is not None and not _known_contents(source, unit.files[0], manifest)
+    ]
+
+
+def _known_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[str, Any] | None:
+    contents = manifest.sources.get(file.sha256)
+    return contents if contents is not None and contents["version"] == source.version else None
+
+
+def spill_folder(root: Path, file: RawFile) -> Path:
+    """Where a file's rows wait, by recording, for the length of a writing session."""
+    return root / STAGING / "spilled" / file.sha256
+
+
+def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
+    """Spill one file that holds several recordings; returns its FileContents as a dict.
+
+    Raises:
+        SourceError: not one of its rows could be read.
+    """
+    source = SOURCE_BY_NAME[dataset]
+    assert source.spill is not None
+    folder = spill_folder(root, file)
+    folder.mkdir(parents=True, exist_ok=True)
+    spilled = source.spill(file, folder)
+    if not spilled.recordings:
+        raise SourceError(_unreadable(file, spilled.rows_read, spilled.rejects))
+    spilled.rejects.write_parquet(folder / REJECTS_FILE)
+    return vars(
+        FileContents(
+            dataset=dataset,
+            version=source.version,
+            rows_read=spilled.rows_read,
+            recordings=sorted(spilled.recordings),
+            unassigned=spilled.rejects.height if len(spilled.recordings) > 1 else 0,
+        )
+    )
+
+
+def _unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:
+    if rejects.is_empty():
+        return f"{file.name}: a header and no rows. Download it again."
+    line, reason, text = rejects.row(0)
+    return (
+        f"{file.name}, line {line}: none of its {rows_read} rows can be read; this one: {reason}. "
+        f"Got {text[:100]!r}. Download the file again, or repair it."
+    )
+
+
+def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
+    """One job per recording that the discovered files hold, and one per file with lines that belong to no recording.
+
+    Files whose contents are not known yet (see `files_to_read`) give no jobs.
+    """
+    by_recording: dict[tuple[str, str], list[RawFile]] = {}
+    jobs = []
+    for source, unit in discovery.units:
+        if unit.recording is not None:
+            by_recording[source.name, unit.recording] = list(unit.files)
+            continue
+        contents = _known_contents(source, unit.files[0], manifest)
+        if contents is None:
+            continue
+        for recording in contents["recordings"]:
+            by_recording.setdefault((source.name, recording), []).append(unit.files[0])
+        if contents["unassigned"]:
+            jobs.append(_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
+    jobs += [_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
+    return jobs
+
+
+def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
+    return make_job(
+        f"ingest/{dataset}/{title}",
+        version_of_stage=VERSION,
+        made_of={
+            "sources": [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files],
+            "source_version": SOURCE_BY_NAME[dataset].version,
+        },
+        inputs={
+            "dataset": dataset,
+            "recording": recording,
+            "files": [
+                {"path": str(file.path), "name": file.name, "dialect": file.dialect, "sha256": file.sha256}
+                for file in files
+            ],
+        },
+    )
+
+
+def files_of(job: Job) -> list[RawFile]:
+    """The raw files of an ingest job."""
+    return [RawFile(Path(file["path"]), file["name"], file["dialect"], file["sha256"]) for file in job.inputs["files"]]
+
+
+def needs_spill(job: Job) -> bool:
+    """Whether the job's files must have been read into the staging folder first."""
+    return SOURCE_BY_NAME[job.inputs["dataset"]].spill is not None
+
+
+def build(root: Path, job: Job) -> Entry:
+    """Make one recording's tables and account for the rows of its files.
+
+    Raises:
+        SourceError, schemas.StructureError: the recording cannot be used.
+    """
+    dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
+    if recording is None:
+        return _build_unassigned(root, job, files[0])
+    source = SOURCE_BY_NAME[dataset]
+    parts = [_spilled_part(root, file, recording) if needs_spill(job) else Part(file) for file in files]
+    canonical = source.to_canonical(parts, recording)
+    if not canonical.subsets:
+        raise SourceError(f"recording {recording}: no carriageway has entries ({files[-1].name}).")
+    written = _write(root, job, canonical)
+    info = {
+        "dataset": dataset,
+        "recording": recording,
+        "notes": list(canonical.notes),
+        "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
+        "rows_read": int(canonical.log["rows_read"].sum()),
+        "rows_dropped": int(canonical.log["rows_dropped"].sum()),
+    }
+    return make_entry(job, written, info)
+
+
+def _spilled_part(root: Path, file: RawFile, recording: str) -> Part:
+    folder = spill_folder(root, file)
+    alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
+    rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
+    return Part(file, pl.scan_parquet(folder / recording / "*.parquet"), rejects)
+
+
+def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFile]]:
+    dataset, recording = job.inputs["dataset"], job.inputs["recording"]
+    files: dict[str, list[LakeFile]] = {}
+    for subset in canonical.subsets:
+        values = {"dataset": dataset, "subset": subset.name}
+        for table, frame in ((TRACKS, subset.tracks), (VEHICLES, subset.vehicles), (SUBSETS, subset.facts)):
+            written = write_table(root, table, frame, values, job.fingerprint, where=f"recording {recording}")
+            files.setdefault(table.name, []).extend(written)
+    for table, frame in ((INGEST_LOG, canonical.log), (REJECTS, canonical.rejects)):
+        files[table.name] = write_table(
+            root, table, frame, {"dataset": dataset}, job.fingerprint, where=f"recording {recording}"
+        )
+    return files
+
+
+def _build_unassigned(root: Path, job: Job, file: RawFile) -> Entry:
+    dataset = job.inputs["dataset"]
+    lines = pl.read_parquet(spill_folder(root, file) / REJECTS_FILE)
+    log = {
+        "dataset": dataset,
+        "recording": None,
+        "file": file.name,
+        "sha256": file.sha256,
+        "dialect": file.dialect,
+        "rows_read": lines.height,
+        "rows_kept": 0,
+        "rows_dropped": lines.height,
+        "dropped_by_reason": count_reasons(lines),
+    }
+    rejects = to_rejects(lines.with_columns(file=pl.lit(file.name)), dataset, None)
+    values = {"dataset": dataset}
+    files = {
+        table.name: write_table(root, table, frame, values, job.fingerprint, where=file.name)
+        for table, frame in ((INGEST_LOG, pl.DataFrame([log], schema=INGEST_LOG.dtypes)), (REJECTS, rejects))
+    }
+    info = {
+        "dataset": dataset,
+        "recording": None,
+        "notes": [f"{file.name}: {lines.height} lines belong to no recording and stand in rejects"],
+        "subsets": [],
+        "rows_read": lines.height,
+        "rows_dropped": lines.height,
+    }
+    return make_entry(job, files, info)

@@ -1,0 +1,16 @@
+"""The stages after ingestion, in the order in which `tracklake run` goes through them."""
+
+from pipeline.stages import repair, report, samples, score, split, tensors, validate
+from pipeline.stages.base import Stage
+
+STAGES: tuple[Stage, ...] = (
+    Stage("validate", "Check every entry against the rules.", validate.plan, validate.build),
+    Stage("repair", "Find late starts and estimate what is missing of them.", repair.plan, repair.build),
+    Stage("samples", "Draw samples with maneuvers and neighbors.", samples.plan, samples.build),
+    Stage("split", "Divide the subsets into train and eval.", split.plan, split.build),
+    Stage("tensors", "Write the split as flat arrays.", tensors.plan, tensors.build),
+    Stage("score", "Score the constant-velocity baseline.", score.plan, score.build),
+    Stage("report", "Write the quality report.", report.plan, report.build),
+)
+
+STAGE_BY_NAME = {stage.name: stage for stage in STAGES}

@@ -1,0 +1,63 @@
+"""Report: the lake's quality as one page for people and one document for programs."""
+
+import hashlib
+import json
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from pipeline.lake import Entry, LakeFile, Manifest, connect, load, write_aside
+from pipeline.lake.files import MODELS, REPORTS
+from pipeline.settings import Settings
+from pipeline.stages.base import Job, make_entry, make_job
+from pipeline.stages.score import collect_scores
+
+VERSION = 1
+PAGE, DOCUMENT = "index.html", "quality.json"
+SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy", "scikit-learn")
+
+
+def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
+    """One job over everything that is in the lake."""
+    entries = {key: entry.fingerprint for key, entry in manifest.entries.items() if entry.stage != "report"}
+    if not any(key.startswith("ingest/") for key in entries):
+        return []
+    runs = {
+        path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        for path in sorted((root / MODELS).glob("*/metrics.json"))
+    }
+    made_of = {"entries": entries, "runs": runs, "settings": _shown(settings)}
+    return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
+
+
+def _shown(settings: Settings) -> dict[str, object]:
+    """Settings that change what is in the lake, not where it stands or how fast it is made."""
+    return settings.model_dump(mode="json", exclude={"lake", "workers"})
+
+
+def build(root: Path, job: Job, settings: Settings) -> Entry:
+    """Query the lake and write reports/index.html and reports/quality.json."""
+    from quality_reports.report import build_report
+
+    manifest = load(root)
+    provenance = {
+        "lake": root.resolve().name,
+        "lake_id": manifest.lake_id,
+        "created": datetime.now(tz=UTC).isoformat(timespec="seconds"),
+        "tracklake": version("tracklake"),
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in SHOWN_VERSIONS},
+        "thresholds": settings.thresholds,
+        "settings": _shown(settings),
+        "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
+    }
+    with connect(root) as connection:
+        report = build_report(connection, provenance, scores=collect_scores(root, manifest))
+    folder = root / REPORTS
+    folder.mkdir(exist_ok=True)
+    files = []
+    for name, content in ((PAGE, report.html), (DOCUMENT, json.dumps(report.quality, indent=1, allow_nan=False))):
+        write_aside(folder / name, content.encode())
+        files.append(LakeFile(f"{REPORTS}/{name}", None, (folder / name).stat().st_size))
+    return make_entry(job, {REPORTS: files}, {"headline": report.quality.get("headline", {})})

@@ -1,0 +1,61 @@
+"""Samples: prediction origins with maneuvers and neighbors, and every entry dropped by reason."""
+
+from pathlib import Path
+
+from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from pipeline.settings import Settings
+from pipeline.stages.base import Job, make_entry, make_job, recordings, upstream
+from pipeline.transforms.samples import draw_samples
+from schemas import MISSING_STARTS, NEIGHBORS, SAMPLE_DROPS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_STARTS
+
+VERSION = 1
+
+
+def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
+    """One job per freeway recording; validation and repair come before."""
+    protocol = settings.get_protocol()
+    return [
+        make_job(
+            f"samples/{recording['dataset']}/{recording['recording']}",
+            version_of_stage=VERSION,
+            made_of={
+                "ingest": recording["fingerprint"],
+                "validate": upstream(manifest, "validate", recording),
+                "repair": upstream(manifest, "repair", recording),
+                "protocol": protocol.digest,
+            },
+            inputs={"dataset": recording["dataset"], "subsets": [item["subset"] for item in recording["subsets"]]},
+        )
+        for recording in recordings(manifest, freeway_only=True)
+    ]
+
+
+def build(root: Path, job: Job, settings: Settings) -> Entry:
+    """Draw the samples of a recording's subsets."""
+    manifest, dataset = load(root), job.inputs["dataset"]
+    files: dict[str, list[LakeFile]] = {}
+    info = {"samples": 0, "collisions": 0}
+    for subset in job.inputs["subsets"]:
+        values = {"dataset": dataset, "subset": subset}
+        facts = scan(root, manifest, SUBSETS, **values).collect().row(0, named=True)
+        drawn = draw_samples(
+            scan(root, manifest, TRACKS, **values).collect(),
+            scan(root, manifest, VEHICLE_STARTS, **values).collect(),
+            scan(root, manifest, MISSING_STARTS, **values).collect(),
+            protocol=settings.get_protocol(),
+            dataset=dataset,
+            subset=subset,
+            first_frame=facts["first_frame"],
+            frame_rate_hz=facts["frame_rate_hz"],
+            excluded=scan(root, manifest, SUBSET_STATUS, **values).collect()["excluded"][0],
+        )
+        for table, frame in (
+            (SAMPLES, drawn.samples),
+            (SAMPLE_DROPS, drawn.sample_drops),
+            (NEIGHBORS, drawn.neighbors),
+        ):
+            written = write_table(root, table, frame, values, job.fingerprint, where=subset)
+            files.setdefault(table.name, []).extend(written)
+        info["samples"] += drawn.samples.height
+        info["collisions"] += drawn.collisions
+    return make_entry(job, files, info)

@@ -1,0 +1,57 @@
+"""Score: the error of the simplest model on the evaluation part, the first number for others to stand beside."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.lake import Entry, LakeFile, Manifest, load
+from pipeline.lake.files import MODELS, TENSORS
+from pipeline.settings import Settings
+from pipeline.stages.base import Job, make_entry, make_job
+from pipeline.stages.tensors import tensor_folder
+
+VERSION = 1
+BASELINE = "constant-velocity"
+
+
+def plan(_root: Path, manifest: Manifest, _settings: Settings) -> list[Job]:
+    """One job where there are tensors."""
+    tensors = manifest.entries.get(TENSORS)
+    if tensors is None or tensors.info["path"] is None:
+        return []
+    made_of = {"tensors": tensors.fingerprint, "model": BASELINE}
+    return [make_job("score", version_of_stage=VERSION, made_of=made_of, inputs={})]
+
+
+def build(root: Path, job: Job, _settings: Settings) -> Entry:
+    """Evaluate the baseline and write it as a run like any other."""
+    from training.train import train
+
+    out = root / MODELS / BASELINE
+    metrics = train(BASELINE, tensor_folder(root, load(root)), out)
+    files = [
+        LakeFile(file.relative_to(root).as_posix(), None, file.stat().st_size)
+        for file in sorted(out.iterdir())
+        if file.is_file()
+    ]
+    return make_entry(job, {MODELS: files}, {"evaluation": metrics["evaluation"]})
+
+
+def collect_scores(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
+    """What the runs in the lake scored, of those that were made from the tensors that are live now.
+
+    Returns:
+        {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
+    """
+    if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
+        return []
+    index = json.loads((tensor_folder(root, manifest) / "index.json").read_text(encoding="utf-8"))
+    scores = []
+    for path in sorted((root / MODELS).glob("*/metrics.json")):
+        config = json.loads(path.with_name("config.json").read_text(encoding="utf-8"))
+        evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
+        if evaluation is None or (config["protocol"], config["blocks"]) != (index["protocol"], index["blocks"]):
+            continue
+        rows = [{name: horizon[name] for name in ("seconds", "rmse_m", "n")} for horizon in evaluation["horizons"]]
+        scores.append({"model": path.parent.name, "part": evaluation["part"], "rows": rows})
+    return scores

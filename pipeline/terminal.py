@@ -1,0 +1,189 @@
+"""What a person at a terminal sees: progress bars, summaries, tables. Results go to stdout, the rest to stderr."""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from pipeline.progress import Silent, reporting_to
+
+if TYPE_CHECKING:
+    import duckdb
+
+    from pipeline.work import Outcome
+
+SHOWN_ROWS = 40
+"""Rows of a query's result that are shown to a person; csv, json and parquet give all."""
+
+
+class Terminal:
+    """Where output goes, and how much of it.
+
+    Args:
+        quiet: errors only.
+        as_json: one JSON object on stdout at the end, nothing else there.
+    """
+
+    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
+        self.out = Console(highlight=False, soft_wrap=True)
+        self.err = Console(stderr=True, highlight=False, soft_wrap=True)
+        self.as_json = as_json
+        self.talks = not (quiet or as_json)
+
+    def say(self, text: str, *, style: str = "") -> None:
+        """A line for people."""
+        if self.talks:
+            self.out.print(escape(text), style=style or None)
+
+    def complain(self, text: str, *, label: str = "error") -> None:
+        """An error or refusal; always shown, on stderr."""
+        colour = "red" if label == "error" else "yellow"
+        self.err.print(f"[bold {colour}]{label}:[/] {escape(text)}")
+
+    def give(self, record: dict[str, Any]) -> None:
+        """The result for programs, where they asked for it."""
+        if self.as_json:
+            json.dump(record, sys.stdout, indent=1, allow_nan=False, default=str)
+            sys.stdout.write("\n")
+
+    @contextmanager
+    def working(self) -> Iterator[None]:
+        """Show progress bars for the length of a block."""
+        if not self.talks:
+            with reporting_to(Silent()):
+                yield
+            return
+        columns = (
+            TextColumn("{task.description:<9}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("[dim]{task.fields[title]}"),
+        )
+        with Progress(*columns, console=self.err) as progress, reporting_to(_Bars(progress)):
+            yield
+
+
+class _Bars:
+    """One bar per stage."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._bars: dict[str, TaskID] = {}
+
+    def begin(self, stage: str, total: int) -> None:
+        if stage in self._bars:
+            bar = self._bars[stage]
+            self._progress.update(bar, total=(self._progress.tasks[bar].total or 0) + total)
+        else:
+            self._bars[stage] = self._progress.add_task(stage, total=total, title="")
+
+    def advance(self, stage: str, title: str) -> None:
+        self._progress.update(self._bars[stage], advance=1, title=escape(title))
+
+    def say(self, text: str) -> None:
+        self._progress.console.print(escape(text))
+
+
+def show_outcome(terminal: Terminal, outcome: "Outcome") -> None:
+    """Print what came of an order: notes, refusals, failures."""
+    for note in dict.fromkeys(outcome.notes):
+        terminal.say(f"note: {note}", style="dim")
+    if outcome.passed_by and terminal.talks:
+        shown = ", ".join(outcome.passed_by[:5]) + (", ..." if len(outcome.passed_by) > 5 else "")
+        terminal.say(f"note: passed by, no raw data: {shown}", style="dim")
+    for message in outcome.refused:
+        terminal.complain(message, label="refused")
+    for message in outcome.failed:
+        terminal.complain(message)
+
+
+def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
+    """Print the report's figures, where it stands, and two commands to try next."""
+    head = quality["headline"]
+    excluded, late, judged = _some(head["excluded_subsets"]), _some(head["late_starts"]), _some(head["eligible_starts"])
+    lines = {
+        "recordings": f"{head['recordings']:,} recordings, {head['subsets']:,} subsets, {excluded} excluded",
+        "tracks": f"{head['vehicles']:,} vehicles, {head['entries']:,} entries",
+        "rows": f"{head['rows_read']:,} read, {head['rows_dropped']:,} rejected",
+        "quality": f"{_some(head['vehicles_with_errors'])} vehicles with errors; {late} late starts of {judged} judged",
+        "samples": f"{_some(head['samples'])}" + _balance(quality),
+    }
+    for score in quality["scores"]:
+        rmse = "  ".join(
+            f"{row['seconds']} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
+        )
+        lines[f"RMSE, m ({score['model']})"] = f"{rmse}  (n = {score['rows'][0]['n']:,} at 1 s)"
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for name, value in lines.items():
+        table.add_row(f"[bold]{escape(name)}", escape(value))
+    if not terminal.talks:
+        return
+    terminal.out.print(table)
+    terminal.out.print(f"\n[bold green]report[/] {escape(str(report.resolve()))}", soft_wrap=True)
+    at = "" if lake == Path("lake") else f" --lake {lake}"
+    terminal.out.print("\nTry next:")
+    terminal.out.print(
+        escape(f'  tracklake sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
+    )
+    second = f"  tracklake train lstm{at}" if head["samples"] else f'  tracklake sql "FROM subsets"{at}'
+    terminal.out.print(escape(second))
+
+
+def _some(count: int | None) -> str:
+    return "no" if count is None else f"{count:,}"
+
+
+def _balance(quality: dict[str, Any]) -> str:
+    parts = [
+        f"{row['dataset']} {row['part']} {row['vehicle_share']:.1%}"
+        for row in quality["splits"]["balance"]
+        if row["vehicle_share"] is not None
+    ]
+    return f"; split by vehicles: {', '.join(parts)}" if parts else ""
+
+
+def show_relation(relation: "duckdb.DuckDBPyRelation", terminal: Terminal) -> None:
+    """Print a query's first rows as a table that keeps every column."""
+    rows = relation.limit(SHOWN_ROWS + 1).fetchall()
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    numeric = ("INT", "FLOAT", "DOUBLE", "DECIMAL", "HUGEINT")
+    for name, kind in zip(relation.columns, relation.types, strict=True):
+        right = any(word in str(kind) for word in numeric) and "(" not in str(kind).removeprefix("DECIMAL")[:1]
+        table.add_column(escape(name), justify="right" if right else "left", no_wrap=True)
+    for row in rows[:SHOWN_ROWS]:
+        table.add_row(*(escape(_cell(value)) for value in row))
+    terminal.out.print(table, crop=False, no_wrap=True, overflow="ignore")
+    if len(rows) > SHOWN_ROWS:
+        terminal.err.print(f"[dim]the first {SHOWN_ROWS} rows; --format csv, json or parquet gives all[/]")
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "null"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def show_scores(terminal: Terminal, evaluations: Sequence[dict[str, Any]]) -> None:
+    """Print RMSE by horizon with the number of samples behind each."""
+    for evaluation in evaluations:
+        title = (
+            f"{evaluation['model']} on {evaluation['part']} of {evaluation['split']} "
+            f"({evaluation['samples']:,} samples, protocol {evaluation['protocol']})"
+        )
+        table = Table(title=escape(title), title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0))
+        for heading in ("horizon", "RMSE m", "longitudinal m", "lateral m", "MAE m", "n"):
+            table.add_column(heading, justify="right")
+        for row in evaluation["horizons"]:
+            values = [row[name] for name in ("rmse_m", "rmse_longitudinal_m", "rmse_lateral_m", "mae_m")]
+            shown = ["-" if value is None else f"{value:.2f}" for value in values]
+            table.add_row(f"{row['seconds']} s", *shown, f"{row['n']:,}")
+        if terminal.talks:
+            terminal.out.print(table)

@@ -1,0 +1,117 @@
+"""Entries on a protocol's clock: tick k lies k / rate_hz seconds after the recording's first frame."""
+
+from fractions import Fraction
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+CLOCK_DTYPES: dict[str, pl.DataType] = {
+    "vehicle_id": pl.Int32(),
+    "tick": pl.Int32(),
+    "frame": pl.Int32(),
+    "x_m": pl.Float64(),
+    "y_m": pl.Float64(),
+    "lane": pl.Int16(),
+    "speed_mps": pl.Float32(),
+    "segment": pl.Int32(),
+}
+"""What a frame of entries on the clock holds; see `put_on_clock`."""
+
+
+def find_stride(*, frame_rate_hz: float, rate_hz: int) -> Fraction:
+    """Frames of the source per tick of the clock, exactly (25 Hz to 10 Hz: 5/2).
+
+    Raises:
+        ValueError: the clock is faster than the source; positions between frames are interpolated, never multiplied.
+    """
+    stride = Fraction(frame_rate_hz).limit_denominator(1001) / rate_hz
+    if stride < 1:
+        raise ValueError(
+            f"cannot put {frame_rate_hz:g} Hz tracks on a {rate_hz} Hz clock: expected a protocol rate of at most "
+            f"{frame_rate_hz:g} Hz; choose a protocol with a lower rate_hz"
+        )
+    return stride
+
+
+def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float, rate_hz: int) -> pl.DataFrame:
+    """Select (or interpolate) the entries on the clock, by frame and never by row (DESIGN section 7).
+
+    Tick k lies at frame `first_frame + k * frame_rate_hz / rate_hz`. Where that is a whole number the source's own
+    entry is taken; where it is not, x_m, y_m and speed_mps are linear between the two frames around it and the lane
+    is that of the earlier one. Both frames must exist: a gap is never bridged.
+
+    Args:
+        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
+        first_frame: the recording's first frame, where tick 0 lies (highD 1, NGSIM whatever it is).
+        frame_rate_hz: the source's.
+        rate_hz: the clock's.
+
+    Returns:
+        CLOCK_DTYPES, sorted by vehicle_id, tick; `frame` is null where no source frame falls on the tick. `segment`
+        numbers the gap-free runs of source frames, so that ticks are consecutive within a segment. A track that
+        skips a frame starts a new segment even if the clock would not have used that frame.
+
+    Raises:
+        ValueError: the clock is faster than the source.
+    """
+    stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
+    frames, ticks = stride.numerator, stride.denominator
+    position = (pl.col("frame").cast(pl.Int64) - first_frame) * ticks
+    follows = (pl.col("vehicle_id") == pl.col("vehicle_id").shift(1)) & (
+        pl.col("frame") - pl.col("frame").shift(1) == 1
+    )
+    entries = tracks.lazy().select(
+        "vehicle_id",
+        "frame",
+        "x_m",
+        "y_m",
+        "lane",
+        "speed_mps",
+        tick=(position + frames - 1) // frames,
+        segment=(~follows.fill_null(value=False)).cast(pl.Int32).cum_sum(),
+    )
+    columns = [pl.col(name).cast(dtype) for name, dtype in CLOCK_DTYPES.items()]
+    if ticks == 1:
+        on_frame = (pl.col("frame").cast(pl.Int64) - first_frame) % frames == 0
+        return entries.filter(on_frame).select(columns).collect()
+
+    # The first tick at or after an entry lies `beyond` / `ticks` frames after it: on the entry itself, before the
+    # next frame, or farther (then it belongs to a later entry).
+    beyond = pl.col("tick") * frames - position
+    on_frame = beyond == 0
+    next_is_adjacent = (pl.col("segment") == pl.col("segment").shift(-1)).fill_null(value=False)
+    share = beyond / ticks
+
+    def between(name: str) -> pl.Expr:
+        now = pl.col(name).cast(pl.Float64)
+        return pl.when(on_frame).then(now).otherwise(now + share * (now.shift(-1) - now)).alias(name)
+
+    return (
+        entries.with_columns(
+            between("x_m"),
+            between("y_m"),
+            between("speed_mps"),
+            frame=pl.when(on_frame).then("frame"),
+            used=on_frame | ((beyond < ticks) & next_is_adjacent),
+        )
+        .filter("used")
+        .select(columns)
+        .collect()
+    )
+
+
+def bound_segments(clock: pl.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last row of the segment that each row of the clock stands in.
+
+    Args:
+        clock: segment; the rows of a segment stand together, as `put_on_clock` leaves them.
+
+    Returns:
+        Two arrays (N,) of row numbers. Ticks are consecutive within a segment, so rows differ as ticks do.
+    """
+    segment = clock["segment"].to_numpy()
+    starts = np.flatnonzero(np.diff(segment, prepend=segment[:1] - 1))
+    lengths = np.diff(starts, append=segment.size)
+    first = np.repeat(starts, lengths)
+    return first, first + np.repeat(lengths, lengths) - 1

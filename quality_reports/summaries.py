@@ -1,0 +1,169 @@
+"""The report's numbers: one SQL statement per file over the lake's views, gathered into plain values."""
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import date, datetime
+from importlib.resources import files
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+from quality_reports.rules import RULES, Rule, describe
+from schemas.columns import PARTS
+
+if TYPE_CHECKING:
+    import duckdb
+
+QUALITY_SCHEMA = "tracklake/quality/1"
+REJECTS_PER_FILE = 10
+REJECT_CHARACTERS = 300
+
+Row = dict[str, Any]
+Parameters = Mapping[str, Any]
+
+
+def statement(name: str) -> str:
+    """The text of `sql/<name>.sql`."""
+    return (files("quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
+
+
+def query(connection: "duckdb.DuckDBPyConnection", name: str, parameters: Parameters | None = None) -> list[Row]:
+    """Run `sql/<name>.sql` and return its rows as dictionaries of plain values.
+
+    Args:
+        connection: with the catalog's views.
+        name: the file's name without its suffix.
+        parameters: values of its $names.
+    """
+    # Not on a cursor: it would be a connection of its own, without the caller's local settings and registered frames.
+    result = connection.execute(statement(name), dict(parameters or {}))
+    names = [column[0] for column in result.description or ()]
+    return [dict(zip(names, plain(row), strict=True)) for row in result.fetchall()]
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a setting may hold
+    """Turn a value into what JSON knows: NaN and infinity into None, paths and dates into text, tuples into lists.
+
+    Raises:
+        TypeError: the value is of no such kind.
+    """
+    if value is None or isinstance(value, bool | str | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, Sequence | set | frozenset) and not isinstance(value, bytes):
+        return [plain(each) for each in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    if isinstance(value, PurePath):
+        return str(value)
+    if hasattr(value, "__float__"):  # Decimal, NumPy scalars
+        return plain(float(value))
+    raise TypeError(f"cannot put a {type(value).__name__} into the report: {value!r}")
+
+
+def collect(
+    connection: "duckdb.DuckDBPyConnection",
+    provenance: Mapping[str, Any],
+    *,
+    rules: Sequence[Rule] = RULES,
+    scores: Sequence[Mapping[str, Any]] | None = None,
+) -> Row:
+    """Gather every number of the report: what `quality.json` holds and the page shows.
+
+    Rows are those of `sql/<name>.sql` (their first lines say what a row is); units are in the names; shares are
+    0 to 1; null means unknown or not done, never zero. Nothing here depends on the clock or on row order.
+
+    Returns a mapping with the keys
+        schema: "tracklake/quality/1"; its number grows when a key changes meaning or goes.
+        headline: one row of headline.sql.
+        stages: [{stage, possible, done}] in subsets; rows of stages.sql.
+        left_out: [{dataset, stages, reason, subsets}]; rows of left_out.sql.
+        subsets: rows of subsets.sql.
+        rules: [{name, severity, unit, thresholds: [{name, value, default, unit}], meaning, source, columns,
+            total, datasets: [..], subsets: [..]}]; the last three are rows of findings.sql: runs, vehicles,
+            vehicle_share, entries, entry_share, worst, subsets_checked, subsets_all.
+        speeds: {summary: rows of speeds.sql, histogram: rows of speed_histogram.sql}.
+        starts: {subsets: rows of starts.sql, positions: rows of start_positions.sql}.
+        samples: {subsets: rows of samples.sql, drops: rows of sample_drops.sql}.
+        splits: {balance: rows of split_balance.sql, members: rows of split_members.sql}.
+        ingestion: {files: rows of ingested_files.sql, rejects: rows of rejects.sql}.
+        scores: [{model, part, rows: [{seconds, rmse_m, n}]}], empty unless given.
+        provenance: as given, and source_files: rows of source_files.sql.
+
+    Args:
+        connection: with the views tracks, vehicles, subsets, findings, start_cutoffs, missing_starts, samples,
+            sample_drops, neighbors, splits, split_balance, ingest_log and rejects; they may be empty.
+        provenance: anything worth citing: lake, tracklake, versions, settings...; `thresholds`, where given, are the
+            overrides that validation ran with.
+        rules: what validation judged by.
+        scores: what evaluation found.
+
+    Raises:
+        ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
+    """
+    return {
+        "schema": QUALITY_SCHEMA,
+        "headline": query(connection, "headline")[0],
+        "stages": query(connection, "stages"),
+        "left_out": query(connection, "left_out"),
+        "subsets": query(connection, "subsets"),
+        "rules": _rules(connection, rules, provenance.get("thresholds") or {}),
+        "speeds": {"summary": query(connection, "speeds"), "histogram": query(connection, "speed_histogram")},
+        "starts": {"subsets": query(connection, "starts"), "positions": query(connection, "start_positions")},
+        "samples": {"subsets": query(connection, "samples"), "drops": query(connection, "sample_drops")},
+        "splits": {
+            "balance": query(connection, "split_balance", {"parts": list(PARTS)}),
+            "members": query(connection, "split_members", {"parts": list(PARTS)}),
+        },
+        "ingestion": {
+            "files": query(connection, "ingested_files"),
+            "rejects": query(
+                connection,
+                "rejects",
+                {"rejects_per_file": REJECTS_PER_FILE, "reject_characters": REJECT_CHARACTERS},
+            ),
+        },
+        "scores": plain(list(scores or ())),
+        "provenance": {**plain(provenance), "source_files": query(connection, "source_files")},
+    }
+
+
+def _rules(
+    connection: "duckdb.DuckDBPyConnection", rules: Sequence[Rule], thresholds: Mapping[str, float]
+) -> list[Row]:
+    """Each rule's declaration, with what was found in the whole lake, per dataset and per subset."""
+    rows = query(
+        connection,
+        "findings",
+        {"rules": [rule.name for rule in rules], "columns": [list(rule.columns) for rule in rules]},
+    )
+    extremes = {rule.name: "least" if rule.extreme == "min" else "greatest" for rule in rules}
+    found: dict[str, list[Row]] = {rule.name: [] for rule in rules}
+    for row in rows:
+        name = row.pop("rule")
+        least_and_greatest = {"least": row.pop("least"), "greatest": row.pop("greatest")}
+        found[name].append({**row, "worst": least_and_greatest[extremes[name]]})
+    nothing = dict.fromkeys(("runs", "vehicles", "vehicle_share", "entries", "entry_share", "worst"))
+    return [
+        {
+            **declared,
+            "total": next(
+                (_without(row, "dataset", "subset") for row in found[declared["name"]] if row["dataset"] is None),
+                {"subsets_checked": 0, "subsets_all": 0, **nothing},
+            ),
+            "datasets": [
+                _without(row, "subset")
+                for row in found[declared["name"]]
+                if row["dataset"] is not None and row["subset"] is None
+            ],
+            "subsets": [row for row in found[declared["name"]] if row["subset"] is not None],
+        }
+        for declared in describe(rules, thresholds)
+    ]
+
+
+def _without(row: Row, *names: str) -> Row:
+    """The row without some of its columns."""
+    return {key: value for key, value in row.items() if key not in names}
