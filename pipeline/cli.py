@@ -167,8 +167,8 @@ def train(
         root = _settings(lake=lake).lake
         tensors = tensor_folder(root, load(root))
         out = root / MODELS / (name or model)
-        with terminal.working():
-            metrics = train_model(model, tensors, out, TrainConfig(seconds=seconds, seed=seed), terminal.say)
+        with terminal.measuring(f"train {model}") as tell:
+            metrics = train_model(model, tensors, out, TrainConfig(seconds=seconds, seed=seed), tell)
         if metrics["evaluation"] is not None:
             show_scores(terminal, [metrics["evaluation"]])
         terminal.say(f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report")
@@ -288,6 +288,11 @@ def _order(
     plain = settings.model_dump(mode="json", exclude_unset=True)
     order = Order(str(settings.lake), steps, source, dataset, plain)
     discovery = survey(order) if source is not None else None
+    if discovery is not None and not discovery.units:
+        # Nothing can come of it, so no lake is made for it either.
+        for message in discovery.refusals:
+            terminal.complain(message, label="refused")
+        raise typer.Exit(FAILED)
     if is_idle(order, discovery):
         terminal.say("nothing to do: the lake is up to date", style="dim")
         return Outcome(refused=list(discovery.refusals) if discovery else [])

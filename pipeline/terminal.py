@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,6 +70,17 @@ class Terminal:
         with Progress(*columns, console=self.err) as progress, reporting_to(_Bars(progress)):
             yield
 
+    @contextmanager
+    def measuring(self, title: str) -> Iterator[Callable[[float, float], None]]:
+        """Show one bar that is told the share done (0 to 1) and the loss in m2."""
+        if not self.talks:
+            yield lambda _share, _loss: None
+            return
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
+        with Progress(*columns, TextColumn("[dim]{task.fields[loss]}"), console=self.err) as progress:
+            bar = progress.add_task(escape(title), total=1.0, loss="")
+            yield lambda share, loss: progress.update(bar, completed=share, loss=f"loss {loss:.3f} m2")
+
 
 class _Bars:
     """One bar per stage."""
@@ -108,12 +119,13 @@ def show_outcome(terminal: Terminal, outcome: "Outcome") -> None:
 def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
     """Print the report's figures, where it stands, and two commands to try next."""
     head = quality["headline"]
-    excluded, late, judged = _some(head["excluded_subsets"]), _some(head["late_starts"]), _some(head["eligible_starts"])
+    excluded, judged = _some(head["excluded_subsets"]), head["eligible_starts"]
+    late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"
     lines = {
         "recordings": f"{head['recordings']:,} recordings, {head['subsets']:,} subsets, {excluded} excluded",
         "tracks": f"{head['vehicles']:,} vehicles, {head['entries']:,} entries",
         "rows": f"{head['rows_read']:,} read, {head['rows_dropped']:,} rejected",
-        "quality": f"{_some(head['vehicles_with_errors'])} vehicles with errors; {late} late starts of {judged} judged",
+        "quality": f"{_some(head['vehicles_with_errors'])} vehicles with errors; " + late,
         "samples": f"{_some(head['samples'])}" + _balance(quality),
     }
     for score in quality["scores"]:
@@ -121,20 +133,14 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
             f"{row['seconds']} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
         )
         lines[f"RMSE, m ({score['model']})"] = f"{rmse}  (n = {score['rows'][0]['n']:,} at 1 s)"
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    width = max(map(len, lines)) + 2
     for name, value in lines.items():
-        table.add_row(f"[bold]{escape(name)}", escape(value))
-    if not terminal.talks:
-        return
-    terminal.out.print(table)
-    terminal.out.print(f"\n[bold green]report[/] {escape(str(report.resolve()))}", soft_wrap=True)
+        terminal.say(f"{name:<{width}}{value}")
+    terminal.say(f"{'report':<{width}}{report.resolve()}", style="bold green")
     at = "" if lake == Path("lake") else f" --lake {lake}"
-    terminal.out.print("\nTry next:")
-    terminal.out.print(
-        escape(f'  tracklake sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
-    )
-    second = f"  tracklake train lstm{at}" if head["samples"] else f'  tracklake sql "FROM subsets"{at}'
-    terminal.out.print(escape(second))
+    terminal.say("\nTry next:")
+    terminal.say(f'  tracklake sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
+    terminal.say(f"  tracklake train lstm{at}" if head["samples"] else f'  tracklake sql "FROM subsets"{at}')
 
 
 def _some(count: int | None) -> str:
@@ -153,16 +159,20 @@ def _balance(quality: dict[str, Any]) -> str:
 def show_relation(relation: "duckdb.DuckDBPyRelation", terminal: Terminal) -> None:
     """Print a query's first rows as a table that keeps every column."""
     rows = relation.limit(SHOWN_ROWS + 1).fetchall()
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    numeric = ("INT", "FLOAT", "DOUBLE", "DECIMAL", "HUGEINT")
-    for name, kind in zip(relation.columns, relation.types, strict=True):
-        right = any(word in str(kind) for word in numeric) and "(" not in str(kind).removeprefix("DECIMAL")[:1]
-        table.add_column(escape(name), justify="right" if right else "left", no_wrap=True)
-    for row in rows[:SHOWN_ROWS]:
-        table.add_row(*(escape(_cell(value)) for value in row))
-    terminal.out.print(table, crop=False, no_wrap=True, overflow="ignore")
+    cells = [list(relation.columns), *([_cell(value) for value in row] for row in rows[:SHOWN_ROWS])]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    numeric = [str(kind).startswith(_NUMERIC) and not str(kind).endswith("]") for kind in relation.types]
+    for number, row in enumerate(cells):
+        shown = [
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        ]
+        terminal.say("  ".join(shown).rstrip(), style="" if number else "bold")
     if len(rows) > SHOWN_ROWS:
         terminal.err.print(f"[dim]the first {SHOWN_ROWS} rows; --format csv, json or parquet gives all[/]")
+
+
+_NUMERIC = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UBIGINT", "UINTEGER", "FLOAT", "DOUBLE", "DECIMAL")
 
 
 def _cell(value: object) -> str:

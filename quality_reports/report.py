@@ -86,6 +86,9 @@ def render(quality: Row) -> str:
         style=Markup(style),
         drawings=_drawings(quality),
         stage={row["stage"]: row for row in quality["stages"]},
+        found_in={
+            (rule["name"], row["dataset"], row["subset"]): row for rule in quality["rules"] for row in rule["subsets"]
+        },
         settings=flatten(_without_known(quality["provenance"])),
         horizons=sorted({row["seconds"] for score in quality["scores"] for row in score["rows"]}),
     )

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import duckdb
 
 QUALITY_SCHEMA = "tracklake/quality/1"
+SIGNIFICANT_DIGITS = 10
+"""A sum's last digits depend on the order in which threads add; beyond these the report would not repeat."""
 REJECTS_PER_FILE = 10
 REJECT_CHARACTERS = 300
 
@@ -41,7 +43,10 @@ def query(connection: "duckdb.DuckDBPyConnection", name: str, parameters: Parame
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a setting may hold
-    """Turn a value into what JSON knows: NaN and infinity into None, paths and dates into text, tuples into lists.
+    """Turn a value into what JSON knows.
+
+    NaN and infinity become None, other fractions are rounded to SIGNIFICANT_DIGITS, paths and dates become text,
+    tuples and sets lists.
 
     Raises:
         TypeError: the value is of no such kind.
@@ -49,7 +54,7 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a sett
     if value is None or isinstance(value, bool | str | int):
         return value
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return float(f"{value:.{SIGNIFICANT_DIGITS}g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, Sequence | set | frozenset) and not isinstance(value, bytes):

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.protocols import Protocol
-from training.models import Predictor, find_model
+from training.models import MODELS, Predictor, find_model
 from training.runs import load_run, refuse_leak
 from training.tensors import Batch, TensorFolder
 
@@ -85,15 +85,15 @@ def evaluate(name: str, tensors: Path, models: Path, part: str = "eval") -> Eval
         ImportError: torch is needed and missing.
     """
     folder = TensorFolder.open(tensors)
+    if name in MODELS and not MODELS[name].learns:  # as it is, whether or not it was written as a run before
+        return measure_errors(MODELS[name].build(folder.protocol), folder, part, name=name)
     if (models / name / "config.json").is_file():
         run = load_run(models / name, folder.protocol)
-        if part != "train":
+        if part != "train" and find_model(run.config["model"]).learns:
             refuse_leak(run.config, folder, part)
         return measure_errors(run.predictor, folder, part, name=name)
-    model = find_model(name)
-    if model.learns:
-        raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
-    return measure_errors(model.build(folder.protocol), folder, part, name=name)
+    find_model(name)
+    raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
 
 
 def measure_errors(predictor: Predictor, folder: TensorFolder, part: str, *, name: str) -> Evaluation:

@@ -29,8 +29,8 @@ def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | Non
         return
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
-    frame = relation.pl()
     target = out or sys.stdout.buffer
+    frame = _flat(relation).pl() if form == "csv" else relation.pl()
     if form == "csv":
         frame.write_csv(target)
     elif form == "json":
@@ -41,3 +41,13 @@ def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | Non
         raise ValueError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
     if out is None:
         sys.stdout.buffer.flush()
+
+
+def _flat(relation: "duckdb.DuckDBPyRelation") -> "duckdb.DuckDBPyRelation":
+    """Lists and structs as text, which is all that CSV can hold."""
+    columns = []
+    for name, kind in zip(relation.columns, relation.types, strict=True):
+        quoted = '"' + name.replace('"', '""') + '"'
+        nested = str(kind).endswith("]") or str(kind).startswith(("STRUCT", "MAP"))
+        columns.append(f"CAST({quoted} AS VARCHAR) AS {quoted}" if nested else quoted)
+    return relation.project(", ".join(columns))

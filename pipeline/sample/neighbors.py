@@ -8,10 +8,11 @@ import numpy.typing as npt
 import polars as pl
 
 Integers = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
 Number = TypeVar("Number", bound=np.generic)
 
 NOBODY = -1
+PLACES = (pl.col("x"), pl.col("x") - pl.col("length"))
+"""Front and rear."""
 
 
 @dataclass(frozen=True)
@@ -36,22 +37,22 @@ def find_surroundings(tracks: pl.DataFrame) -> Surroundings:
     """Look around in every frame.
 
     Args:
-        tracks: columns vehicle, frame, lane, x, length; x is the front, increasing in the direction of travel.
+        tracks: columns vehicle, frame, lane, x, length; x is the front, increasing in the direction of travel. They
+            are compared to three decimals, so that equal positions of a file are equal here.
     """
-    frame, lane, vehicle, front, length = (
-        tracks[name].to_numpy().astype(np.float64) for name in ("frame", "lane", "vehicle", "x", "length")
-    )
+    frame, lane, vehicle = (tracks[name].to_numpy().astype(np.int64) for name in ("frame", "lane", "vehicle"))
+    front, rear = (np.rint(tracks.select(place).to_series().to_numpy() * 1000).astype(np.int64) for place in PLACES)
     order = np.lexsort((vehicle, front, lane, frame))
     same_lane = (np.diff(frame[order]) == 0) & (np.diff(lane[order]) == 0)
     leader, follower = np.full(len(order), NOBODY), np.full(len(order), NOBODY)
     leader[order[:-1][same_lane]] = order[1:][same_lane]
     follower[order[1:][same_lane]] = order[:-1][same_lane]
-    left = _beside(frame, lane, front, length, -1)
-    right = _beside(frame, lane, front, length, +1)
+    left = _beside(frame, lane, front, rear, -1)
+    right = _beside(frame, lane, front, rear, +1)
     return Surroundings(leader, follower, *left, *right)
 
 
-def _beside(frame: Floats, lane: Floats, front: Floats, length: Floats, side: int) -> list[Integers]:
+def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, side: int) -> list[Integers]:
     """Preceding, alongside and following rows in the lane next to one's own.
 
     Positions become distances along one long line on which every (frame, lane) has its own stretch, so that one
@@ -59,30 +60,27 @@ def _beside(frame: Floats, lane: Floats, front: Floats, length: Floats, side: in
     """
     if not len(frame):
         return [np.empty(0, np.int64)] * 3
-    stretch = float(np.ptp(front)) + 2 * float(length.max()) + 1_000.0
-    lanes = lane.max() + 3
-    own = (frame * lanes + lane) * stretch
+    stretch = int(front.max() - rear.min()) + 1_000_000
+    own = (frame * (int(lane.max()) + 3) + lane) * stretch - int(rear.min())
     target = own + side * stretch
-    rear = front - length
     by_front, by_rear = np.argsort(own + front, kind="stable"), np.argsort(own + rear, kind="stable")
-    ahead = np.searchsorted((own + rear)[by_rear], target + front, side="left")
-    preceding = _valid(by_rear, ahead, own, target)
-    behind = np.searchsorted((own + front)[by_front], target + rear, side="left") - 1
-    following = _valid(by_front, behind, own, target)
+    fronts, rears = (own + front)[by_front], (own + rear)[by_rear]
+    preceding = _valid(by_rear, np.searchsorted(rears, target + front, side="right"), own, target)
+    following = _valid(by_front, np.searchsorted(fronts, target + rear, side="left") - 1, own, target)
     # Alongside: of the nearest fronts at and behind, at and ahead of the own front, those that overlap lengthwise.
-    near = np.searchsorted((own + front)[by_front], target + front, side="left")
+    near = np.searchsorted(fronts, target + front, side="left")
     alongside = np.full(len(frame), NOBODY)
-    least = np.full(len(frame), np.inf)
+    least = np.full(len(frame), np.iinfo(np.int64).max)
     for step in (-1, 0):
         candidate = _valid(by_front, near + step, own, target)
         beside = (candidate >= 0) & (front[candidate] >= rear) & (rear[candidate] <= front)
-        distance = np.abs(front[candidate] - length[candidate] / 2 - front + length / 2)
+        distance = np.abs(front[candidate] + rear[candidate] - front - rear)
         closer = beside & (distance < least)
         alongside[closer], least[closer] = candidate[closer], distance[closer]
     return [preceding, alongside, following]
 
 
-def _valid(order: Integers, place: Integers, own: Floats, target: Floats) -> Integers:
+def _valid(order: Integers, place: Integers, own: Integers, target: Integers) -> Integers:
     """Rows at these places of a sorted order, NOBODY where the place lies outside the searched lane and frame."""
     inside = (place >= 0) & (place < len(order))
     rows = order[np.clip(place, 0, len(order) - 1)]

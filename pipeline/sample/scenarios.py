@@ -151,7 +151,7 @@ HIGHD = (
         Traffic(0.40, bottleneck_mps=2.5, pulsing=True, plan=Plan(backward_share=0.12)),
         Traffic(0.30),
     ),
-    HighdScenario("04", 2, THREE_LANES, 0.37, "11.2017", "Fri", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
+    HighdScenario("04", 2, THREE_LANES, 0.35, "11.2017", "Fri", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
 )  # fmt: skip
 
 _NGSIM_PLAN = Plan(late_starts=4, overlaps=3, backward_share=0.01, spikes=5, frozen=4, gaps=4)

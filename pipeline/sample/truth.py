@@ -112,8 +112,8 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         found.files.append(count)
     direction = {}
     for line in _lines(folder / f"{recording}_tracksMeta.csv")[1:]:
-        parts = line.split(",")
-        direction[int(parts[0])] = int(parts[7])
+        meta = line.split(",")
+        direction[int(meta[0])] = int(meta[7])
     name = f"{recording}_tracks.csv"
     count = FileCount(name, "highd", recording)
     seen = set()

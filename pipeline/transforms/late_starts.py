@@ -313,7 +313,7 @@ def find_would_be_neighbors(
     if missing_starts.is_empty() or clock.is_empty():
         return near
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
-    tick = clock["tick"].to_numpy()
+    tick = clock["tick"].cast(pl.Int64).to_numpy()
     order = np.argsort(tick, kind="stable")
     tick = tick[order]
     x_m = clock["x_m"].to_numpy()

@@ -104,14 +104,14 @@ def find_neighbors(clock: pl.DataFrame, origins: NDArray[np.bool_] | None = None
             collisions += contested.shape[1]
             crowded_out += _settle(grid, contested, own, line, vehicle_id)
         filled = np.flatnonzero(grid >= 0)
-        origin, cell = np.divmod(filled, CELLS)
+        origin = filled // CELLS
         other = grid[filled]
         tables.append(
             pl.DataFrame(
                 {
                     "vehicle_id": vehicle_id[chunk][origin],
                     "tick": tick[chunk][origin],
-                    "cell": cell.astype(np.int8),
+                    "cell": (filled - origin * CELLS).astype(np.int8),
                     "neighbor_id": vehicle_id[line.entry[other]],
                     "dx_m": (_offset(line, other, own, filled) / UNITS_PER_M).astype(np.float32),
                 },
@@ -200,8 +200,9 @@ def _sweep(place: Ints, target: Ints, first: Ints, side: int) -> Iterator[tuple[
 
 def _offset(line: _Line, other: NDArray[np.int32] | Ints, own: Ints, cell: Ints) -> Ints:
     """Offset (dx) in units of those who stand at `other`, around the origins whose grids hold `cell`."""
-    origin, cell_in_grid = np.divmod(cell, CELLS)
-    dx: Ints = line.place[other] - own[origin] - (cell_in_grid // ROWS - COLUMNS // 2) * line.stretch
+    column = cell // ROWS
+    origin = column // COLUMNS
+    dx: Ints = line.place[other] - own[origin] - (column - (origin * COLUMNS + COLUMNS // 2)) * line.stretch
     return dx
 
 

@@ -124,6 +124,15 @@ def test_a_run_is_not_evaluated_on_what_it_was_trained_on(trained, tmp_path):
         evaluate("run", folder, models)
 
 
+def test_what_never_learned_cannot_have_seen_anything(tensors, tmp_path):
+    for name in ("constant-velocity", "cv"):
+        train("constant-velocity", tensors, tmp_path / name)
+    swapped = pl.concat([split_row("a", "eval"), split_row("b", "train")])
+    folder = write(tmp_path / "tensors", make_tables(), swapped, protocol=CSP)
+    for name in ("constant-velocity", "cv"):
+        assert evaluate(name, folder, tmp_path).samples > 0
+
+
 def test_a_run_meets_new_recordings(trained, tmp_path):
     models, *_ = trained
     splits = pl.concat([SPLITS, split_row("c", "eval")])

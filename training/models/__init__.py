@@ -43,7 +43,7 @@ def _build_constant_velocity(protocol: Protocol) -> Predictor:
     return ConstantVelocity(protocol)
 
 
-def _build_lstm(protocol: Protocol, hidden: int = 64) -> Predictor:
+def _build_lstm(protocol: Protocol, hidden: int = 48) -> Predictor:
     require_torch("lstm")
     from training.models.lstm import EncoderDecoder
 

@@ -6,7 +6,6 @@ import numpy.typing as npt
 from schemas.protocols import Protocol
 from training.tensors import Batch
 
-
 VELOCITY_S = 0.2
 """Seconds of history that the velocity is taken from."""
 

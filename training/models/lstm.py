@@ -25,7 +25,7 @@ class EncoderDecoder(nn.Module):
     Outputs per tick of future, 2: the change of the deviation; summed up over the ticks.
     """
 
-    def __init__(self, protocol: Protocol, *, hidden: int = 64) -> None:
+    def __init__(self, protocol: Protocol, *, hidden: int = 48) -> None:
         """Prepare for a protocol's rate, history and horizon.
 
         Args:

@@ -220,11 +220,12 @@ def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_chunks(entri
     assert (found.collisions, found.crowded_out) == (collisions, crowded_out)
 
 
-def test_crowded_road_agrees_with_the_loop():
-    """Thirty vehicles within 30 m of three lanes: many collisions, some crowded out."""
+@pytest.mark.parametrize("grain_mm", [1, 2_000])
+def test_crowded_road_agrees_with_the_loop(grain_mm):
+    """Forty vehicles within 30 m of two lanes: many collisions, many equally near, some crowded out."""
     rng = np.random.default_rng(11)
     entries = [
-        (vehicle, tick, int(rng.integers(0, 12_000)), int(rng.integers(1, 3)))
+        (vehicle, tick, int(rng.integers(0, 30_000 // grain_mm)) * grain_mm, int(rng.integers(1, 3)))
         for vehicle in range(40)
         for tick in (4, 5)
     ]

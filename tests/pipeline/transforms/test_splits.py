@@ -138,6 +138,18 @@ def test_the_search_comes_near_the_exhaustive_optimum_where_it_can_be_known(monk
     assert verdicts[0][2] - 1e-8 <= verdicts[1][2] <= verdicts[0][2] + 1e-3
 
 
+@settings(max_examples=40, deadline=None)
+@given(rows=SUBSETS, validation=st.booleans())
+def test_the_search_breaks_no_constraint_that_can_be_met(rows, validation):
+    shares = SHARES[validation]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.transforms.split_search.EXHAUSTIVE_STATES", 0)
+        chosen = parts_of(allocate_flow_balanced(table(rows), validation=validation, restarts=20))
+    got = judge(rows, [chosen[row[0]] for row in rows], shares)
+    best = min(judge(rows, parts, shares)[:2] for parts in itertools.product(shares, repeat=len(rows)))
+    assert got[:2] == best
+
+
 def test_the_search_repeats_by_seed_and_ignores_row_order_and_other_datasets():
     rows = like_highd(subsets=30)
     once = allocate_flow_balanced(table(rows), seed=3, restarts=5)
