@@ -357,3 +357,7 @@ def _write_sample(
     except SumoError as error:
         terminal.complain(str(error))
         raise typer.Exit(FAILED) from None
+
+
+if __name__ == "__main__":
+    main()

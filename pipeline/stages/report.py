@@ -15,7 +15,7 @@ from pipeline.stages.score import collect_scores
 
 VERSION = 1
 PAGE, DOCUMENT = "index.html", "quality.json"
-SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy", "scikit-learn")
+SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
