@@ -188,7 +188,7 @@ def evaluate(
     with _command(quiet=quiet, json=json) as terminal:
         from pipeline.lake import load
         from pipeline.lake.files import MODELS
-        from pipeline.stages.score import BASELINE
+        from pipeline.stages.score import BASELINE, finished_runs
         from pipeline.stages.tensors import tensor_folder
         from pipeline.terminal import show_scores
         from training.evaluate import evaluate as evaluate_model
@@ -197,7 +197,7 @@ def evaluate(
         settings.get_protocol()
         root = settings.lake
         tensors = tensor_folder(root, load(root))
-        names = runs or sorted({BASELINE, *(path.parent.name for path in (root / MODELS).glob("*/config.json"))})
+        names = runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))})
         found = [evaluate_model(name, tensors, root / MODELS, part).to_dict() for name in names]
         show_scores(terminal, found)
         terminal.give({"evaluations": found})
@@ -281,6 +281,7 @@ def _order(
     dataset: str | None = None,
 ) -> "Outcome":
     """Do what is not done; Prefect is imported only where something is."""
+    from pipeline.lake import load
     from pipeline.work import Order, Outcome, is_idle, survey
 
     if dataset not in (None, "ngsim", "highd"):
@@ -288,6 +289,8 @@ def _order(
     plain = settings.model_dump(mode="json", exclude_unset=True)
     order = Order(str(settings.lake), steps, source, dataset, plain)
     discovery = survey(order) if source is not None else None
+    if discovery is None:
+        load(order.root)  # raises where there is no lake to work on
     if discovery is not None and not discovery.units:
         # Nothing can come of it, so no lake is made for it either.
         for message in discovery.refusals:

@@ -6,6 +6,9 @@ decided before (`pipeline.work`), so an idle rerun never comes here.
 
 import logging
 import os
+import socket
+import threading
+import time
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +22,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE, CacheKeyFnPolicy
 from prefect.futures import PrefectFuture, as_completed
 from prefect.logging.handlers import PrefectConsoleHandler
-from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from pipeline.lake import Entry, LakeFile, Writer, is_intact, open_for_writing
@@ -45,6 +48,7 @@ def _content_key(_context: Any, parameters: dict[str, Any]) -> str:  # noqa: ANN
     return f"tracklake-{parameters['lake_id']}-{parameters['job']['fingerprint']}"
 
 
+SERVER_START_S = 120.0
 RETRIES: dict[str, Any] = {"retries": 2, "retry_delay_seconds": 1, "retry_condition_fn": _is_io_error}
 
 
@@ -225,11 +229,40 @@ def execute(order: Order) -> Outcome:
         parameters |= {"source": order.source, "dataset": order.dataset}
     else:
         (parameters["stage"],) = order.steps
-    _mute_console()
-    # The heartbeat's thread costs a second at the end of every flow, and nobody listens for it here.
-    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+    changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it
+    if PREFECT_API_URL.value() is None:
+        changed[PREFECT_API_URL] = _embed_server()
+    with temporary_settings(changed):
+        _mute_console()  # after all that sets logging up
         runner: ThreadPoolTaskRunner[Any] = ThreadPoolTaskRunner(max_workers=order.get_settings().workers)
         return Outcome(**chosen.with_options(task_runner=runner)(**parameters))
+
+
+def _embed_server() -> str:
+    """Serve Prefect's API from a thread of this process and return its address.
+
+    The server that Prefect would start by itself is a process of its own, which outlives one that is killed. This one
+    ends with us, whatever happens, and spares a second interpreter's start. It is never stopped before: Prefect sends
+    its last logs and events to it while the interpreter exits.
+    """
+    import uvicorn
+    from prefect.server.api.server import create_app
+
+    listener = socket.socket()
+    listener.bind(("127.0.0.1", 0))
+    server = uvicorn.Server(uvicorn.Config(create_app(ephemeral=True), log_config=None, lifespan="on"))
+    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="prefect-server", daemon=True)
+    thread.start()
+    limit = time.monotonic() + SERVER_START_S
+    while not server.started:
+        if not thread.is_alive() or time.monotonic() > limit:
+            raise RuntimeError(
+                "Prefect's embedded server did not start. Look at PREFECT_HOME (its database may be of another "
+                "version: `prefect server database reset`), or set PREFECT_API_URL to a running server."
+            )
+        time.sleep(0.01)
+    return f"http://127.0.0.1:{listener.getsockname()[1]}/api"
 
 
 def _mute_console() -> None:

@@ -1,7 +1,6 @@
-"""Tensor folders on disk: one `.npy` per array, and `index.json`, written last, that makes the folder valid."""
+"""Tensor folders on disk: one `.npy` per array, and `index.json`."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,8 @@ INDEX = "index.json"
 def write_tensors(folder: Path, arrays: Mapping[str, np.ndarray], index: Mapping[str, Any]) -> None:
     """Write a tensor folder.
 
-    Each file is written aside, synced and renamed, so that a reader who has the old one mapped keeps it; `index.json`
-    comes last: a folder without it was left unfinished and is to be written again.
-
     Args:
-        folder: made where it does not exist.
+        folder: exists and is empty; the lake makes it visible, whole, afterwards.
         arrays: one per name of `schemas.tensors.ARRAYS`, of its dtype.
         index: what `index.json` holds, see `pipeline.transforms.tensors.describe_tensors`.
 
@@ -31,18 +27,6 @@ def write_tensors(folder: Path, arrays: Mapping[str, np.ndarray], index: Mapping
         found = arrays[declared.name].dtype if declared.name in arrays else "nothing"
         if found != np.dtype(declared.dtype):
             raise ValueError(f"{folder}: array `{declared.name}`: expected {declared.dtype}, got {found}")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / INDEX).unlink(missing_ok=True)
     for declared in ARRAYS:
-        aside = folder / f"{declared.name}.npy.partial"
-        with aside.open("wb") as file:
-            np.save(file, arrays[declared.name], allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        aside.replace(folder / f"{declared.name}.npy")
-    aside = folder / f"{INDEX}.partial"
-    with aside.open("w", encoding="utf-8") as text:
-        json.dump(index, text, indent=1)
-        text.flush()
-        os.fsync(text.fileno())
-    aside.replace(folder / INDEX)
+        np.save(folder / f"{declared.name}.npy", arrays[declared.name], allow_pickle=False)
+    (folder / INDEX).write_text(json.dumps(index, indent=1), encoding="utf-8")

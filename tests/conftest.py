@@ -1,4 +1,4 @@
-"""What several test packages share: Prefect kept to itself, a generated sample, and a lake made of it by the command."""
+"""What several test packages share: Prefect kept to itself, a generated sample, and a lake made of it."""
 
 import json
 import os
@@ -84,3 +84,10 @@ def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactor
     done = command("run", sample, "--lake", root, "--json")
     assert done.code == 0, done.err
     return Lake(root, json.loads(done.out))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep what uses the generated sample on one worker, so that it is generated once."""
+    for item in items:
+        if {"sample", "lake"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.xdist_group("lake"))

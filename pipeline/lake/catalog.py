@@ -1,14 +1,17 @@
 """The lake as SQL: views over the live Parquet files, in catalog.duckdb and on sandboxed in-memory connections."""
 
-import uuid
-from collections.abc import Callable
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.lake.errors import QueryError
-from pipeline.lake.manifest import Manifest, load, sync_folder
+from pipeline.lake.errors import LakeError, QueryError
+from pipeline.lake.files import partition_values
+from pipeline.lake.manifest import Manifest, load, name_aside, sync
 from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 
 if TYPE_CHECKING:
@@ -34,6 +37,14 @@ _SQL_TYPES: dict[pl.DataType, str] = {
 }
 
 
+_EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", re.IGNORECASE)
+_SWITCHES = re.compile(
+    r"""\b((enable|disable)_(logging|profiling)\b|query"?(\s|/\*.*?\*/|--[^\n]*\n)*\()""", re.IGNORECASE | re.DOTALL
+)
+"""Functions by which a SELECT changes a setting in spite of the locked configuration, or runs a text it made up. What
+they would write is refused by the file system all the same, but DuckDB then ends the whole process."""
+
+
 def sql_type(dtype: pl.DataType) -> str:
     """DuckDB's name of a Polars dtype."""
     if isinstance(dtype, pl.List):
@@ -48,6 +59,11 @@ def sql_type(dtype: pl.DataType) -> str:
 def quote(text: str) -> str:
     """A SQL string literal."""
     return "'" + text.replace("'", "''") + "'"
+
+
+def _literally(path: str) -> str:
+    """A path in which DuckDB finds no pattern."""
+    return re.sub(r"[*?\[]", r"[\g<0>]", path)
 
 
 def view_statements(manifest: Manifest, locate: Callable[[str], str]) -> list[str]:
@@ -74,45 +90,90 @@ def _select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> s
 
 
 def _rows(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
-    files = [quote(locate(file.path)) for file in manifest.live(table.name)]
+    paths = [file.path for file in manifest.live(table.name)]
+    files = [quote(locate(path)) for path in paths]
     if not files:
         columns = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.dtypes.items())
         return f"SELECT {columns} WHERE false"
     columns = ", ".join(f'"{name}"' for name in table.dtypes)
     if not table.partition:
         return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = false)"
+    if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
+        # A folder above the lake looks like a partition, and DuckDB would believe it.
+        return " UNION ALL ".join(_one_file(table, path, locate) for path in paths)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
     return (
         f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = true, hive_types = {{{types}}})"
     )
 
 
-def rebuild(root: Path, manifest: Manifest) -> None:
-    """Write catalog.duckdb aside and put it in place; its views hold paths relative to the lake's folder."""
+def _one_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
+    stated = partition_values(table, path)
+    columns = ", ".join(
+        f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'"{name}"'
+        for name, dtype in table.dtypes.items()
+    )
+    return f"SELECT {columns} FROM read_parquet([{quote(locate(path))}], hive_partitioning = false)"
+
+
+def _create_views(
+    connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest, locate: Callable[[str], str]
+) -> None:
     import duckdb
 
-    aside = root / f".{CATALOG}.{uuid.uuid4().hex}.tmp"
-    with duckdb.connect(str(aside)) as connection:
-        # Views are checked on creation against files relative to the search path, and store the relative names.
-        connection.execute(f"SET file_search_path = {quote(str(root.resolve()))}")
-        for statement in view_statements(manifest, locate=str):
+    for table, statement in zip(TABLES, view_statements(manifest, locate), strict=True):
+        try:
             connection.execute(statement)
-        for table in TABLES:
-            connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
-    aside.replace(root / CATALOG)
-    sync_folder(root)
+        except duckdb.Error as failed:
+            reason = str(failed).splitlines()[0]
+            raise LakeError(
+                f"{root}: the table `{table.name}` cannot be read: {reason}\nIts files were removed or damaged by "
+                f"something else. `tracklake run SOURCE --lake {root}` on the raw files makes them again."
+            ) from failed
+
+
+def rebuild(root: Path, manifest: Manifest) -> None:
+    """Write catalog.duckdb aside and put it in place; its views hold paths relative to the lake's folder.
+
+    Raises:
+        LakeError: a live file is missing or unreadable; the catalog of before stays.
+    """
+    import duckdb
+
+    aside = name_aside(root / CATALOG)
+    try:
+        with tempfile.TemporaryDirectory() as elsewhere, duckdb.connect(str(aside)) as connection:
+            # Views are checked on creation against files relative to the search path, and store the relative names.
+            # The search path is a list of patterns without a way to quote: the lake may be called "a,b" or "c[1]".
+            link = Path(elsewhere) / "lake"
+            link.symlink_to(root.resolve(), target_is_directory=True)
+            connection.execute(f"SET file_search_path = {quote(str(link))}")
+            _create_views(connection, root, manifest, locate=str)
+            for table in TABLES:
+                connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
+        sync(aside)
+        # What a client that wrote to the old catalog left would be replayed into the new one.
+        (root / f"{CATALOG}.wal").unlink(missing_ok=True)
+        aside.replace(root / CATALOG)
+    except BaseException:
+        for leftover in (aside, aside.with_name(f"{aside.name}.wal")):
+            leftover.unlink(missing_ok=True)
+        raise
+    sync(root)
 
 
 def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":
-    """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
+    """Open a lake for SQL: an in-memory DuckDB with the views.
 
-    Nothing but the lake's tables can be read, nothing can be written, no extension loaded, no setting changed.
+    Nothing but the lake's live files can be reached, no extension loaded, no setting changed. Statements from others
+    go through `query`, which admits none that writes.
 
     Args:
         lake: the lake's folder, wherever it stands now.
 
     Raises:
         LakeMissingError: no lake there.
+        LakeError: a live file is missing or unreadable.
     """
     import duckdb
 
@@ -126,14 +187,15 @@ def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":
             "allow_community_extensions": False,
         },
     )
-    for statement in view_statements(manifest, locate=lambda path: str(root / path)):
-        connection.execute(statement)
-    folders = ", ".join(quote(str(root / table.name)) for table in TABLES)
+    _create_views(connection, root, manifest, locate=lambda path: _literally(str(root / path)))
+    live = [str(root / file.path) for table in TABLES for file in manifest.live(table.name)]
+    # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
+    allowed = ", ".join(quote(path) for path in {*live, *map(_literally, live)})
     for setting in (
         "temp_directory = ''",
         "python_enable_replacements = false",
         "allow_persistent_secrets = false",
-        f"allowed_directories = [{folders}]",
+        f"allowed_paths = [{allowed}]",
         "enable_external_access = false",
         "lock_configuration = true",
     ):
@@ -142,14 +204,16 @@ def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":
 
 
 def query(connection: "duckdb.DuckDBPyConnection", sql: str) -> "duckdb.DuckDBPyRelation":
-    """Run one SELECT (or EXPLAIN of one) and return its result.
+    """Run one SELECT and return its result; EXPLAIN of one, DESCRIBE, SUMMARIZE and SHOW are selects, too.
+
+    DuckDB computes a result when it is fetched: what fails only then fails there, see `query_errors`.
 
     Raises:
         QueryError: not exactly one SELECT, or DuckDB's own message with the list of tables.
     """
     import duckdb
 
-    try:
+    with query_errors():
         statements = connection.extract_statements(sql)
         kinds = [statement.type for statement in statements]
         allowed = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
@@ -158,18 +222,27 @@ def query(connection: "duckdb.DuckDBPyConnection", sql: str) -> "duckdb.DuckDBPy
             raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.")
         if kinds[0] == duckdb.StatementType.EXPLAIN:
             _refuse_explained_writes(connection, statements[0].query)
+        if switch := _SWITCHES.search(sql):
+            raise QueryError(f"{switch[1]!r} is not available here; the lake is read-only.")
         return connection.sql(statements[0].query)
+
+
+@contextmanager
+def query_errors() -> Iterator[None]:
+    """Turn what DuckDB raises, also while a result is fetched, into a QueryError with the list of tables."""
+    import duckdb
+
+    try:
+        yield
     except duckdb.Error as failed:
         raise QueryError(f"{failed}\nTables: {', '.join(table.name for table in TABLES)}.") from failed
 
 
 def _refuse_explained_writes(connection: "duckdb.DuckDBPyConnection", sql: str) -> None:
     """EXPLAIN ANALYZE runs what it explains, so that must be a SELECT as well."""
-    import re
-
     import duckdb
 
-    inner = re.sub(r"^\s*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", "", sql, flags=re.IGNORECASE)
+    inner = _EXPLAIN.sub("", sql)
     kinds = [statement.type for statement in connection.extract_statements(inner)]
     if kinds != [duckdb.StatementType.SELECT]:
         raise QueryError("EXPLAIN explains a SELECT here; the lake is read-only.")

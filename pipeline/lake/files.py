@@ -1,27 +1,42 @@
 """The files of a lake: where they stand and how they come to stand there whole or not at all."""
 
-import os
+import json
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from urllib.parse import quote, unquote
 
 import polars as pl
 
-from pipeline.lake.manifest import LakeFile, Manifest, sync_folder
+from pipeline.lake.manifest import LakeFile, Manifest, sync
 from schemas import TABLES, Table
 
 STAGING = ".staging"
 TENSORS = "tensors"
 REPORTS = "reports"
 MODELS = "models"
+LISTING = "files.json"
+"""In every folder of `write_folder`: names and sizes of its files, so that one left half deleted is noticed."""
 TABLE_BY_NAME = {table.name: table for table in TABLES}
 
 
 def place(table: Table, values: Mapping[str, str], fingerprint: str) -> str:
     """Where a table's file stands: `tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
-    folders = [f"{name}={values[name]}" for name in table.partition]
+    folders = [_folder(name, values[name]) for name in table.partition]
     return "/".join([table.name, *folders, f"part-{fingerprint}.parquet"])
+
+
+def _folder(name: str, value: str) -> str:
+    """A hive partition's folder; what would end the name or be a pattern is percent-encoded, as readers expect."""
+    return f"{name}=" + re.sub(r"[^\w.\- ]", lambda found: quote(found[0], safe=""), value)
+
+
+def partition_values(table: Table, path: str) -> dict[str, str]:
+    """The partition columns' values that the path of a table's file states."""
+    folders = dict(part.split("=", 1) for part in path.split("/") if "=" in part)
+    return {name: unquote(folders[name]) for name in table.partition}
 
 
 def write_table(
@@ -34,7 +49,7 @@ def write_table(
         table: what it is.
         frame: all the table's columns, in order.
         values: of the partition columns.
-        fingerprint: part of the name; a file that stands there already came from the same inputs and is kept.
+        fingerprint: part of the name; a whole file that stands there already came from the same inputs and is kept.
         where: the recording, for messages.
 
     Returns:
@@ -48,7 +63,7 @@ def write_table(
     table.validate(frame, where=where)
     path = place(table, values, fingerprint)
     target = root / path
-    if not target.exists():
+    if not _holds(target, frame.height):
         stored = frame.drop(*table.partition)
 
         def write(aside: Path) -> None:
@@ -58,27 +73,57 @@ def write_table(
     return [LakeFile(path=path, rows=frame.height, bytes=target.stat().st_size)]
 
 
+def _holds(target: Path, rows: int) -> bool:
+    """Whether a Parquet file stands there, to its end (the footer), with so many rows."""
+    if not target.is_file():
+        return False
+    try:
+        found = pl.scan_parquet(target, glob=False, hive_partitioning=False).select(pl.len()).collect().item()
+    except (pl.exceptions.PolarsError, OSError):
+        return False
+    return bool(found == rows)
+
+
 def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[LakeFile]:
     """Put a whole folder of files into the lake at once.
 
     Args:
         root: the lake.
-        path: of the folder, relative to the lake; carries the fingerprint.
+        path: of the folder, relative to the lake; carries the fingerprint. A whole folder that stands there is kept.
         write: fills the folder it is given.
+
+    Returns:
+        Its files, and the listing of them that is added.
     """
     target = root / path
-    if not target.exists():
+    if not _is_whole(target):
 
         def fill(aside: Path) -> None:
             aside.mkdir()
             write(aside)
+            sizes = {file.relative_to(aside).as_posix(): file.stat().st_size for file in _files_in(aside)}
+            (aside / LISTING).write_text(json.dumps(sizes, indent=1), encoding="utf-8")
 
         _put(root, target, fill)
     return [
         LakeFile(path=file.relative_to(root).as_posix(), rows=None, bytes=file.stat().st_size)
-        for file in sorted(target.rglob("*"))
-        if file.is_file()
+        for file in _files_in(target)
     ]
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.is_file())
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a folder holds what its listing says: deleting one is no single step, and may have been killed."""
+    try:
+        sizes = json.loads((folder / LISTING).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    found = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files_in(folder)}
+    found.pop(LISTING)
+    return bool(found == sizes)
 
 
 def _put(root: Path, target: Path, write: Callable[[Path], None]) -> None:
@@ -86,10 +131,12 @@ def _put(root: Path, target: Path, write: Callable[[Path], None]) -> None:
     aside.parent.mkdir(parents=True, exist_ok=True)
     try:
         write(aside)
-        for file in [aside] if aside.is_file() else aside.rglob("*"):
-            with file.open("rb") as handle:
-                os.fsync(handle.fileno())
+        for item in (*aside.rglob("*"), aside):
+            sync(item)
         target.parent.mkdir(parents=True, exist_ok=True)
+        if target.is_dir():
+            # Damaged, or it would have been kept; a folder cannot be replaced by a rename.
+            target.replace(aside.with_suffix(".damaged"))
         aside.replace(target)
     except BaseException:
         if aside.is_dir():
@@ -97,7 +144,10 @@ def _put(root: Path, target: Path, write: Callable[[Path], None]) -> None:
         else:
             aside.unlink(missing_ok=True)
         raise
-    sync_folder(target.parent)
+    for folder in target.parents:
+        sync(folder)
+        if folder == root:
+            break
 
 
 def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.LazyFrame:
@@ -108,30 +158,39 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
         manifest: which files are live.
         table: what to read.
         values: of partition columns, to read only those files (`dataset="highd", subset="01-upper"`).
+
+    Raises:
+        ValueError: the table is not partitioned by a column of `values`.
     """
-    wanted = [f"{name}={value}" for name, value in values.items()]
-    files = [
-        root / file.path for file in manifest.live(table.name) if all(part in file.path.split("/") for part in wanted)
-    ]
-    if not files:
+    strangers = values.keys() - set(table.partition)
+    if strangers:
+        raise ValueError(f"{table.name} has no partition {', '.join(sorted(strangers))}; filter its rows instead")
+    # Not by the reader's hive option: that takes `name=value` folders above the lake for partitions, too.
+    by_values: dict[tuple[tuple[str, str], ...], list[Path]] = {}
+    for file in manifest.live(table.name):
+        stated = partition_values(table, file.path)
+        if values.items() <= stated.items():
+            by_values.setdefault(tuple(stated.items()), []).append(root / file.path)
+    if not by_values:
         return table.empty().lazy()
-    return pl.scan_parquet(
-        files,
-        hive_partitioning=bool(table.partition),
-        hive_schema={name: table.dtypes[name] for name in table.partition} or None,
-    ).select(*table.dtypes)
+    return pl.concat(
+        pl.scan_parquet(paths, hive_partitioning=False, glob=False)
+        .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in stated)
+        .select(*table.dtypes)
+        for stated, paths in by_values.items()
+    )
 
 
 def is_intact(root: Path, files: Iterable[LakeFile]) -> bool:
     """Whether files stand in the lake with the size they were committed with."""
     try:
         return all((root / file.path).stat().st_size == file.bytes for file in files)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
 
 
 def remove_orphans(root: Path, manifest: Manifest) -> int:
-    """Delete what killed runs left: finished files that were never committed. Returns how many."""
+    """Delete what killed runs left: finished files never committed, and empty folders. Returns how many files."""
     known = manifest.live_paths() | {item.path for item in manifest.retired}
     folders = [root / name for name in (*TABLE_BY_NAME, TENSORS) if (root / name).is_dir()]
     orphans = [
@@ -141,6 +200,10 @@ def remove_orphans(root: Path, manifest: Manifest) -> int:
         if file.is_file() and file.relative_to(root).as_posix() not in known
     ]
     remove(root, orphans)
+    for folder in folders:
+        for item in sorted(folder.rglob("*"), reverse=True):
+            if item.is_dir() and not any(item.iterdir()):
+                item.rmdir()
     return len(orphans)
 
 

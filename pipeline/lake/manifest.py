@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import uuid
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
 from schemas import SCHEMA_VERSION
 
 MANIFEST = "manifest.json"
+_ASIDE = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 
 
 @dataclass(frozen=True)
@@ -94,12 +96,11 @@ class Manifest:
     def committing(self, entry: Entry, generation: int) -> "Manifest":
         """The manifest with an entry added or replaced; what it replaces is retired."""
         before = self.entries.get(entry.key)
-        entries = {**self.entries, entry.key: entry}
-        changed = replace(self, entries=entries, generation=generation)
-        if before is None:
-            return changed
-        gone = {file.path for files in before.files.values() for file in files} - changed.live_paths()
-        kept = tuple(item for item in self.retired if item.path not in changed.live_paths())
+        changed = replace(self, entries={**self.entries, entry.key: entry}, generation=generation)
+        live = changed.live_paths()
+        replaced = before.files.values() if before is not None else ()
+        gone = {file.path for files in replaced for file in files} - live
+        kept = tuple(item for item in self.retired if item.path not in live)
         return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(gone)))
 
 
@@ -119,18 +120,35 @@ def load(root: Path) -> Manifest:
             f"{root}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake {root}`, "
             "or name another with --lake or TRACKLAKE_LAKE."
         ) from None
+    except OSError as failed:
+        raise LakeError(
+            f"{path}: cannot be read ({failed.strerror}). A lake's manifest is a readable file."
+        ) from failed
+    except UnicodeDecodeError as broken:
+        raise _not_ours(path, broken) from broken
     try:
         document = json.loads(text)
         version = document["schema_version"]
-    except (json.JSONDecodeError, KeyError, TypeError) as broken:
-        raise LakeError(
-            f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
-        ) from broken
+    except (ValueError, KeyError, TypeError) as broken:
+        raise _not_ours(path, broken) from broken
     if version != SCHEMA_VERSION:
         raise LakeVersionError(
             f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
             f"{SCHEMA_VERSION}. Rebuild it from the raw files: `tracklake run SOURCE --lake NEW_FOLDER`."
         )
+    try:
+        return _parse(document)
+    except (ValueError, KeyError, TypeError, AttributeError) as broken:
+        raise _not_ours(path, broken) from broken
+
+
+def _not_ours(path: Path, broken: Exception) -> LakeError:
+    return LakeError(
+        f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
+    )
+
+
+def _parse(document: dict[str, Any]) -> Manifest:
     entries = {
         key: Entry(
             key=key,
@@ -157,19 +175,35 @@ def store(root: Path, manifest: Manifest) -> None:
 
 
 def write_aside(target: Path, content: bytes) -> None:
-    """Write a whole file beside its target, sync it, and rename it into place."""
-    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
-    with aside.open("wb") as handle:
-        handle.write(content)
-        handle.flush()
-        os.fsync(handle.fileno())
-    aside.replace(target)
-    sync_folder(target.parent)
+    """Write a whole file beside its target, sync it, and rename it into place; what stood there stays on an error."""
+    aside = name_aside(target)
+    try:
+        with aside.open("wb") as handle:
+            handle.write(content)
+            handle.flush()
+            os.fsync(handle.fileno())
+        aside.replace(target)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+    sync(target.parent)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def name_aside(target: Path) -> Path:
+    """A hidden name of its own beside a file that is being replaced."""
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what killed processes left under such names."""
+    for file in folder.glob(".*.tmp*"):
+        if _ASIDE.fullmatch(file.name) and file.is_file():
+            file.unlink()
+
+
+def sync(path: Path) -> None:
+    """Make a file's bytes, or the renames in a folder, survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -1,23 +1,34 @@
 """One writer at a time: the lock, commits, and the sweeping of what is no longer needed."""
 
 import fcntl
-import json
 import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.lake import catalog, files
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from pipeline.lake.manifest import Entry, Manifest, load, store
+from pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, remove_leftovers, store
 
 LOCK = ".lock"
 KEPT_GENERATIONS = 2
-"""A replaced file is deleted when this many later generations have begun."""
+"""A replaced file is deleted at the end of the session that makes this many generations since."""
+
+_HELD: set[int] = set()
+"""Descriptors of the locks this process holds."""
+
+
+def _let_go() -> None:
+    """A forked child shares its parent's lock and would keep it after the parent's death."""
+    while _HELD:
+        os.close(_HELD.pop())
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 class Writer:
@@ -28,13 +39,15 @@ class Writer:
         self.manifest = manifest
         self._generation = manifest.generation + 1
         self._guard = threading.Lock()
+        self._process = os.getpid()
 
     def commit(self, entry: Entry) -> None:
         """Make an entry's files live and those it replaces retired, by replacing manifest.json."""
         with self._guard:
             if not files.is_intact(self.root, (file for group in entry.files.values() for file in group)):
                 raise LakeError(f"{self.root}: files of {entry.key} vanished before they were committed. Run again.")
-            self._store(self.manifest.committing(entry, self._generation))
+            if self.manifest.entries.get(entry.key) != entry:
+                self._store(self.manifest.committing(entry, self._generation))
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -44,9 +57,15 @@ class Writer:
                 self._store(replace(self.manifest, sources=merged, generation=self._generation))
 
     def finish(self) -> None:
-        """Sweep and rebuild the catalog: the last step of a writing session."""
+        """Rebuild the catalog, then sweep what neither it nor a reader of the one before needs: a session's last step.
+
+        Raises:
+            LakeError: live files were removed or damaged by others, so that there is no catalog to make.
+        """
         with self._guard:
-            limit = self._generation - KEPT_GENERATIONS
+            self._refuse_child()
+            catalog.rebuild(self.root, self.manifest)
+            limit = self.manifest.generation - KEPT_GENERATIONS
             old = [item for item in self.manifest.retired if item.generation <= limit]
             live = self.manifest.live_paths()
             files.remove(self.root, (self.root / item.path for item in old if item.path not in live))
@@ -54,9 +73,13 @@ class Writer:
                 self._store(replace(self.manifest, retired=tuple(i for i in self.manifest.retired if i not in old)))
             files.remove_orphans(self.root, self.manifest)
             shutil.rmtree(self.root / files.STAGING, ignore_errors=True)
-            catalog.rebuild(self.root, self.manifest)
+
+    def _refuse_child(self) -> None:
+        if os.getpid() != self._process:
+            raise LakeError(f"{self.root}: only process {self._process}, which holds the lock, writes; not its child.")
 
     def _store(self, manifest: Manifest) -> None:
+        self._refuse_child()
         store(self.root, manifest)
         self.manifest = manifest
 
@@ -69,44 +92,75 @@ def open_for_writing(root: Path) -> Iterator[Writer]:
 
     Raises:
         LakeLockedError: another process holds the lock.
-        LakeError: the folder holds other things than a lake.
+        LakeError: the folder holds other things than a lake, or cannot be written to.
     """
     _refuse_foreign(root)
-    root.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    descriptor = _open_lock(root)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(descriptor, 200).decode(errors="replace").strip()
-            raise LakeLockedError(
-                f"{root}: another process is writing to this lake ({holder or 'unknown'}). "
-                "Wait for it to end, or write to another lake with --lake. Readers need not wait."
-            ) from None
+        _take(root, descriptor)
+        # What is said of its holder stays in the file where a session did not come to its end.
+        broken_off = bool(os.pread(descriptor, 1, 0))
         os.ftruncate(descriptor, 0)
-        os.write(descriptor, json.dumps({"pid": os.getpid()}).encode())
-        shutil.rmtree(root / files.STAGING, ignore_errors=True)
-        for leftover in (*root.glob(".*.tmp"), *root.glob(".*.tmp.wal")):
-            leftover.unlink()
-        try:
-            manifest = load(root)
-        except LakeMissingError:
-            manifest = Manifest()
-            store(root, manifest)
-        writer = Writer(root, manifest)
+        os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
+        writer = _begin(root, broken_off=broken_off)
         yield writer
         writer.finish()
+        os.ftruncate(descriptor, 0)
     finally:
-        os.close(descriptor)
+        if descriptor in _HELD:  # not in a forked child, which let go of it
+            _HELD.discard(descriptor)
+            os.close(descriptor)
+
+
+def _open_lock(root: Path) -> int:
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as denied:
+        raise LakeError(
+            f"{root}: no lake can be written there ({denied.strerror}). Name another folder with --lake."
+        ) from denied
+    _HELD.add(descriptor)
+    return descriptor
+
+
+def _take(root: Path, descriptor: int) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+        raise LakeLockedError(
+            f"{root}: {holder or 'another process'} is writing to this lake. "
+            "Wait for it to end, or write to another lake with --lake. Readers need not wait."
+        ) from None
+
+
+def _begin(root: Path, *, broken_off: bool) -> Writer:
+    """Load the manifest (or make the first), sweep what was half written, and bring the catalog up to date."""
+    try:
+        manifest = load(root)
+    except LakeMissingError:
+        manifest = Manifest()
+        store(root, manifest)
+    shutil.rmtree(root / files.STAGING, ignore_errors=True)
+    remove_leftovers(root)
+    remove_leftovers(root / files.REPORTS)
+    if broken_off:
+        # Readers of the catalog must not fall behind by more generations than files are kept for.
+        with suppress(LakeError):  # files are missing: this session may be the one that makes them again
+            catalog.rebuild(root, manifest)
+    return Writer(root, manifest)
 
 
 def _refuse_foreign(root: Path) -> None:
-    if root.is_file():
+    if root.exists() and not root.is_dir():
         raise LakeError(f"{root}: is a file; a lake is a folder. Name another with --lake.")
-    if root.is_dir() and not (root / "manifest.json").exists():
+    if (root / MANIFEST).exists():
+        load(root)  # another program's manifest is found out before anything is touched
+    elif root.is_dir():
         foreign = sorted(item.name for item in root.iterdir() if not item.name.startswith("."))
         if foreign:
             raise LakeError(
                 f"{root}: holds other files ({', '.join(foreign[:3])}{', ...' if len(foreign) > 3 else ''}) and is no "
-                "lake (no manifest.json). Name an empty or new folder with --lake."
+                f"lake (no {MANIFEST}). Name an empty or new folder with --lake."
             )

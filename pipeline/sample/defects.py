@@ -19,7 +19,13 @@ Integers = npt.NDArray[np.int64]
 
 DEEPEST_START_M = 200.0
 SHALLOWEST_START_M = 20.0
-NEAREST_LEADER_M = 30.0
+NEAREST_LEADER_M = 20.0
+"""Vehicles overlap in recordings where they drive close; from farther away, the drift would be no tracking error."""
+
+DRIFT_S = 2.0
+"""How long a vehicle takes to drift into its leader, and out again."""
+
+CLEAR_M = 0.05
 ROLLING_MPS = 1.6
 """Only vehicles slower than this swing back; the acceleration of that stays below 3.05 m/s2."""
 
@@ -217,32 +223,53 @@ def _overlap(unseen_leaders: bool) -> Inflict:
     unseen = [unseen_leaders]
 
     def inflict(work: _Work, place: int) -> bool:
-        """For a while the vehicle is recorded inside its leader."""
-        run = _run(work, place, work.seconds(0.4, 1.6), margin=round(work.rate_hz / 2))
+        """For a while the vehicle drifts into its leader, where it is nearest to it, and back out again."""
+        ramp, deep = round(DRIFT_S * work.rate_hz), work.seconds(0.4, 1.6)
+        run = _nearest_to_leader(work, place, 2 * ramp + deep)
         if run is None:
             return False
         rows = slice(run[0], run[1] + 1)
         leaders = work.leader[rows]
-        if (leaders < 0).any() or len(np.unique(work.vehicle[leaders])) > 1:
-            return False
         ahead = int(np.searchsorted(work.begins, leaders[0], side="right")) - 1
         rear = work.x[leaders] - work.length[leaders]
-        if ahead in work.used or (rear - work.x[rows] > NEAREST_LEADER_M).any():
+        if ahead in work.used:
             return False
         depth = float(work.random.uniform(0.4, 0.5 * min(4.0, work.length[leaders[0]])))
-        work.x[rows] = rear + depth
+        rise = (1 - np.cos(np.pi * (np.arange(ramp) + 1) / (ramp + 1))) / 2
+        share = np.concatenate([rise, np.ones(deep), rise[::-1]])
+        gap = (1 - share) * (rear - work.x[rows]) - share * depth
+        # So near to touching, the file's rounding would decide whether it is an overlap.
+        gap = np.where(np.abs(gap) < CLEAR_M, CLEAR_M, gap)
+        work.x[rows] = rear - gap
+        inside = np.flatnonzero(gap < 0) + rows.start
         work.used.add(ahead)
-        work.note("overlap", *run, depth)
+        work.note("overlap", int(inside[0]), int(inside[-1]), depth)
         if unseen[0]:
             # Some of the leader's entries are lost, but the headway to it has been recorded.
             unseen[0] = False
-            lost = leaders[: max(1, len(leaders) // 2)]
+            lost = work.leader[inside][: max(1, len(inside) // 2)]
             work.lost_later[lost] = True
             work.note("frame_gap", int(lost[0]), int(lost[-1]))
-            work.note("overlap_unseen", run[0], run[0] + len(lost) - 1, depth)
+            work.note("overlap_unseen", int(inside[0]), int(inside[0]) + len(lost) - 1, depth)
         return True
 
     return inflict
+
+
+def _nearest_to_leader(work: _Work, place: int, wanted: int) -> tuple[int, int] | None:
+    """The run of `wanted` rows behind one leader around the smallest gap that is at most NEAREST_LEADER_M."""
+    rows = work.rows(place)
+    leader = work.leader[rows]
+    if rows.stop - rows.start < wanted or (leader < 0).all():
+        return None
+    gap = np.where(leader < 0, np.inf, work.x[leader] - work.length[leader] - work.x[rows])
+    nearest = int(np.argmin(gap))
+    first = min(max(0, nearest - wanted // 2), rows.stop - rows.start - wanted)
+    chosen = slice(first, first + wanted)
+    one_leader = (leader[chosen] >= 0).all() and len(np.unique(work.vehicle[leader[chosen]])) == 1
+    if not one_leader or gap[chosen].max() > NEAREST_LEADER_M or gap[chosen].min() < CLEAR_M:
+        return None
+    return rows.start + first, rows.start + first + wanted - 1
 
 
 def _backward(work: _Work, place: int) -> bool:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import polars as pl
 
 from pipeline.sources.base import Part
-from pipeline.sources.lines import LINE, REJECT_SCHEMA, fetch_lines
+from pipeline.sources.lines import REJECT_SCHEMA
+from pipeline.sources.raw_files import LINE, fetch_lines
 from schemas import INGEST_LOG, REJECTS
 
 FILE = "file_index"

@@ -1,7 +1,9 @@
 """highD: drone recordings of German motorways, 25 Hz, three CSV files per recording."""
 
+import math
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import polars as pl
@@ -9,7 +11,8 @@ import polars as pl
 from pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
-from pipeline.sources.lines import LINE, Chunk, Layout, read_chunks
+from pipeline.sources.lines import Chunk, Layout, read_chunks
+from pipeline.sources.raw_files import LINE
 from pipeline.transforms.orientation import LOWER, UPPER, orient_highd
 from schemas import Table
 from schemas.raw_highd import (
@@ -28,7 +31,6 @@ FIRST_FRAME = 1
 """Frames count from 1, so time_s = 0 there even where the first vehicle comes later."""
 
 CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
-CLASSES = {"Car": "car", "Truck": "truck"}
 
 
 def detect(head: bytes, _name: str) -> str | None:
@@ -39,10 +41,13 @@ def detect(head: bytes, _name: str) -> str | None:
 
 
 def group(files: Sequence[RawFile]) -> Grouping:
-    """Gather each recording's three files by folder and number (`NN_tracks.csv`); incomplete ones are refused."""
+    """Gather each recording's three files by folder and number (`NN_tracks.csv`); incomplete ones are refused.
+
+    Of two files of one kind the one that is named as shipped is taken and the other refused.
+    """
     gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
     refusals = []
-    for file in sorted(files, key=lambda file: file.name):
+    for file in sorted(files, key=lambda file: (not file.path.stem.endswith(_kind(file.dialect)), file.name)):
         number = re.match(r"(\d+)_", file.path.name)
         if number is None:
             refusals.append(
@@ -50,7 +55,14 @@ def group(files: Sequence[RawFile]) -> Grouping:
                 f"the recording's number. Expected `NN_{_kind(file.dialect)}.csv`, as shipped; rename it."
             )
             continue
-        gathered.setdefault((str(file.path.parent), number.group(1)), {})[file.dialect] = file
+        found = gathered.setdefault((str(file.path.parent), number.group(1)), {})
+        if file.dialect in found:
+            refusals.append(
+                f"{file.name}: a second {_kind(file.dialect)} file of recording {number.group(1)} beside "
+                f"{found[file.dialect].name}, which was taken. Expected one; remove one of the two."
+            )
+            continue
+        found[file.dialect] = file
     units: list[Unit] = []
     for (_, digits), found in sorted(gathered.items(), key=lambda item: item[0][::-1]):
         recording = f"{int(digits):02d}"
@@ -83,28 +95,30 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     """
     meta_file, vehicles_file, tracks_file = (part.file for part in parts)
     meta_rows, vehicles, tracks = (_read(part.file) for part in parts)
-    meta = _only_row(meta_rows.frame, meta_file)
+    meta = _only_row(meta_rows, meta_file)
     if f"{meta['id']:02d}" != recording:
         raise SourceError(
             f"{meta_file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
             "Two recordings' files are mixed; restore the originals."
         )
     entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
+    if again.height < tracks.frame.height:
+        entries = entries.sort("id", "frame", LINE)
     conflicting = (pl.col("id") == pl.col("id").shift(1)) & (pl.col("frame") == pl.col("frame").shift(1))
     entries = entries.with_columns(conflicting.fill_null(value=False).alias("conflicts"))
     conflicts, entries = entries.filter("conflicts"), entries.filter(~pl.col("conflicts"))
     if entries.is_empty():
         raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
-    _require_known(entries, vehicles.frame, tracks_file, vehicles_file)
+    known, known_again = _unique_vehicles(vehicles.frame, vehicles_file)
+    _require_known(entries, known, tracks_file, vehicles_file)
     rejected = [
         Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
     ]
     parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
-    log, rejects = account("highd", recording, rejected, parsed, [(again, DUPLICATE), (conflicts, CONFLICT)])
+    dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
+    log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
-    subsets = [
-        _to_subset(entries, vehicles.frame, direction, recording, meta, meta_file, files) for direction in CARRIAGEWAYS
-    ]
+    subsets = [_to_subset(entries, known, direction, recording, meta, meta_file, files) for direction in CARRIAGEWAYS]
     found = tuple(subset for subset in subsets if subset is not None)
     return Canonical(found, log, rejects, tuple(_remark(found, meta)))
 
@@ -133,10 +147,27 @@ def _layout(dialect: str, raw: Table) -> Layout:
     )
 
 
-def _only_row(meta: pl.DataFrame, file: RawFile) -> dict[str, Any]:
-    if meta.height != 1:
-        raise SourceError(f"{file.name}: expected one readable row under the header, got {meta.height}.")
-    return meta.row(0, named=True)
+def _only_row(meta: Chunk, file: RawFile) -> dict[str, Any]:
+    if meta.frame.height != 1:
+        why = "".join(f" Line {line} cannot be read: {reason}." for line, reason, _ in meta.rejects.head(1).rows())
+        raise SourceError(
+            f"{file.name}: expected one readable row under the header, got {meta.frame.height}.{why} "
+            "Restore the original file."
+        )
+    return meta.frame.row(0, named=True)
+
+
+def _unique_vehicles(vehicles: pl.DataFrame, file: RawFile) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Vehicles with one row each, and exact repetitions of those rows."""
+    unique, again = split_duplicates(vehicles.with_columns(pl.lit(1, pl.Int64).alias(FILE)), ["id"])
+    twice = unique.filter(~pl.col("id").is_first_distinct())
+    if not twice.is_empty():
+        first = twice.row(0, named=True)
+        raise SourceError(
+            f"{file.name}, line {first[LINE]}: a second, different row of vehicle {first['id']}. Expected one row per "
+            "vehicle; restore the original file."
+        )
+    return unique, again
 
 
 def _require_known(entries: pl.DataFrame, vehicles: pl.DataFrame, tracks_file: RawFile, vehicles_file: RawFile) -> None:
@@ -155,7 +186,8 @@ def _markings(text: str, file: RawFile) -> list[float]:
         values = [float(value) for value in text.split(";")]
     except ValueError:
         values = []
-    if len(values) < 2 or values != sorted(values):
+    increasing = all(low < high for low, high in pairwise(values))
+    if len(values) < 2 or not increasing or not all(math.isfinite(value) for value in values):
         raise SourceError(
             f"{file.name}, line 2: expected lane markings as increasing numbers separated by `;`, got {text!r}."
         )
@@ -193,7 +225,7 @@ def _to_subset(
         headway_recorded_m=leader.then(pl.col("dhw")),
     )
     sizes = mine.select(
-        pl.col("class").replace_strict(CLASSES, return_dtype=pl.String),
+        pl.col("class").str.to_lowercase(),
         vehicle_id="id",
         source_vehicle_id="id",
         length_m="width",

@@ -4,22 +4,25 @@ A file is read in chunks of whole lines. A chunk is parsed strictly and at once;
 all of its lines is the chunk (not the file) looked at line by line.
 """
 
-import gzip
-import io
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
 
-CHUNK_BYTES = 32 << 20
-LINE = "line"
+from pipeline.sources.raw_files import BOM, CHUNK_BYTES, LINE, open_raw, split_lines, squeeze_blanks, whole_lines
+
 REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
 THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
 """A count or a length that may carry thousands separators: `1,156` is one, `1,15` is not."""
+
+UNNAMED = "#"
+"""In the name of a field that is not wanted, precedes its number where its own name is missing or taken."""
+
+WELL_QUOTED = r'^("[^"]*"|[^",]*)(,("[^"]*"|[^",]*))*$'
+"""Quotes surround whole fields or do not occur."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +70,6 @@ class Chunk:
     rows_read: int
 
 
-def open_raw(path: Path) -> BinaryIO:
-    """Open a raw file for reading bytes; a gzip file is read without unpacking it to disk."""
-    with path.open("rb") as probe:
-        magic = probe.read(2)
-    return gzip.open(path, "rb") if magic == b"\x1f\x8b" else path.open("rb")  # type: ignore[return-value]
-
-
 def read_chunks(path: Path, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Chunk]:
     """Read a file chunk by chunk.
 
@@ -81,27 +77,17 @@ def read_chunks(path: Path, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES) -
         path: the file; gzip is recognised.
         layout: how to read its lines.
         chunk_bytes: about how much to hold at once.
+
+    Raises:
+        SourceError: a compressed file is damaged or cut short.
     """
     first_line = 1
     with open_raw(path) as handle:
-        for data in _whole_lines(handle, chunk_bytes):
+        for data in whole_lines(handle, chunk_bytes, path):
             lines = data.count(b"\n") + (not data.endswith(b"\n"))
             skip = layout.header_lines if first_line == 1 else 0
             yield parse(data, layout, first_line=first_line, skip=skip)
             first_line += lines
-
-
-def _whole_lines(handle: BinaryIO, chunk_bytes: int) -> Iterator[bytes]:
-    rest = b""
-    while block := handle.read(chunk_bytes):
-        cut = block.rfind(b"\n") + 1
-        if cut == 0:
-            rest += block
-            continue
-        yield rest + block[:cut]
-        rest = block[cut:]
-    if rest:
-        yield rest
 
 
 def parse(data: bytes, layout: Layout, *, first_line: int = 1, skip: int = 0) -> Chunk:
@@ -113,11 +99,11 @@ def parse(data: bytes, layout: Layout, *, first_line: int = 1, skip: int = 0) ->
         first_line: number of the first of them in its file.
         skip: header lines at the start, neither kept nor counted.
     """
+    if first_line == 1:
+        data = data.removeprefix(BOM)
     for _ in range(skip):
         data = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
     first_line += skip
-    if first_line <= 2:
-        data = data.removeprefix(b"\xef\xbb\xbf")
     rows_read = data.count(b"\n") + (bool(data) and not data.endswith(b"\n"))
     kept = _parse_strictly(data, layout, rows_read, first_line)
     if kept is not None:
@@ -127,10 +113,15 @@ def parse(data: bytes, layout: Layout, *, first_line: int = 1, skip: int = 0) ->
 
 def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int) -> pl.DataFrame | None:
     """All lines typed at once, or None where a single one cannot be accounted for."""
-    if b"\0" in data:
+    # A byte order mark inside a file comes from joining files; the CSV reader would take it only at a chunk's start.
+    if b"\0" in data or BOM in data:
         return None
     if not rows_read:
         return pl.DataFrame(schema={LINE: pl.Int64(), **layout.dtypes})
+    if layout.blanks:
+        data = squeeze_blanks(data)
+    elif not _is_well_quoted(data):
+        return None
     typed = {
         name: pl.String() if name in layout.thousands else layout.dtypes.get(name, pl.String()) for name in layout.names
     }
@@ -138,16 +129,40 @@ def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int
         frame = _scan(data, layout, typed, first_line=first_line)
     except (pl.exceptions.ComputeError, pl.exceptions.NoDataError, pl.exceptions.SchemaError):
         return None
-    if frame.height != rows_read:
+    # Where a line has too few fields its last one is missing; one with too many has failed the scan.
+    if frame.height != rows_read or frame[layout.names[-1]].null_count():
         return None
     separated = sorted(layout.thousands & layout.dtypes.keys())
     if not all(frame[name].str.contains(THOUSANDS).all() for name in separated):
         return None
+    empty = frame.select(pl.col(separated).null_count())
     frame = frame.with_columns(
         pl.col(LINE).cast(pl.Int64),
-        *(pl.col(name).str.replace_all(",", "", literal=True).cast(layout.dtypes[name]) for name in separated),
+        *(
+            pl.col(name).str.replace_all(",", "", literal=True).cast(layout.dtypes[name], strict=False)
+            for name in separated
+        ),
     )
+    # A number that its dtype cannot hold has become null.
+    if not frame.select(pl.col(separated).null_count()).equals(empty):
+        return None
     return frame.select(LINE, *layout.dtypes) if frame.select(~_is_bad(layout).any()).item() else None
+
+
+def _is_well_quoted(data: bytes) -> bool:
+    """Whether quotes surround whole fields; elsewhere the CSV reader and the one for single lines might disagree."""
+    if b'"' not in data:
+        return True
+    text = np.frombuffer(data, np.uint8)
+    quotes = np.flatnonzero(text == ord('"'))
+    if quotes.size % 2:
+        return False
+    opening, closing = quotes[0::2], quotes[1::2]
+    before = text[opening[opening > 0] - 1]
+    after = text[closing[closing + 1 < text.size] + 1]
+    if not (np.isin(before, (10, 44)).all() and np.isin(after, (10, 13, 44)).all()):
+        return False
+    return data.count(b'"\r') == data.count(b'"\r\n')
 
 
 def _is_bad(layout: Layout) -> pl.Expr:
@@ -171,25 +186,11 @@ def _not_among(name: str, allowed: tuple[str, ...]) -> pl.Expr:
     return ~pl.col(name).str.to_lowercase().is_in(list(allowed)).fill_null(value=True)
 
 
-def squeeze_blanks(data: bytes) -> bytes:
-    """Runs of blanks, tabs and carriage returns to one blank; none at the start or the end of a line."""
-    text = np.frombuffer(data, np.uint8)
-    blank = (text == 32) | (text == 9) | (text == 13)
-    last_of_run = np.empty_like(blank)
-    last_of_run[:-1] = ~blank[1:] & (text[1:] != 10)
-    last_of_run[-1:] = False
-    text = np.where(blank, np.uint8(32), text)[~blank | last_of_run]
-    leading = text == 32
-    leading[1:] &= text[:-1] == 10
-    squeezed: bytes = text[~leading].tobytes()
-    return squeezed
-
-
 def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line: int) -> Chunk:
     lines = split_lines(data, first_line)
     reason = _structural_reason(lines, layout)
     sound = lines.filter(reason.is_null())
-    fields = _split_fields(sound["text"], layout)
+    fields = _split_fields(sound["text"].str.replace_all(BOM.decode(), "", literal=True), layout)
     cells = fields.with_columns(sound[LINE])
     numeric = [name for name, dtype in layout.dtypes.items() if dtype.is_numeric()]
     # What is not well formed stays as it is and fails its cast below.
@@ -197,6 +198,11 @@ def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line:
     cells = cells.with_columns(
         pl.when(yes).then(pl.col(name).str.replace_all(",", "", literal=True)).otherwise(pl.col(name)).alias(name)
         for name, yes in well_formed.items()
+    ).with_columns(
+        # Programs that know no empty whole number write 1156 as 1156.0.
+        pl.col(name).str.replace(r"^([+-]?\d+)\.0+$", "${1}")
+        for name in numeric
+        if layout.dtypes[name].is_integer()
     )
     typed = cells.select(
         LINE,
@@ -224,8 +230,14 @@ def _complaints(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
     """What is wrong with a row's values, the first complaint that applies; `<name>.cell` is the text of a number."""
     complaints = [pl.lit(None, pl.String)]
     for name in numeric:
-        unread = pl.col(name).is_null() | ~pl.col(name).cast(pl.Float64).is_finite()
-        complaints.append(_say(pl.col(f"{name}.cell").is_not_null() & unread, f"not a number: {name}"))
+        cell = pl.col(f"{name}.cell")
+        finite = cell.cast(pl.Float64, strict=False).is_finite().fill_null(value=False)
+        complaints.append(_say(cell.is_not_null() & ~finite, f"not a number: {name}"))
+        if layout.dtypes[name].is_integer():
+            unread = cell.is_not_null() & pl.col(name).is_null()
+            whole = cell.str.contains(r"^[+-]?\d+$")
+            complaints.append(_say(unread & ~whole, f"not a plain whole number: {name}"))
+            complaints.append(_say(unread, f"out of range: {name}"))
     complaints += [_say(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
     complaints += [_say(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
     complaints += [
@@ -239,21 +251,24 @@ def _say(applies: pl.Expr, complaint: str) -> pl.Expr:
 
 
 def _structural_reason(lines: pl.DataFrame, layout: Layout) -> pl.Series:
-    text = pl.col("text")
+    text = pl.col("text").str.replace_all(BOM.decode(), "", literal=True)
     if layout.blanks:
-        fields = text.str.strip_chars().str.count_matches(r"[ \t]+") + 1
-        unbalanced = pl.lit(value=False)
+        fields = text.str.strip_chars(" \t\r").str.count_matches(r"[ \t\r]+") + 1
+        unbalanced = misplaced = pl.lit(value=False)
         header = text.str.contains(r"^\s*[A-Za-z_]+(\s+[A-Za-z_]+)+\s*$")
     else:
         fields = text.str.replace_all(r'"[^"]*"', "").str.count_matches(",", literal=True) + 1
         unbalanced = text.str.count_matches('"', literal=True) % 2 == 1
-        header = text.str.to_lowercase().str.starts_with(f"{layout.names[0].lower()},")
+        misplaced = ~text.str.contains(WELL_QUOTED)
+        first_name = layout.names[0].lower().partition(UNNAMED)[0] or layout.names[0]
+        header = text.str.to_lowercase().str.strip_chars_start(' "').str.contains(f'^{re.escape(first_name)}"?,')
     return lines.select(
         pl.when(~pl.col("utf8")).then(pl.lit("not UTF-8"))
         .when(text.str.strip_chars() == "").then(pl.lit("blank line"))
         .when(text.str.contains("\0", literal=True)).then(pl.lit("NUL byte"))
         .when(header).then(pl.lit("repeated header"))
         .when(unbalanced).then(pl.lit("unbalanced quotes"))
+        .when(misplaced).then(pl.lit("misplaced quotes"))
         .when(fields != len(layout.names)).then(pl.format("{} fields instead of {}", fields, pl.lit(len(layout.names))))
         .alias("reason")
     ).to_series()  # fmt: skip
@@ -264,76 +279,20 @@ def _split_fields(text: pl.Series, layout: Layout) -> pl.DataFrame:
     if text.is_empty():
         return pl.DataFrame(schema=dict.fromkeys(layout.dtypes, pl.String()))
     data = "\n".join(text.to_list()).encode()
-    fields = _scan(data, layout, dict.fromkeys(layout.names, pl.String()), first_line=1).drop(LINE)
+    data = squeeze_blanks(data) if layout.blanks else data
+    fields = _scan(data, layout, dict.fromkeys(layout.names, pl.String()), first_line=1).select(*layout.dtypes)
     return fields.with_columns(pl.all().str.strip_chars().replace("", None))
 
 
 def _scan(data: bytes, layout: Layout, dtypes: Mapping[str, pl.DataType], *, first_line: int) -> pl.DataFrame:
-    return (
-        pl.scan_csv(
-            squeeze_blanks(data) if layout.blanks else data,
-            has_header=False,
-            separator=layout.separator,
-            quote_char=None if layout.blanks else '"',
-            schema=dtypes,
-            row_index_name=LINE,
-            row_index_offset=first_line,
-        )
-        .select(LINE, *layout.dtypes)
-        .collect()
-    )
-
-
-def split_lines(data: bytes, first_line: int = 1) -> pl.DataFrame:
-    """Lines as text: `line`, `text` (without its end, undecodable bytes replaced), `utf8` (whether it was)."""
-    ends = np.flatnonzero(np.frombuffer(data, np.uint8) == 10)
-    if data and not data.endswith(b"\n"):
-        ends = np.append(ends, len(data))
-    # An Arrow array over the same bytes: each line runs to the next one's start, its newline stripped below.
-    offsets = np.concatenate([[0], np.minimum(ends + 1, len(data))]).astype(np.int64)
-    buffers = [None, pa.py_buffer(offsets), pa.py_buffer(data)]
-    array = pa.LargeBinaryArray.from_buffers(pa.large_binary(), len(ends), buffers)
-    binary = pl.Series("text", array, dtype=pl.Binary)
-    utf8 = np.ones(len(binary), dtype=bool)
-    try:
-        text = binary.cast(pl.String)
-    except pl.exceptions.ComputeError:
-        # Only lines with a byte beyond ASCII can be at fault; those few are decoded one by one.
-        damaged = np.flatnonzero(np.maximum.reduceat(np.frombuffer(data, np.uint8), offsets[:-1]) > 127)
-        decoded = [value.decode("utf-8", errors="replace") for value in binary.gather(damaged)]
-        utf8[damaged] = ["\N{REPLACEMENT CHARACTER}" not in value for value in decoded]
-        text = binary.scatter(damaged, [value.encode() for value in decoded]).cast(pl.String)
-    return pl.DataFrame(
-        {
-            LINE: pl.int_range(first_line, first_line + len(ends), eager=True, dtype=pl.Int64),
-            "text": text.str.strip_suffix("\n").str.strip_suffix("\r"),
-            "utf8": pl.Series(utf8),
-        }
-    )
-
-
-def fetch_lines(path: Path, numbers: pl.Series) -> pl.DataFrame:
-    """The text of some lines of a file: `line`, `text`.
-
-    Args:
-        path: the file.
-        numbers: line numbers from 1.
-    """
-    wanted = pl.DataFrame({LINE: numbers.cast(pl.Int64)}).unique()
-    found = []
-    first_line = 1
-    with open_raw(path) as handle:
-        for data in _whole_lines(handle, CHUNK_BYTES):
-            lines = split_lines(data, first_line)
-            found.append(lines.join(wanted, on=LINE, how="semi").select(LINE, "text"))
-            first_line += lines.height
-    return pl.concat(found) if found else pl.DataFrame(schema={LINE: pl.Int64(), "text": pl.String()})
-
-
-def read_head(path: Path, size: int = 65_536) -> bytes:
-    """The first bytes of a raw file (of its content, where it is compressed)."""
-    with open_raw(path) as handle:
-        try:
-            return handle.read(size)
-        except (EOFError, gzip.BadGzipFile, io.UnsupportedOperation):
-            return b""
+    # All fields, wanted or not: the reader looks no further than the last one asked for, so that a field too many in
+    # the middle of a line would shift the others unnoticed.
+    return pl.scan_csv(
+        data,
+        has_header=False,
+        separator=layout.separator,
+        quote_char=None if layout.blanks else '"',
+        schema=dtypes,
+        row_index_name=LINE,
+        row_index_offset=first_line,
+    ).collect()

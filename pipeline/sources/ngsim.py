@@ -10,8 +10,9 @@ import polars as pl
 from pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, Spilled, Subset, Unit
-from pipeline.sources.lines import REJECT_SCHEMA, read_chunks, read_head
+from pipeline.sources.lines import REJECT_SCHEMA, read_chunks
 from pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording
+from pipeline.sources.raw_files import read_head
 from pipeline.transforms.identities import identify_vehicles
 from pipeline.transforms.orientation import DIRECTIONS, orient_ngsim
 from schemas.columns import FOOT_M
@@ -19,6 +20,10 @@ from schemas.raw_ngsim import RAW_NGSIM
 
 FRAME_RATE_HZ = 10.0
 CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
+DECIMALS = 6
+"""To which measurements are rounded. The originals have three; files that passed through a program's binary numbers say
+27.125999999999998 for 27.126, and are to give the same tables and to be recognised as repetitions."""
+
 CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
 """The same in all rows of one vehicle, so that they tell apart vehicles that share an id."""
 
@@ -47,7 +52,7 @@ def spill(file: RawFile, folder: Path) -> Spilled:
         file: any NGSIM dialect.
         folder: receives `<recording>/<chunk>.parquet` with the columns of schemas.RAW_NGSIM.
     """
-    layout = layout_of(read_head(file.path), file.dialect)
+    layout = layout_of(read_head(file.path), file.dialect, where=file.name)
     counts: Counter[str] = Counter()
     rejects, rows_read = [pl.DataFrame(schema=REJECT_SCHEMA)], 0
     for number, chunk in enumerate(read_chunks(file.path, layout)):
@@ -57,13 +62,17 @@ def spill(file: RawFile, folder: Path) -> Spilled:
             pl.lit(None, dtype).alias(name) for name, dtype in RAW_NGSIM.dtypes.items() if name not in chunk.frame
         ]
         raw = RAW_NGSIM.validate(chunk.frame.with_columns(absent).select(*RAW_NGSIM.dtypes), where=file.name)
-        raw = raw.with_columns(key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64))
-        for (key, location), rows in raw.partition_by("key", "Location", as_dict=True, include_key=True).items():
-            recording, _ = name_recording(int(key), None if location is None else str(location).lower())
+        raw = raw.with_columns(
+            pl.col(pl.Float64).round(DECIMALS),
+            pl.col("Location").str.to_lowercase(),
+            key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64),
+        )
+        for share, ((key, location), rows) in enumerate(raw.partition_by("key", "Location", as_dict=True).items()):
+            recording, _ = name_recording(int(key), None if location is None else str(location))
             counts[recording] += rows.height
             target = folder / recording
             target.mkdir(parents=True, exist_ok=True)
-            rows.drop("key").write_parquet(target / f"{number:06d}-{key}.parquet", compression="lz4")
+            rows.drop("key").write_parquet(target / f"{number:06d}-{share:06d}.parquet", compression="lz4")
     return Spilled(dict(counts), rows_read, pl.concat(rejects))
 
 
@@ -80,11 +89,14 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         if part.rows is not None
     ]
     raw = pl.concat(shares)
+    location: str | None = raw.select(pl.col("Location").drop_nulls().first()).item()
+    # Not every dialect says where it is from; the recording does, so rows that differ only in that are repetitions.
+    raw = raw.drop("Location")
     rows, duplicates = split_duplicates(raw, ["Vehicle_ID", "Frame_ID"])
     log, rejects = account("ngsim", recording, parts, [share.height for share in shares], [(duplicates, DUPLICATE)])
     first = rows.row(0, named=True)
     key = first["Global_Time"] - 100 * first["Frame_ID"]
-    _, site_name = name_recording(key, None if first["Location"] is None else first["Location"].lower())
+    _, site_name = name_recording(key, location)
     one_direction = rows["Direction"].is_null().all()
     site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", None, (), "")
     recording_facts: dict[str, Any] = {
@@ -102,7 +114,8 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     if site.freeway:
         subsets = [_to_subset(rows, recording, None, {**recording_facts, "direction": site.direction}, files)]
     else:
-        by_direction = rows.with_columns(pl.col("Direction").fill_null(0).cast(pl.Int16))
+        known = pl.col("Direction").is_in([float(code) for code in DIRECTIONS])
+        by_direction = rows.with_columns(pl.when(known).then("Direction").otherwise(0).cast(pl.Int16))
         subsets = []
         for (code,), entries in sorted(by_direction.partition_by("Direction", as_dict=True).items()):
             direction = DIRECTIONS.get(code, "unknown")

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
 
-from pipeline.sources.lines import Layout
+from pipeline.sources.base import SourceError
+from pipeline.sources.lines import UNNAMED, Layout
+from pipeline.sources.raw_files import LINE
 from schemas.raw_ngsim import RAW_NGSIM
 
 TEXT_FIELDS = (
@@ -116,7 +118,8 @@ def name_recording(key: int, location: str | None) -> tuple[str, str]:
     by_day = {site.day: site.name for site in SITES.values()}
     site = location or by_day.get(f"{start:%Y-%m-%d}", "unknown")
     rest = f"-{start_ms % 1000:03d}" if start_ms % 1000 else ""
-    return f"{site}-{start:%Y%m%d-%H%M%S}{rest}", site
+    again = "-again" if start.fold else ""  # the hour that summer time's end repeats
+    return f"{site}-{start:%Y%m%d-%H%M%S}{rest}{again}", site
 
 
 def detect(head: bytes, _name: str) -> str | None:
@@ -135,16 +138,26 @@ def detect(head: bytes, _name: str) -> str | None:
     return TEXT if any(_are_numbers(line.split()) for line in lines) else None
 
 
-def layout_of(head: bytes, dialect: str) -> Layout:
-    """How to read a file of a dialect, given its first bytes."""
+def layout_of(head: bytes, dialect: str, *, where: str) -> Layout:
+    """How to read a file of a dialect, given its first bytes.
+
+    Args:
+        head: the first bytes.
+        dialect: as detected.
+        where: the file's name, for the message.
+
+    Raises:
+        SourceError: two columns have one meaning.
+    """
     if dialect == CSV:
         line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace")
-        names = tuple(_canonical_names(line))
+        names = _tell_apart(_canonical_names(line), where)
     else:
         names = TEXT_FIELDS
-    wanted = [name for name in RAW_NGSIM.columns if name in names]
+    wanted = [name for name in RAW_NGSIM.columns if name in names and name != LINE]
     # The last field tells a cut line from a whole one, so it may not be empty even where the schema would let it.
-    required = (RAW_NGSIM.required & set(wanted)) | {names[-1]} & set(wanted)
+    # (Direction may: freeways have none.)
+    required = (RAW_NGSIM.required & set(wanted)) | {names[-1]} & set(wanted) - {"Direction"}
     if dialect != CSV:
         required = frozenset(wanted)
     return Layout(
@@ -162,6 +175,20 @@ def layout_of(head: bytes, dialect: str) -> Layout:
 def _canonical_names(line: str) -> list[str]:
     names = [field.strip().strip('"') for field in line.rstrip("\r\n").split(",")]
     return [ALIASES.get(name.lower(), name) for name in names]
+
+
+def _tell_apart(names: list[str], where: str) -> tuple[str, ...]:
+    """Unique names: those of no meaning here are numbered where they are missing, repeated or ours."""
+    taken = {LINE, ""}
+    unique = []
+    for number, name in enumerate(names, start=1):
+        if name in taken and name in RAW_NGSIM.columns and name != LINE:
+            raise SourceError(
+                f"{where}, line 1: two columns stand for {name}. Expected one; remove or rename the other."
+            )
+        unique.append(f"{name}{UNNAMED}{number}" if name in taken else name)
+        taken.add(name)
+    return tuple(unique)
 
 
 def _are_numbers(fields: list[str]) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.lake import write_aside
 from pipeline.sources import SOURCES, RawFile, Source, SourceError
 from pipeline.sources.base import Unit
-from pipeline.sources.lines import read_head
+from pipeline.sources.raw_files import read_head
 
 SUFFIXES = (".csv", ".txt", ".dat", ".gz", "")
 """Endings under which trajectory files circulate; others (pictures, Parquet, documents) are passed by."""
@@ -57,7 +57,14 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[Path
         if path.suffix.lower() not in SUFFIXES:
             passed_by.append(name)
             continue
-        head = read_head(path)
+        try:
+            head = read_head(path)
+        except SourceError as damage:
+            refusals.append(str(damage).replace(path.name, name, 1))
+            continue
+        except OSError as refused:
+            refusals.append(f"{name}: cannot be read ({refused.strerror}). Give yourself the right to read it.")
+            continue
         match = next(((item, d) for item in sources if (d := item.detect(head, path.name)) is not None), None)
         if match is None:
             if path.suffix.lower() in PROSE and not source.is_file():
@@ -125,10 +132,13 @@ class Digests:
 
     def __init__(self, root: Path) -> None:
         self._path = root / HASHES
+        self._known: dict[str, list[object]] = {}
         try:
-            self._known: dict[str, list[object]] = json.loads(self._path.read_text(encoding="utf-8"))
-        except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
-            self._known = {}
+            remembered = json.loads(self._path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            remembered = None  # nothing remembered, or not as it was written: everything is hashed again
+        if isinstance(remembered, dict):
+            self._known = {path: known for path, known in remembered.items() if isinstance(known, list)}
         self._changed = False
 
     def __call__(self, path: Path) -> str:

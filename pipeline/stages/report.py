@@ -8,10 +8,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pipeline.lake import Entry, LakeFile, Manifest, connect, load, write_aside
-from pipeline.lake.files import MODELS, REPORTS
+from pipeline.lake.files import REPORTS
 from pipeline.settings import Settings
 from pipeline.stages.base import Job, make_entry, make_job
-from pipeline.stages.score import collect_scores
+from pipeline.stages.score import collect_scores, finished_runs
 
 VERSION = 1
 PAGE, DOCUMENT = "index.html", "quality.json"
@@ -23,10 +23,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     entries = {key: entry.fingerprint for key, entry in manifest.entries.items() if entry.stage != "report"}
     if not any(key.startswith("ingest/") for key in entries):
         return []
-    runs = {
-        path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-        for path in sorted((root / MODELS).glob("*/metrics.json"))
-    }
+    runs = {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in finished_runs(root)}
     made_of = {"entries": entries, "runs": runs, "settings": _shown(settings)}
     return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
 

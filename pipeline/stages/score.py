@@ -37,6 +37,11 @@ def build(root: Path, job: Job, _settings: Settings) -> Entry:
     return make_entry(job, {MODELS: files}, {"evaluation": metrics["evaluation"]})
 
 
+def finished_runs(root: Path) -> list[Path]:
+    """metrics.json of every run in the lake, sorted by name; what a killed training left is hidden and none."""
+    return sorted(path for path in (root / MODELS).glob("*/metrics.json") if not path.parent.name.startswith("."))
+
+
 def collect_scores(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
     """What the runs in the lake scored, of those that were made from the tensors that are live now.
 
@@ -47,7 +52,7 @@ def collect_scores(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
         return []
     index = json.loads((tensor_folder(root, manifest) / "index.json").read_text(encoding="utf-8"))
     scores = []
-    for path in sorted((root / MODELS).glob("*/metrics.json")):
+    for path in finished_runs(root):
         config = json.loads(path.with_name("config.json").read_text(encoding="utf-8"))
         evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
         if evaluation is None or (config["protocol"], config["blocks"]) != (index["protocol"], index["blocks"]):

@@ -36,7 +36,8 @@ def identify_vehicles(entries: pl.DataFrame, *, constants: Sequence[str]) -> Ide
         entries: source_id, frame, x_m, lane, leader_source_id, follower_source_id (0 or null = none) and the constants.
         constants: columns that are the same in all entries of one vehicle.
     """
-    entries = entries.sort("source_id", "frame", *constants, "x_m")
+    rest = [name for name in entries.columns if name not in ("source_id", "frame", "x_m", *constants)]
+    entries = entries.sort("source_id", "frame", *constants, "x_m", *rest)
     per_id = entries.group_by("source_id", *constants, maintain_order=True).agg(
         rows=pl.len(), frames=pl.col("frame").n_unique(), first=pl.col("frame").min()
     )
@@ -55,15 +56,16 @@ def identify_vehicles(entries: pl.DataFrame, *, constants: Sequence[str]) -> Ide
         .sort("source_id", "first", *constants, "twin")
         .with_columns(extra=pl.col("source_id").is_duplicated() & ~pl.col("source_id").is_first_distinct())
     )
-    fresh = _unused_ids(entries, int(vehicles["extra"].sum()))
-    vehicles = vehicles.with_columns(
-        vehicle_id=pl.when("extra")
-        .then(pl.lit(fresh).gather((pl.col("extra").cum_sum() - 1).clip(0)) if len(fresh) else pl.col("source_id"))
-        .otherwise(pl.col("source_id"))
-        .cast(pl.Int32)
+    extra = vehicles.filter("extra")
+    vehicles = pl.concat(
+        [
+            vehicles.filter(~pl.col("extra")).with_columns(vehicle_id=pl.col("source_id").cast(pl.Int32)),
+            extra.with_columns(_unused_ids(entries, extra.height).alias("vehicle_id")),
+        ]
     )
-    entries = entries.join(vehicles.select(*key, "twin", "vehicle_id"), on=[*key, "twin"], nulls_equal=True)
-    split = vehicles.filter("extra")["source_id"].unique()
+    named = vehicles.select(*key, "twin", "vehicle_id")
+    entries = entries.join(named, on=[*key, "twin"], nulls_equal=True, maintain_order="left")
+    split = extra["source_id"].unique()
     for role in ("leader", "follower"):
         entries = _follow_split(entries, role, split)
     return Identified(entries.drop("twin").sort("vehicle_id", "frame"), split.len())

@@ -108,6 +108,7 @@ def build(tables, splits, *, protocol=TINY):
 def write(folder, tables, splits, *, protocol=TINY):
     """The same as a tensor folder."""
     arrays, index = build(tables, splits, protocol=protocol)
+    folder.mkdir(parents=True, exist_ok=True)
     write_tensors(folder, arrays, index)
     return folder
 

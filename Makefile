@@ -1,0 +1,46 @@
+# make run     environment, generated sample, the whole pipeline to a report
+# make test    every test
+# make lint    ruff, types, import rules
+# make bench   what is claimed about speed and memory
+# make docs    pages derived from the code
+#
+# `make run ARGS="--minutes 0.3 --lake /tmp/lake"` passes options on.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+ARGS ?=
+
+.PHONY: install run test lint bench docs clean
+
+install: $(INSTALLED)
+
+# torch first and by its exact version: as a dependency of something else, pip may take a build with all of CUDA.
+$(INSTALLED): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=...")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet torch==2.13.0
+	$(BIN)/python -m pip install --quiet --editable ".[training,sample,distributed,dev]"
+	touch $@
+
+run: install
+	$(BIN)/tracklake run $(ARGS)
+
+test: install
+	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: install
+	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file $(ARGS) || exit 1; done
+
+docs: install
+	$(BIN)/python -m schemas.markdown > docs/tables.md
+
+clean:
+	rm -rf .venv lake sample build

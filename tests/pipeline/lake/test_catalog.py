@@ -1,0 +1,310 @@
+"""The lake as SQL: the views, their types, odd folder names, moved lakes, and what the sandbox admits."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import polars as pl
+import pytest
+from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
+
+from pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
+from schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
+from schemas import SUBSETS as SUBSETS_TABLE
+
+SQL_NAMES = {
+    pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
+    pl.Int64: "BIGINT", pl.Float32: "FLOAT", pl.Float64: "DOUBLE",
+}  # fmt: skip
+JOINED = {
+    "vehicles": {"eligible": "BOOLEAN", "starts_late": "BOOLEAN", "fully_tracked": "BOOLEAN", "early": "BOOLEAN"},
+    "subsets": {"backward_vehicles": "INTEGER", "excluded": "BOOLEAN", "excluded_reason": "VARCHAR"},
+}
+UPPER = {"dataset": "highd", "subset": "01-upper"}
+
+
+def sql_name(dtype: pl.DataType) -> str:
+    if isinstance(dtype, pl.List):
+        return sql_name(dtype.inner) + "[]"
+    if isinstance(dtype, pl.Struct):
+        return "STRUCT(" + ", ".join(f'"{field.name}" {sql_name(field.dtype)}' for field in dtype.fields) + ")"
+    return SQL_NAMES[dtype if isinstance(dtype, type) else type(dtype)]
+
+
+def make_vehicles(rows: int, subset: str = "01-upper") -> pl.DataFrame:
+    facts = {
+        "dataset": "highd", "subset": subset, "class": "car", "length_m": 4.5, "width_m": 2.0, "first_frame": 1,
+        "last_frame": 9, "entries": 9, "entries_announced": None, "start_x_m": 0.0, "end_x_m": 9.0, "start_lane": 1,
+        "mean_speed_mps": 3.0, "lane_changes": 0,
+    }  # fmt: skip
+    found = [{**facts, "vehicle_id": i, "source_vehicle_id": i} for i in range(rows)]
+    return pl.DataFrame(found, schema=VEHICLES.dtypes)
+
+
+def make_subset(subset: str = "01-upper") -> pl.DataFrame:
+    facts = {
+        "dataset": "highd", "subset": subset, "recording": "01", "site": "1", "direction": "upper", "freeway": True,
+        "frame_rate_hz": 25.0, "lanes": 2, "seconds": 9.0, "first_frame": 1, "last_frame": 9, "vehicles": 3,
+        "entries": 27, "flow": None, "ids_split": 0, "on_ramp_lanes": [], "lane_markings_m": [0.0, 3.75],
+        "columns_missing": ["lane"], "source_files": [{"file": "a.csv", "sha256": "00"}],
+    }  # fmt: skip
+    return pl.DataFrame([facts], schema=SUBSETS_TABLE.dtypes)
+
+
+def make_rejects(text: str) -> pl.DataFrame:
+    row = {"dataset": "highd", "recording": None, "file": "a", "line": 1, "reason": "short", "text": text}
+    return pl.DataFrame([row], schema=REJECTS.dtypes)
+
+
+def build(root: Path) -> None:
+    """Every kind of partition, list and struct columns, two stages beside what they judge."""
+    with open_for_writing(root) as writer:
+        writer.commit(put(root, "a", 1, make_vehicles(3), VEHICLES, **UPPER))
+        writer.commit(put(root, "b", 1, make_subset(), SUBSETS_TABLE, **UPPER))
+        writer.commit(put(root, "c", 1, make_rejects("it's"), REJECTS, dataset="highd"))
+        writer.commit(put(root, "d", 1, make_splits(2), SPLITS))
+
+
+def types_of(connection: duckdb.DuckDBPyConnection, view: str) -> dict[str, str]:
+    return {name: kind for name, kind, *_ in connection.execute(f'DESCRIBE "{view}"').fetchall()}
+
+
+@pytest.mark.parametrize("filled", [False, True])
+def test_every_view_has_the_declared_columns_and_types(tmp_path: Path, monkeypatch, filled: bool):
+    if filled:
+        build(tmp_path)
+    else:
+        with open_for_writing(tmp_path):
+            pass
+    monkeypatch.chdir(tmp_path)
+    with connect(tmp_path) as ours, duckdb.connect("catalog.duckdb", read_only=True) as plain:
+        for connection in (ours, plain):
+            names = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
+            assert names == {table.name for table in TABLES}
+            for table in TABLES:
+                declared = {name: sql_name(dtype) for name, dtype in table.dtypes.items()}
+                found = types_of(connection, table.name)
+                assert list(found.items()) == list((declared | JOINED.get(table.name, {})).items()), table.name
+
+
+def test_the_views_join_what_later_stages_found_out(tmp_path: Path):
+    build(tmp_path)
+    with connect(tmp_path) as connection:
+        assert connection.execute("SELECT DISTINCT starts_late FROM vehicles").fetchall() == [(None,)]
+        assert connection.execute("SELECT excluded, lane_markings_m FROM subsets").fetchall() == [(None, [0.0, 3.75])]
+    with open_for_writing(tmp_path) as writer:
+        writer.commit(put(tmp_path, "e", 1, make_starts("01-upper", 2), VEHICLE_STARTS, **UPPER))
+        writer.commit(put(tmp_path, "f", 1, make_status("01-upper", 3), SUBSET_STATUS, **UPPER))
+        # The same ids in another subset and in another dataset are other vehicles.
+        for key, values in (
+            ("g", {"dataset": "highd", "subset": "01-lower"}),
+            ("h", {"dataset": "ngsim", "subset": "01-upper"}),
+        ):
+            others = make_starts(values["subset"], 3, values["dataset"]).with_columns(starts_late=False)
+            writer.commit(put(tmp_path, key, 1, others, VEHICLE_STARTS, **values))
+    with connect(tmp_path) as connection:
+        found = connection.execute("SELECT vehicle_id, starts_late FROM vehicles ORDER BY 1").fetchall()
+        assert found == [(0, True), (1, True), (2, None)]
+        found = connection.execute("SELECT backward_vehicles, excluded, excluded_reason FROM subsets").fetchall()
+        assert found == [(3, True, "round 3")]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "it's a lake",
+        'la"ke',
+        "Straße 東京",
+        "a,b",
+        "a[1]*?{x}",
+        "50%25",
+        "exp=1",
+        "dataset=ngsim",
+        "subset=other",
+        "a;b",
+    ],
+)
+def test_a_lake_may_be_called_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
+    root = tmp_path / name / "lake"
+    write_round(root, 1)
+    write_round(root, 2)
+    check_lake(root)
+    with connect(root) as connection:
+        asked = "SELECT dataset, subset, backward_vehicles FROM subset_status ORDER BY 2"
+        rows = [("highd", "01-lower", 2), ("highd", "01-upper", 2)]
+        assert query(connection, asked).fetchall() == rows
+        monkeypatch.chdir(root)
+        with duckdb.connect("catalog.duckdb", read_only=True) as plain:
+            assert plain.execute(asked).fetchall() == rows
+    frame = scan(root, load(root), SUBSET_STATUS).sort("subset").collect()
+    assert frame.select("dataset", "subset", "backward_vehicles").rows() == rows
+    assert frame.schema == pl.Schema(SUBSET_STATUS.dtypes)
+
+
+@pytest.mark.parametrize("subset", ["it's", "a=b", "a/b", "..", "ünï 東", "50%", "a+b", "*", "[a]", "01", "a\\b"])
+def test_a_subset_may_be_called_anything(tmp_path: Path, subset: str):
+    values = {"dataset": "highd", "subset": subset}
+    with open_for_writing(tmp_path) as writer:
+        writer.commit(put(tmp_path, "a", 1, make_status(subset, 4), **values))
+        writer.commit(put(tmp_path, "b", 1, make_status("01-upper", 5), **UPPER))
+    manifest = load(tmp_path)
+    found = scan(tmp_path, manifest, SUBSET_STATUS, subset=subset).collect()
+    assert found.rows() == make_status(subset, 4).rows()
+    with connect(tmp_path) as connection:
+        asked = connection.execute("SELECT backward_vehicles FROM subset_status WHERE subset = ?", [subset])
+        assert asked.fetchall() == [(4,)]
+    files = manifest.live("subset_status")
+    assert all(len(Path(file.path).parts) == 4 for file in files)
+    assert tmp_path.resolve() in (tmp_path / files[0].path).resolve().parents
+
+
+def test_scan_reads_only_what_is_asked_for(tmp_path: Path):
+    write_round(tmp_path, 3)
+    manifest = load(tmp_path)
+    every = scan(tmp_path, manifest, VEHICLE_STARTS).collect()
+    assert every.group_by("subset").len().sort("subset").rows() == [(subset, 3) for subset in sorted(SUBSETS)]
+    assert every.schema == pl.Schema(VEHICLE_STARTS.dtypes)
+    shutil.rmtree(tmp_path / "vehicle_starts" / "dataset=highd" / "subset=01-lower")
+    assert scan(tmp_path, manifest, VEHICLE_STARTS, **UPPER).collect().height == 3
+    nothing = scan(tmp_path, manifest, VEHICLE_STARTS, dataset="ngsim").collect()
+    assert (nothing.height, nothing.schema) == (0, every.schema)
+    assert scan(tmp_path, manifest, SUBSETS_TABLE).collect().equals(SUBSETS_TABLE.empty())
+    for table, values in ((SPLITS, {"dataset": "highd"}), (VEHICLE_STARTS, {"vehicle_id": "3"})):
+        with pytest.raises(ValueError, match="has no partition"):
+            scan(tmp_path, manifest, table, **values)
+
+
+def test_a_moved_lake_works_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_round(tmp_path / "before", 2)
+    (tmp_path / "far").mkdir()
+    shutil.move(tmp_path / "before", tmp_path / "far" / "after")
+    check_lake(tmp_path / "far" / "after")
+    monkeypatch.chdir(tmp_path / "far")
+    with connect("after") as connection:  # relative, and still right after another change of folder
+        monkeypatch.chdir(tmp_path)
+        assert connection.execute("SELECT count(*) FROM subset_status").fetchall() == [(2,)]
+    monkeypatch.chdir(tmp_path / "far" / "after")
+    write_round(Path(), 3)
+    check_lake(Path())
+
+
+# ------------------------------------------------------------------------------------------- the sandbox
+
+
+@pytest.fixture
+def lake(tmp_path: Path) -> Path:
+    root = tmp_path / "lake"
+    build(root)
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    return root
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("sql", "first"),
+    [
+        ("SELECT count(*) FROM vehicles", 3),
+        ("with v as (select * from vehicles) select max(vehicle_id) from v;", 2),
+        ("FROM vehicles SELECT min(vehicle_id)", 0),
+        ("-- how many\nSELECT count(*) FROM splits", 2),
+        ("/* how many */ SELECT count(*) FROM splits", 2),
+        ("VALUES (5)", 5),
+        ("DESCRIBE vehicles", "dataset"),
+        ("SUMMARIZE splits", "split"),
+        ("SHOW TABLES", "findings"),
+        ("EXPLAIN SELECT * FROM vehicles", "physical_plan"),
+        ("EXPLAIN (FORMAT json) SELECT * FROM vehicles", "physical_plan"),
+        ("-- why\nEXPLAIN ANALYZE SELECT * FROM vehicles", "analyzed_plan"),
+        ("explain analyze select 1", "analyzed_plan"),
+        ("SELECT text FROM rejects", "it's"),
+    ],
+)
+def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
+    with connect(lake) as connection:
+        row = query(connection, sql).fetchone()
+    assert row is not None
+    assert row[0] == first
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "", ";", "SELECT 1; SELECT 2", "SELECT 1; COPY (SELECT 1) TO '{lake}/splits/x.csv'",
+        "COPY (SELECT 1) TO '{lake}/splits/x.csv'", "COPY vehicles TO '{out}'", "EXPORT DATABASE '{out}'",
+        "ATTACH '{out}' AS other", "ATTACH '{lake}/catalog.duckdb' AS other", "USE memory", "DETACH memory",
+        "CREATE TABLE x (a INT)", "CREATE TEMP TABLE x AS SELECT 1", "CREATE OR REPLACE VIEW vehicles AS SELECT 1",
+        "CREATE MACRO f() AS 1", "CREATE SECRET s (TYPE s3)", "DROP VIEW vehicles", "ALTER VIEW vehicles RENAME TO v",
+        "INSERT INTO vehicles VALUES (1)", "WITH x AS (SELECT 1) INSERT INTO vehicles FROM x", "DELETE FROM vehicles",
+        "UPDATE vehicles SET vehicle_id = 1", "TRUNCATE vehicles", "SET threads = 1", "RESET threads",
+        "SET enable_external_access = true", "PRAGMA threads = 1", "PRAGMA enable_profiling", "INSTALL httpfs",
+        "LOAD httpfs", "CALL pragma_version()", "CALL enable_logging()", "BEGIN", "COMMIT", "CHECKPOINT", "VACUUM",
+        "ANALYZE", "PREPARE p AS SELECT 1", "EXECUTE p", "IMPORT DATABASE '{out}'", "SELECT 1 INTO x",
+        "EXPLAIN ANALYZE COPY (SELECT 1) TO '{lake}/splits/x.csv'", "EXPLAIN COPY (SELECT 1) TO '{out}'",
+        "EXPLAIN (ANALYZE) COPY (SELECT 1) TO '{lake}/splits/x.csv'",
+        "EXPLAIN (ANALYZE, FORMAT json) CREATE TABLE x AS SELECT 1",
+        "EXPLAIN /* SELECT */ ANALYZE COPY (SELECT 1) TO '{lake}/splits/x.csv'",
+        "/* /* */ EXPLAIN SELECT 1 -- */ */ EXPLAIN ANALYZE COPY (SELECT 1) TO '{lake}/splits/x.csv'",
+        "-- \nEXPLAIN ANALYZE CREATE TABLE x AS SELECT 1",
+        "FROM enable_logging(storage = 'file', storage_path = '{lake}/splits')",
+        "FROM query('FROM enable_' || 'logging()')", 'FROM "query" /* */ (\'SELECT 1\')',
+        "FROM query('COPY (SELECT 1) TO ''{lake}/splits/x.csv''')",
+        "FROM Enable_Profiling(format = 'json', save_location = '{lake}/splits/x.json')",
+        "FROM '{secret}'", "FROM read_csv('{secret}')", "FROM read_text('/etc/passwd')", "FROM '/etc/passwd'",
+        "FROM read_blob('{lake}/manifest.json')", "FROM read_text('{lake}/catalog.duckdb')", "FROM glob('/etc/*')",
+        "FROM glob('{lake}/*')", "FROM read_parquet('{lake}/splits/../../secret.csv')", "DESCRIBE '{secret}'",
+        "SUMMARIZE '{secret}'", "FROM sniff_csv('{secret}')", "FROM parquet_metadata('{secret}')",
+        "FROM read_csv('https://example.org/x.csv')", "FROM 's3://bucket/x.parquet'", "FROM lake", "SELECT ?",
+    ],
+)  # fmt: skip
+def test_what_writes_or_looks_elsewhere_is_refused(lake: Path, tmp_path: Path, sql: str):
+    filled = sql.format(lake=lake, out=tmp_path / "out", secret=tmp_path / "secret.csv")
+    before = snapshot(tmp_path)
+    with connect(lake) as connection:
+        # Some are refused on asking, the others when DuckDB first touches the file.
+        with pytest.raises(QueryError), query_errors():
+            query(connection, filled).fetchall()
+        assert connection.execute("SELECT count(*) FROM vehicles").fetchall() == [(3,)]
+        assert connection.execute("SELECT count(*) FROM duckdb_tables()").fetchall() == [(0,)]
+    assert snapshot(tmp_path) == before
+
+
+def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, tmp_path: Path):
+    """In a process of its own, for DuckDB may end it: the file system itself refuses."""
+    before = snapshot(tmp_path)
+    script = (
+        "import sys; from pipeline.lake import connect; connection = connect(sys.argv[1]);"
+        "connection.execute(f\"FROM enable_logging(storage = 'file', storage_path = '{sys.argv[1]}/splits')\").fetchall();"
+        "connection.execute('SELECT count(*) FROM vehicles').fetchall()"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(lake)], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "file system operations are disabled" in done.stderr
+    assert snapshot(tmp_path) == before
+
+
+def test_python_variables_are_no_tables(lake: Path):
+    hidden = pl.DataFrame({"a": [1]})
+    with connect(lake) as connection, pytest.raises(QueryError, match="hidden"):
+        query(connection, "SELECT * FROM hidden")
+    assert hidden.height == 1
+
+
+@pytest.mark.parametrize(
+    ("sql", "says"),
+    [
+        ("SELECT * FROM track", "Did you mean"),
+        ("SELECT speed FROM tracks", "speed"),
+        ("SELEC 1", "syntax error"),
+        ("SELECT CAST(text AS INT) FROM rejects", "Could not convert"),
+    ],
+)
+def test_a_wrong_query_gets_duckdbs_message_and_the_tables(lake: Path, sql: str, says: str):
+    with connect(lake) as connection, pytest.raises(QueryError, match=re.escape(says)) as caught, query_errors():
+        query(connection, sql).fetchall()
+    assert str(caught.value).splitlines()[-1] == f"Tables: {', '.join(table.name for table in TABLES)}."

@@ -1,0 +1,161 @@
+"""What Prefect adds: tasks that are seen, retries on I/O, results cached by content, deployments."""
+
+import json
+import os
+import shutil
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL
+from prefect.testing.utilities import prefect_test_harness
+
+from pipeline import flows
+from pipeline.lake import load
+from pipeline.lake.manifest import Manifest, store
+from pipeline.sources import SourceError
+from pipeline.stages import ingest
+
+pytestmark = [
+    pytest.mark.xdist_group("lake"),
+    # Prefect's own, from the server it starts in this process.
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"] = str(tmp_path_factory.mktemp("results"))
+    with prefect_test_harness(server_startup_timeout=120):
+        yield PREFECT_API_URL.value()
+    del os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]
+
+
+@pytest.fixture
+def raw(sample, tmp_path) -> Path:
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    for kind in ("recordingMeta", "tracksMeta", "tracks"):
+        shutil.copy(sample / f"04_{kind}.csv", folder)
+    return folder
+
+
+@pytest.fixture
+def calls(monkeypatch) -> Counter:
+    """How often each recording was really built."""
+    counted: Counter = Counter()
+    real = ingest.build
+
+    def counting(root, job):
+        counted[job.title] += 1
+        return real(root, job)
+
+    monkeypatch.setattr(ingest, "build", counting)
+    return counted
+
+
+def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server, command, raw, tmp_path):
+    done = command("run", raw, "--lake", tmp_path / "lake", "--json", PREFECT_API_URL=server)
+    assert done.code == 0, done.err
+    with get_client(sync_client=True) as client:
+        runs = [run for run in client.read_flow_runs() if run.parameters.get("lake") == str(tmp_path / "lake")]
+        assert [run.state.name for run in runs] == ["Completed"]
+        wanted = {
+            "ingest 04",
+            "validate 04",
+            "repair 04",
+            "samples 04",
+            "split split",
+            "tensors tensors",
+            "report report",
+        }
+        limit = time.monotonic() + 20
+        seen: set[str] = set()
+        while not wanted <= seen and time.monotonic() < limit:  # task runs are recorded by events, a little later
+            seen = {task.name for task in client.read_task_runs(limit=200) if task.flow_run_id == runs[0].id}
+            time.sleep(0.2)
+    assert wanted <= seen
+
+
+@pytest.mark.usefixtures("server")
+def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypatch):
+    tries: Counter = Counter()
+    real = ingest.build
+
+    def flaky(root, job):
+        tries["flaky"] += 1
+        if tries["flaky"] == 1:
+            raise OSError("the share does not answer")
+        return real(root, job)
+
+    monkeypatch.setattr(ingest, "build", flaky)
+    outcome = flows.ingest_files(str(tmp_path / "one"), str(raw))
+    assert outcome["built"] == {"ingest": 1}
+    assert tries["flaky"] == 2
+
+    def hopeless(*_job):
+        tries["hopeless"] += 1
+        raise SourceError("04_tracks.csv, line 7: no good")
+
+    monkeypatch.setattr(ingest, "build", hopeless)
+    outcome = flows.ingest_files(str(tmp_path / "two"), str(raw))
+    assert outcome["refused"] == ["04_tracks.csv, line 7: no good"]
+    assert outcome["built"] == {}
+    assert tries["hopeless"] == 1
+
+
+@pytest.mark.usefixtures("server")
+def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, calls):
+    root = tmp_path / "lake"
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    finished = load(root)
+    # As if the process had died between the task's end and the commit.
+    store(root, Manifest(lake_id=finished.lake_id))
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 1}
+    assert load(root).entries == finished.entries
+    # A cached result whose files are gone is worth nothing.
+    shutil.rmtree(root / "tracks")
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 2}
+    # Another lake is another place, and a changed file another content.
+    assert flows.ingest_files(str(tmp_path / "other"), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 3}
+    with (raw / "04_tracks.csv").open("a") as file:
+        file.write("\n")
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 4}
+
+
+def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):
+    alone = command("serve")
+    assert alone.code == 1
+    assert "PREFECT_API_URL" in alone.err
+    process = replace(command, folder=tmp_path).start("serve", PREFECT_API_URL=server)
+    try:
+        names: set[str] = set()
+        limit = time.monotonic() + 60
+        with get_client(sync_client=True) as client:
+            while len(names) < 3 and process.poll() is None and time.monotonic() < limit:
+                names = {deployment.name for deployment in client.read_deployments()}
+                time.sleep(0.3)
+        assert names == {"run", "ingest", "quality"}
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
+    process = command.start("ingest", raw, "--lake", tmp_path / "lake", "--quiet")
+    limit = time.monotonic() + 60
+    while not (tmp_path / "lake" / "manifest.json").exists() and time.monotonic() < limit:
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    if children.exists():
+        assert children.read_text().split() == []
+    process.kill()
+    process.communicate(timeout=10)  # returns only when nobody holds the pipe any more
+    assert json.loads((tmp_path / "lake" / "manifest.json").read_text())["lake_id"]

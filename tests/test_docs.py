@@ -1,0 +1,57 @@
+"""The README's commands run as printed; the pages derived from the code are those the code derives."""
+
+import re
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from schemas import TABLES
+from schemas.markdown import write_tables
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
+COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("tracklake ")]
+
+
+@pytest.fixture(scope="module")
+def newcomer(command, lake, sample, tmp_path_factory):
+    """A folder as it is after `make run`."""
+    folder = tmp_path_factory.mktemp("newcomer")
+    shutil.copytree(lake.root, folder / "lake")
+    shutil.copytree(sample, folder / "sample")
+    return replace(command, folder=folder)
+
+
+def test_there_are_commands_to_try():
+    assert len(COMMANDS) >= 8
+
+
+@pytest.mark.parametrize("line", COMMANDS, ids=lambda line: line[:40])
+def test_a_command_of_the_readme_runs_as_printed(newcomer, line):
+    arguments = shlex.split(line.replace("--seconds 60", "--seconds 1"), comments=True)[1:]
+    done = newcomer(*arguments)
+    assert done.code == 0, done.err
+    assert done.out
+
+
+def test_the_readme_names_every_command():
+    from pipeline.cli import app
+
+    names = {command.name or command.callback.__name__ for command in app.registered_commands}
+    assert [name for name in sorted(names) if f"tracklake {name}" not in README] == []
+
+
+def test_the_page_of_tables_is_current():
+    assert (ROOT / "docs" / "tables.md").read_text() == write_tables(), "run `make docs`"
+    assert all(f"## {table.name}\n" in write_tables() for table in TABLES)
+
+
+def test_links_lead_somewhere():
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    for page in pages:
+        for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
