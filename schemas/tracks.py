@@ -28,15 +28,16 @@ TRACKS = Table(
         ),
         "y_m": column(
             pl.Float64,
-            "front centre from the carriageway's left edge, positive to the driver's right",
+            "front centre from the carriageway's left edge (arterials: the street's), positive to the driver's right",
             unit="m",
-            ge=-500,
-            le=500,
+            ge=-2_000,
+            le=2_000,
         ),
         "lane": column(
             pl.Int16,
             "1 is the driver's leftmost; null where the source has none",
             nullable=True,
+            ge=0,
         ),
         "speed_mps": column(
             pl.Float32,

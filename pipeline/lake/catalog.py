@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.lake.errors import LakeError, QueryError
 from pipeline.lake.files import partition_values
-from pipeline.lake.manifest import Manifest, load, name_aside, sync
+from pipeline.lake.manifest import Manifest, load, write_aside
 from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 
 if TYPE_CHECKING:
@@ -127,39 +127,35 @@ def _create_views(
         except duckdb.Error as failed:
             reason = str(failed).splitlines()[0]
             raise LakeError(
-                f"{root}: the table `{table.name}` cannot be read: {reason}\nIts files were removed or damaged by "
-                f"something else. `tracklake run SOURCE --lake {root}` on the raw files makes them again."
+                f"{root}: the table `{table.name}` cannot be read: {reason}\nIf its files were removed or damaged, "
+                f"`tracklake run SOURCE --lake {root}` on the raw files makes them again."
             ) from failed
 
 
 def rebuild(root: Path, manifest: Manifest) -> None:
-    """Write catalog.duckdb aside and put it in place; its views hold paths relative to the lake's folder.
+    """Replace catalog.duckdb, the last step of a session; its views hold paths relative to the lake's folder.
+
+    It is made in a temporary folder, where the lake goes by a link. Views are checked on creation against files
+    relative to DuckDB's search path, which is a list of patterns without a way to quote, and "?" in a database's path
+    starts its options; a lake may be called "a,b" or "c[1]?".
 
     Raises:
         LakeError: a live file is missing or unreadable; the catalog of before stays.
     """
     import duckdb
 
-    aside = name_aside(root / CATALOG)
-    try:
-        with tempfile.TemporaryDirectory() as elsewhere, duckdb.connect(str(aside)) as connection:
-            # Views are checked on creation against files relative to the search path, and store the relative names.
-            # The search path is a list of patterns without a way to quote: the lake may be called "a,b" or "c[1]".
-            link = Path(elsewhere) / "lake"
-            link.symlink_to(root.resolve(), target_is_directory=True)
+    with tempfile.TemporaryDirectory() as elsewhere:
+        made, link = Path(elsewhere) / CATALOG, Path(elsewhere) / "lake"
+        link.symlink_to(root.resolve(), target_is_directory=True)
+        with duckdb.connect(str(made)) as connection:
             connection.execute(f"SET file_search_path = {quote(str(link))}")
             _create_views(connection, root, manifest, locate=str)
             for table in TABLES:
                 connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
-        sync(aside)
-        # What a client that wrote to the old catalog left would be replayed into the new one.
-        (root / f"{CATALOG}.wal").unlink(missing_ok=True)
-        aside.replace(root / CATALOG)
-    except BaseException:
-        for leftover in (aside, aside.with_name(f"{aside.name}.wal")):
-            leftover.unlink(missing_ok=True)
-        raise
-    sync(root)
+        content = made.read_bytes()
+    # What a client that wrote to the old catalog left would be replayed into the new one.
+    (root / f"{CATALOG}.wal").unlink(missing_ok=True)
+    write_aside(root / CATALOG, content)
 
 
 def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":

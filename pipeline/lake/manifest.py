@@ -176,7 +176,7 @@ def store(root: Path, manifest: Manifest) -> None:
 
 def write_aside(target: Path, content: bytes) -> None:
     """Write a whole file beside its target, sync it, and rename it into place; what stood there stays on an error."""
-    aside = name_aside(target)
+    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
     try:
         with aside.open("wb") as handle:
             handle.write(content)
@@ -187,11 +187,6 @@ def write_aside(target: Path, content: bytes) -> None:
         aside.unlink(missing_ok=True)
         raise
     sync(target.parent)
-
-
-def name_aside(target: Path) -> Path:
-    """A hidden name of its own beside a file that is being replaced."""
-    return target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.lake import Entry, LakeFile, Manifest, write_table
+from pipeline.lake import Entry, LakeFile, Manifest, load, write_table
 from pipeline.lake.files import STAGING
 from pipeline.sources import SOURCES, RawFile, Source, SourceError
 from pipeline.sources.accounting import count_reasons, to_rejects
@@ -17,6 +17,7 @@ from pipeline.stages.discovery import Discovery
 from schemas import INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
 VERSION = 1
+SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
 _PLANNING_FACTS = ("subset", "site", "freeway", "vehicles", "entries")
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
@@ -156,12 +157,25 @@ def build(root: Path, job: Job) -> Entry:
     info = {
         "dataset": dataset,
         "recording": recording,
-        "notes": list(canonical.notes),
+        "notes": [*canonical.notes, *_suspect_truncation(root, files, canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }
     return make_entry(job, written, info)
+
+
+def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:
+    """Files of exactly as many rows as a spreadsheet can hold have circulated; what lay beyond is missing."""
+    known = load(root).sources
+    rows = dict(canonical.log.select("sha256", "rows_read").iter_rows())
+    rows |= {file.sha256: known[file.sha256]["rows_read"] for file in files if file.sha256 in known}
+    return [
+        f"{file.name}: exactly {SPREADSHEET_ROWS:,} rows, a spreadsheet's limit: probably TRUNCATED. Compare with the "
+        "publisher's count and download the file again."
+        for file in files
+        if rows[file.sha256] == SPREADSHEET_ROWS
+    ]
 
 
 def _spilled_part(root: Path, file: RawFile, recording: str) -> Part:

@@ -30,7 +30,7 @@ def sql_name(dtype: pl.DataType) -> str:
     if isinstance(dtype, pl.List):
         return sql_name(dtype.inner) + "[]"
     if isinstance(dtype, pl.Struct):
-        return "STRUCT(" + ", ".join(f'"{field.name}" {sql_name(field.dtype)}' for field in dtype.fields) + ")"
+        return "STRUCT(" + ", ".join(f"{field.name} {sql_name(field.dtype)}" for field in dtype.fields) + ")"
     return SQL_NAMES[dtype if isinstance(dtype, type) else type(dtype)]
 
 
@@ -69,7 +69,7 @@ def build(root: Path) -> None:
 
 
 def types_of(connection: duckdb.DuckDBPyConnection, view: str) -> dict[str, str]:
-    return {name: kind for name, kind, *_ in connection.execute(f'DESCRIBE "{view}"').fetchall()}
+    return {name: kind.replace('"', "") for name, kind, *_ in connection.execute(f'DESCRIBE "{view}"').fetchall()}
 
 
 @pytest.mark.parametrize("filled", [False, True])
@@ -194,12 +194,18 @@ def test_a_moved_lake_works_from_anywhere(tmp_path: Path, monkeypatch: pytest.Mo
 # ------------------------------------------------------------------------------------------- the sandbox
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a lake that no test may change, and a file outside of it."""
+    made = tmp_path_factory.mktemp("sandbox")
+    build(made / "lake")
+    (made / "secret.csv").write_text("a\n1\n")
+    return made
+
+
 @pytest.fixture
-def lake(tmp_path: Path) -> Path:
-    root = tmp_path / "lake"
-    build(root)
-    (tmp_path / "secret.csv").write_text("a\n1\n")
-    return root
+def lake(folder: Path) -> Path:
+    return folder / "lake"
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -262,30 +268,31 @@ def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
         "FROM read_csv('https://example.org/x.csv')", "FROM 's3://bucket/x.parquet'", "FROM lake", "SELECT ?",
     ],
 )  # fmt: skip
-def test_what_writes_or_looks_elsewhere_is_refused(lake: Path, tmp_path: Path, sql: str):
-    filled = sql.format(lake=lake, out=tmp_path / "out", secret=tmp_path / "secret.csv")
-    before = snapshot(tmp_path)
+def test_what_writes_or_looks_elsewhere_is_refused(lake: Path, folder: Path, sql: str):
+    filled = sql.format(lake=lake, out=folder / "out", secret=folder / "secret.csv")
+    before = snapshot(folder)
     with connect(lake) as connection:
         # Some are refused on asking, the others when DuckDB first touches the file.
         with pytest.raises(QueryError), query_errors():
             query(connection, filled).fetchall()
         assert connection.execute("SELECT count(*) FROM vehicles").fetchall() == [(3,)]
         assert connection.execute("SELECT count(*) FROM duckdb_tables()").fetchall() == [(0,)]
-    assert snapshot(tmp_path) == before
+    assert snapshot(folder) == before
 
 
-def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, tmp_path: Path):
+def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, folder: Path):
     """In a process of its own, for DuckDB may end it: the file system itself refuses."""
-    before = snapshot(tmp_path)
+    before = snapshot(folder)
     script = (
         "import sys; from pipeline.lake import connect; connection = connect(sys.argv[1]);"
-        "connection.execute(f\"FROM enable_logging(storage = 'file', storage_path = '{sys.argv[1]}/splits')\").fetchall();"
+        "options = f\"storage = 'file', storage_path = '{sys.argv[1]}/splits'\";"
+        "connection.execute(f'FROM enable_logging({options})').fetchall();"
         "connection.execute('SELECT count(*) FROM vehicles').fetchall()"
     )
     done = subprocess.run([sys.executable, "-c", script, str(lake)], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "file system operations are disabled" in done.stderr
-    assert snapshot(tmp_path) == before
+    assert snapshot(folder) == before
 
 
 def test_python_variables_are_no_tables(lake: Path):

@@ -12,7 +12,7 @@ from small_lake import Nursery, check_lake, find_files, write_round
 
 from pipeline.lake import load
 
-STRIDE = 6
+STRIDE = 9
 """Every so manieth step of a session is died at; 1 is thorough and takes half a minute."""
 
 
@@ -47,8 +47,8 @@ def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nurser
 def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nursery: Nursery):
     """The same fingerprints again and again: what an earlier death left is used where whole, and made where not."""
     write_round(root, 0)
-    for step in range(0, 150, 2 * STRIDE):
-        nursery.ask(f"die {1 + step // 12 % 3} {step}")
+    for step in range(0, 150, STRIDE):
+        nursery.ask(f"die {1 + step // STRIDE % 3} {step}")
         check_lake(root)
     write_round(root, 2)
     check_lake(root)
@@ -65,7 +65,7 @@ def test_deaths_at_random_moments(root: Path, nursery: Nursery):
     broken_off = 0
     for kill in range(20):
         child = nursery.ask(f"loop {1_000 * (kill + 1)}")
-        time.sleep(chance.uniform(0.0, 4 * session_s))
+        time.sleep(chance.uniform(0.0, min(4 * session_s, 0.4)))
         os.kill(child, signal.SIGKILL)
         wait_until_gone(child)
         broken_off += bool((root / ".lock").read_bytes())
