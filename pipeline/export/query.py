@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.terminal import Terminal, show_relation
 
@@ -29,7 +29,7 @@ def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | Non
         return
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
-    target = out or sys.stdout.buffer
+    target: Any = out or sys.stdout.buffer
     frame = _flat(relation).pl() if form == "csv" else relation.pl()
     if form == "csv":
         frame.write_csv(target)
