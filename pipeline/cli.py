@@ -134,7 +134,7 @@ def sql(
 ) -> None:
     """Ask SQL of the tracks, read-only, from anywhere."""
     from pipeline.export.query import FORMATS, write_result
-    from pipeline.lake import connect
+    from pipeline.lake import connect, query_errors
     from pipeline.lake import query as run_query
 
     with _command() as terminal:
@@ -142,7 +142,8 @@ def sql(
             raise typer.BadParameter(f"--format is one of {', '.join(FORMATS)}; got {format!r}")
         with connect(_settings(lake=lake).lake) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
-            write_result(relation, format, out, terminal)
+            with query_errors():  # DuckDB computes while the result is fetched
+                write_result(relation, format, out, terminal)
 
 
 @app.command()
@@ -281,7 +282,7 @@ def _order(
     dataset: str | None = None,
 ) -> "Outcome":
     """Do what is not done; Prefect is imported only where something is."""
-    from pipeline.lake import load
+    from pipeline.lake import load, refuse_if_busy
     from pipeline.work import Order, Outcome, is_idle, survey
 
     if dataset not in (None, "ngsim", "highd"):
@@ -299,6 +300,7 @@ def _order(
     if is_idle(order, discovery):
         terminal.say("nothing to do: the lake is up to date", style="dim")
         return Outcome(refused=list(discovery.refusals) if discovery else [])
+    refuse_if_busy(order.root)
     with terminal.working():
         from pipeline.flows import execute
 

@@ -86,6 +86,7 @@ def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactor
     return Lake(root, json.loads(done.out))
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep what uses the generated sample on one worker, so that it is generated once."""
     for item in items:

@@ -112,6 +112,22 @@ def open_for_writing(root: Path) -> Iterator[Writer]:
             os.close(descriptor)
 
 
+def refuse_if_busy(root: Path) -> None:
+    """Raise what `open_for_writing` would raise now, before anything expensive is started for it.
+
+    Raises:
+        LakeLockedError: another process holds the lock.
+        LakeError: the folder holds other things than a lake.
+    """
+    _refuse_foreign(root)
+    if (root / LOCK).exists():
+        descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            _take(root, descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def _open_lock(root: Path) -> int:
     try:
         root.mkdir(parents=True, exist_ok=True)
