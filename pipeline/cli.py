@@ -216,10 +216,12 @@ def sample(
     json: JsonOption = False,
 ) -> None:
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
+    from pipeline.terminal import command_here
+
     with _command(quiet=quiet, json=json) as terminal:
         summary = _write_sample(out, minutes, seed, terminal, formats=format)
         terminal.say(f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)")
-        terminal.say(f"Try next:\n  tracklake run {out}")
+        terminal.say(f"Try next:\n  {command_here()} run {out}")
         terminal.give({"out": out, "rows": summary.rows, "recordings": summary.recordings, "seconds": summary.seconds})
 
 

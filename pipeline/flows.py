@@ -49,6 +49,9 @@ def _content_key(_context: Any, parameters: dict[str, Any]) -> str:  # noqa: ANN
 
 
 SERVER_START_S = 120.0
+FEW_THREADS: Any = ThreadPoolTaskRunner(max_workers=min(os.cpu_count() or 1, 4))
+"""Of served flows: as many recordings in memory at once as the settings' default."""
+
 RETRIES: dict[str, Any] = {"retries": 2, "retry_delay_seconds": 1, "retry_condition_fn": _is_io_error}
 
 
@@ -180,8 +183,8 @@ def _work(order: Order) -> dict[str, Any]:
         if INGEST in order.steps:
             _ingest(writer, order, outcome)
         for stage in order.stages():
-            if outcome.failed:
-                break
+            if outcome.failed and stage.name != "report":
+                continue  # what comes later builds on what failed; the report shows what there is
             _build_all(
                 writer,
                 stage.name,
@@ -194,13 +197,13 @@ def _work(order: Order) -> dict[str, Any]:
     return asdict(outcome)
 
 
-@flow(name="tracklake-run", validate_parameters=False)
+@flow(name="tracklake-run", validate_parameters=False, task_runner=FEW_THREADS)
 def run(lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None) -> dict[str, Any]:
     """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
     return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}))
 
 
-@flow(name="tracklake-ingest", validate_parameters=False)
+@flow(name="tracklake-ingest", validate_parameters=False, task_runner=FEW_THREADS)
 def ingest_files(
     lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -208,13 +211,13 @@ def ingest_files(
     return _work(Order(lake, (INGEST,), source, dataset, settings or {}))
 
 
-@flow(name="tracklake-quality", validate_parameters=False)
+@flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
 def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
     """Findings, late starts and the report over what is in the lake."""
     return _work(Order(lake, QUALITY_STEPS, settings=settings or {}))
 
 
-@flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False)
+@flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False, task_runner=FEW_THREADS)
 def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
     """One stage over what is in the lake."""
     return _work(Order(lake, (stage,), settings=settings or {}))
@@ -234,8 +237,21 @@ def execute(order: Order) -> Outcome:
         changed[PREFECT_API_URL] = _embed_server()
     with temporary_settings(changed):
         _mute_console()  # after all that sets logging up
-        runner: ThreadPoolTaskRunner[Any] = ThreadPoolTaskRunner(max_workers=order.get_settings().workers)
-        return Outcome(**chosen.with_options(task_runner=runner)(**parameters))
+        return Outcome(**chosen.with_options(task_runner=_choose_runner(order.get_settings()))(**parameters))
+
+
+def _choose_runner(settings: Settings) -> Any:  # noqa: ANN401 - prefect-dask is an extra, and untyped
+    """Threads (Polars and DuckDB release the interpreter), or Dask workers, which need the lake on a shared disk."""
+    if settings.runner == "threads":
+        return ThreadPoolTaskRunner(max_workers=settings.workers)
+    try:
+        from prefect_dask.task_runners import DaskTaskRunner
+    except ImportError:
+        raise ImportError('the setting runner = "dask" needs Dask: `pip install "tracklake[distributed]"`') from None
+    if settings.dask_address is not None:
+        return DaskTaskRunner(address=settings.dask_address)
+    cluster = {"n_workers": settings.workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    return DaskTaskRunner(cluster_kwargs=cluster)
 
 
 def _embed_server() -> str:

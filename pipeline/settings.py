@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
@@ -18,6 +19,10 @@ class Settings(BaseSettings):
 
     lake: Path = Field(Path("lake"), description="folder of the lake")
     workers: int = Field(min(os.cpu_count() or 1, 4), ge=1, description="recordings worked on at once")
+    runner: Literal["threads", "dask"] = Field(
+        "threads", description="where recordings are worked on: threads of this process, or Dask workers"
+    )
+    dask_address: str | None = Field(None, description="of a Dask scheduler; none: a cluster on this machine")
     thresholds: dict[str, float] = Field(default_factory=dict, description="of rules, by rule name")
     max_backward_share: float = Field(
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"

@@ -1,6 +1,8 @@
 """What a person at a terminal sees: progress bars, summaries, tables. Results go to stdout, the rest to stderr."""
 
 import json
+import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -126,7 +128,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         "tracks": f"{head['vehicles']:,} vehicles, {head['entries']:,} entries",
         "rows": f"{head['rows_read']:,} read, {head['rows_dropped']:,} rejected",
         "quality": f"{_some(head['vehicles_with_errors'])} vehicles with errors; " + late,
-        "samples": f"{_some(head['samples'])}" + _balance(quality),
+        "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_balance(quality)}",
     }
     for score in quality["scores"]:
         rmse = "  ".join(
@@ -139,8 +141,17 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     terminal.say(f"{'report':<{width}}{report.resolve()}", style="bold green")
     at = "" if lake == Path("lake") else f" --lake {lake}"
     terminal.say("\nTry next:")
-    terminal.say(f'  tracklake sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
-    terminal.say(f"  tracklake train lstm{at}" if head["samples"] else f'  tracklake sql "FROM subsets"{at}')
+    command = command_here()
+    terminal.say(f'  {command} sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
+    terminal.say(f"  {command} train lstm{at}" if head["samples"] else f'  {command} sql "FROM subsets"{at}')
+
+
+def command_here() -> str:
+    """How to call the command from where the user is: by name if that is found, else by the path it was called by."""
+    found, called = shutil.which("tracklake"), Path(sys.argv[0])
+    if called.name != "tracklake" or (found and Path(found).resolve() == called.resolve()):
+        return "tracklake"
+    return os.path.relpath(called)
 
 
 def _some(count: int | None) -> str:

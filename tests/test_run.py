@@ -215,3 +215,12 @@ def test_a_model_trains_and_every_run_is_evaluated(command, lake):
     assert "constant-velocity on eval" in scored.out
     for seconds in range(1, 6):
         assert f"{seconds} s" in scored.out
+
+
+def test_dask_workers_make_the_same_lake(command, sample, sql, tmp_path):
+    done = command("ingest", sample, "--lake", tmp_path / "lake", "--json", TRACKLAKE_RUNNER="dask")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["built"] == {"ingest": 8}
+    query = "SELECT subset, count(*) AS entries, sum(x_m) AS metres FROM tracks GROUP BY subset ORDER BY subset"
+    with connect(tmp_path / "lake") as other:
+        assert other.sql(query).pl()["entries"].to_list() == sql(query)["entries"].to_list()

@@ -82,7 +82,7 @@ def train(
     entry = find_model(model)
     folder = TensorFolder.open(tensors)
     samples = len(folder.samples_of("train"))
-    if samples == 0:
+    if samples == 0 and entry.learns:
         raise ValueError(
             f"{folder.path}: the split `{folder.split}` has no samples in `train`: nothing to learn from; see "
             '`sample_drops` for why (`tracklake sql "FROM sample_drops"`)'

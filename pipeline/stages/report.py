@@ -30,7 +30,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
 
 def _shown(settings: Settings) -> dict[str, object]:
     """Settings that change what is in the lake, not where it stands or how fast it is made."""
-    return settings.model_dump(mode="json", exclude={"lake", "workers"})
+    return settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address"})
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:

@@ -34,7 +34,8 @@ def build(root: Path, job: Job, _settings: Settings) -> Entry:
         for file in sorted(out.iterdir())
         if file.is_file()
     ]
-    return make_entry(job, {MODELS: files}, {"evaluation": metrics["evaluation"]})
+    unscored = [] if metrics["evaluation"] else ["no score: the split's evaluation part has no samples"]
+    return make_entry(job, {MODELS: files}, {"notes": unscored})
 
 
 def finished_runs(root: Path) -> list[Path]:

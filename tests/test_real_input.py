@@ -1,0 +1,41 @@
+"""The real excerpts through the command, where they are at hand (they are not part of the repository)."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+EXCERPTS = Path(__file__).parents[2] / "shared" / "data" / "ngsim"
+pytestmark = [
+    pytest.mark.xdist_group("lake"),
+    pytest.mark.skipif(not EXCERPTS.is_dir(), reason=f"the NGSIM excerpts are not at {EXCERPTS}"),
+]
+
+
+def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
+    done = command("run", EXCERPTS / "socrata_head_10000.csv", "--lake", tmp_path / "lake")
+    assert done.code == 0, done.err
+    assert "repair, samples, split and tensors were left out for peachtree-1245-north" in done.out
+    assert "10,000 entries" in done.out
+    query = "SELECT recording, direction, sum(entries)::INT AS entries FROM subsets GROUP BY ALL ORDER BY ALL"
+    rows = json.loads(command("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
+    # Counted from the file with a spreadsheet's means: Global_Time - 100 * Frame_ID and Direction of every row.
+    assert [tuple(row.values()) for row in rows] == [
+        ("peachtree-1245", "north", 7613),
+        ("peachtree-1245", "south", 6),
+        ("peachtree-1600", "north", 2320),
+        ("peachtree-1600", "south", 61),
+    ]
+    assert "peachtree-1600-south" in (tmp_path / "lake" / "reports" / "index.html").read_text()
+
+
+def test_all_excerpts_at_once(command, tmp_path):
+    done = command("run", EXCERPTS, "--lake", tmp_path / "lake", "--json")
+    assert done.code == 0, done.err
+    said = json.loads(done.out)
+    # 1,005 + 1,999 + 10,000 + 38 + 155,604 rows, and 5,000 of the portal's once more in another dialect, which are
+    # recognised as repetitions.
+    assert said["headline"]["rows_read"] == 173_646
+    assert said["headline"]["rows_read"] - said["headline"]["rows_dropped"] == said["headline"]["entries"]
+    assert said["headline"]["rows_dropped"] == 5_000
+    assert said["headline"]["recordings"] == 7
