@@ -3,6 +3,7 @@
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
 # make docs    pages derived from the code
+# make clean   removes the environment and caches, never data
 #
 # `make run ARGS="--minutes 0.3 --lake /tmp/lake"` passes options on.
 
@@ -17,7 +18,7 @@ install: $(INSTALLED)
 
 # torch first and by its exact version: as a dependency of something else, pip may take a build with all of CUDA.
 $(INSTALLED): pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=...")'
+	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and "Python 3.11 to 3.13 is needed: make PYTHON=...")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet torch==2.13.0
@@ -43,4 +44,4 @@ docs: install
 	$(BIN)/python -m schemas.markdown > docs/tables.md
 
 clean:
-	rm -rf .venv lake sample build
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,19 +1,18 @@
 """The command line. Heavy libraries are imported inside the commands, so that help answers at once."""
 
+import os
+import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from pipeline.settings import Settings
-    from pipeline.terminal import Terminal
-    from pipeline.work import Outcome
+from pipeline.session import DONE, FAILED, carry_out, command, conclude, failure, read_settings
 
-DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
+if TYPE_CHECKING:
+    from pipeline.terminal import Terminal
+
 SAMPLE = "sample"
 
 app = typer.Typer(
@@ -31,7 +30,11 @@ LakeOption = Annotated[
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim or highd.")]
+ReplaceOption = Annotated[
+    bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
+]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="Recordings worked on at once.")]
+ProtocolOption = Annotated[str | None, typer.Option("--protocol", help="Name of the protocol [default: csp].")]
 MinutesOption = Annotated[float | None, typer.Option("--minutes", help="Length of the generated recordings.")]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Of the generated sample: same seed, same bytes.")]
 
@@ -60,6 +63,7 @@ def run(
     lake: LakeOption = None,
     dataset: DatasetOption = None,
     workers: WorkersOption = None,
+    replace: ReplaceOption = False,
     minutes: MinutesOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -68,14 +72,15 @@ def run(
     """The whole pipeline: raw files to tables, checks, repair, samples, split, tensors, first score and report."""
     from pipeline.work import ALL_STEPS
 
-    with _command(quiet=quiet, json=json) as terminal:
-        settings = _settings(lake=lake, workers=workers)
+    with command(quiet=quiet, json=json) as terminal:
+        settings = read_settings(lake=lake, workers=workers)
         if source is None:
             source = str(_provide_sample(settings.lake, minutes, seed, terminal))
+            _refuse_mixing(settings.lake, source)
         elif minutes is not None or seed is not None:
             raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
-        outcome = _order(terminal, settings, ALL_STEPS, source, dataset)
-        _conclude(terminal, settings, outcome)
+        outcome = carry_out(terminal, settings, ALL_STEPS, source, dataset, replace=replace)
+        conclude(terminal, settings, outcome)
 
 
 @app.command()
@@ -84,14 +89,15 @@ def ingest(
     lake: LakeOption = None,
     dataset: DatasetOption = None,
     workers: WorkersOption = None,
+    replace: ReplaceOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Raw files to tracks, vehicles and subsets (the format is detected)."""
-    with _command(quiet=quiet, json=json) as terminal:
-        settings = _settings(lake=lake, workers=workers)
-        outcome = _order(terminal, settings, ("ingest",), source, dataset)
-        _conclude(terminal, settings, outcome, headline=False)
+    with command(quiet=quiet, json=json) as terminal:
+        settings = read_settings(lake=lake, workers=workers)
+        outcome = carry_out(terminal, settings, ("ingest",), source, dataset, replace=replace)
+        conclude(terminal, settings, outcome, headline=False)
 
 
 def _add_stage(name: str, meaning: str) -> None:
@@ -103,10 +109,10 @@ def _add_stage(name: str, meaning: str) -> None:
         quiet: QuietOption = False,
         json: JsonOption = False,
     ) -> None:
-        with _command(quiet=quiet, json=json) as terminal:
-            settings = _settings(lake=lake, workers=workers)
-            outcome = _order(terminal, settings, (name,))
-            _conclude(terminal, settings, outcome, headline=name == "report")
+        with command(quiet=quiet, json=json) as terminal:
+            settings = read_settings(lake=lake, workers=workers)
+            outcome = carry_out(terminal, settings, (name,))
+            conclude(terminal, settings, outcome, headline=name == "report")
 
     stage.__doc__ = meaning
     app.command(name=name)(stage)
@@ -137,10 +143,10 @@ def sql(
     from pipeline.lake import connect, query_errors
     from pipeline.lake import query as run_query
 
-    with _command() as terminal:
+    with command() as terminal:
         if format not in FORMATS:
             raise typer.BadParameter(f"--format is one of {', '.join(FORMATS)}; got {format!r}")
-        with connect(_settings(lake=lake).lake) as connection:
+        with connect(read_settings(lake=lake).lake) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
             with query_errors():  # DuckDB computes while the result is fetched
                 write_result(relation, format, out, terminal)
@@ -150,6 +156,7 @@ def sql(
 def train(
     model: Annotated[str, typer.Argument(help="A model's name, for instance lstm.")],
     lake: LakeOption = None,
+    protocol: ProtocolOption = None,
     seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="How long to train.")] = 60.0,
     seed: Annotated[int, typer.Option("--seed", help="Of weights and batches.")] = 0,
     name: Annotated[str | None, typer.Option("--name", help="Name of the run; default: the model's.")] = None,
@@ -157,17 +164,27 @@ def train(
     json: JsonOption = False,
 ) -> None:
     """Train a model on the split's training part and evaluate it once on the evaluation part."""
-    with _command(quiet=quiet, json=json) as terminal:
+    with command(quiet=quiet, json=json) as terminal:
         from pipeline.lake import load
         from pipeline.lake.files import MODELS
+        from pipeline.stages.score import BASELINE
         from pipeline.stages.tensors import tensor_folder
         from pipeline.terminal import show_scores
+        from training.models import MODELS as MODELS_KNOWN
         from training.train import TrainConfig
         from training.train import train as train_model
 
-        root = _settings(lake=lake).lake
-        tensors = tensor_folder(root, load(root))
-        out = root / MODELS / (name or model)
+        settings = read_settings(lake=lake, protocol=protocol)
+        root = settings.lake
+        run_name = model if name is None else name
+        if model not in MODELS_KNOWN:
+            raise typer.BadParameter(f"MODEL is one of {', '.join(MODELS_KNOWN)}; got {model!r}")
+        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", run_name):
+            raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {run_name!r}")
+        if run_name == BASELINE:
+            raise typer.BadParameter(f"{BASELINE} does not learn; `tracklake evaluate` scores it")
+        tensors = tensor_folder(root, load(root), settings)
+        out = root / MODELS / run_name
         with terminal.measuring(f"train {model}") as tell:
             metrics = train_model(model, tensors, out, TrainConfig(seconds=seconds, seed=seed), tell)
         if metrics["evaluation"] is not None:
@@ -181,25 +198,35 @@ def evaluate(
     runs: Annotated[list[str] | None, typer.Argument(help="Runs or models; none: all runs in the lake.")] = None,
     lake: LakeOption = None,
     part: Annotated[str, typer.Option("--part", help="train, val or eval.")] = "eval",
-    protocol: Annotated[str | None, typer.Option("--protocol", help="Name of the protocol.")] = None,
+    protocol: ProtocolOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """RMSE at 1 to 5 s with the number of samples behind each."""
-    with _command(quiet=quiet, json=json) as terminal:
+    with command(quiet=quiet, json=json) as terminal:
         from pipeline.lake import load
         from pipeline.lake.files import MODELS
         from pipeline.stages.score import BASELINE, finished_runs
         from pipeline.stages.tensors import tensor_folder
         from pipeline.terminal import show_scores
+        from schemas.columns import PARTS
         from training.evaluate import evaluate as evaluate_model
+        from training.runs import StaleRunError
 
-        settings = _settings(lake=lake, protocol=protocol)
-        settings.get_protocol()
+        if part not in PARTS:
+            raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
+        settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
-        tensors = tensor_folder(root, load(root))
+        tensors = tensor_folder(root, load(root), settings)
         names = runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))})
-        found = [evaluate_model(name, tensors, root / MODELS, part).to_dict() for name in names]
+        found = []
+        for name in names:
+            try:
+                found.append(evaluate_model(name, tensors, root / MODELS, part).to_dict())
+            except StaleRunError as stale:
+                if runs:
+                    raise
+                terminal.complain(str(stale), label="passed by")
         show_scores(terminal, found)
         terminal.give({"evaluations": found})
 
@@ -218,7 +245,7 @@ def sample(
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
     from pipeline.terminal import command_here
 
-    with _command(quiet=quiet, json=json) as terminal:
+    with command(quiet=quiet, json=json) as terminal:
         summary = _write_sample(out, minutes, seed, terminal, formats=format)
         terminal.say(f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)")
         terminal.say(f"Try next:\n  {command_here()} run {out}")
@@ -228,8 +255,6 @@ def sample(
 @app.command()
 def serve() -> None:
     """Serve the flows as Prefect deployments (run, ingest, quality) until interrupted."""
-    import os
-
     if not os.environ.get("PREFECT_API_URL"):
         typer.echo("PREFECT_API_URL is not set: runs would be seen by nobody. Start a server, for instance", err=True)
         typer.echo("  prefect server start\n  export PREFECT_API_URL=http://127.0.0.1:4200/api", err=True)
@@ -237,104 +262,6 @@ def serve() -> None:
     from pipeline.flows import serve_deployments
 
     serve_deployments()
-
-
-@contextmanager
-def _command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
-    """Give a command its terminal, and turn what a user can mend into a message and an exit code."""
-    from pydantic import ValidationError
-
-    from pipeline.lake import LakeError
-    from pipeline.sources import SourceError
-    from pipeline.stages.base import StageError
-    from pipeline.terminal import Terminal
-
-    terminal = Terminal(quiet=quiet, as_json=json)
-    try:
-        yield terminal
-    except (LakeError, SourceError, StageError) as error:
-        terminal.complain(str(error))
-        raise typer.Exit(FAILED) from None
-    except ValidationError as error:
-        for problem in error.errors():
-            where = ".".join(str(part) for part in problem["loc"])
-            terminal.complain(
-                f"setting {where}: {problem['msg']}; got {problem['input']!r}. See `tracklake.toml` and TRACKLAKE_*."
-            )
-        raise typer.Exit(USAGE) from None
-    except (ValueError, OSError, ImportError) as error:
-        terminal.complain(f"{error}")
-        raise typer.Exit(FAILED) from None
-    except KeyboardInterrupt:
-        terminal.complain("interrupted; what was committed stays, and the same command goes on from there")
-        raise typer.Exit(FAILED) from None
-
-
-def _settings(**flags: Any) -> "Settings":  # noqa: ANN401 - any setting
-    from pipeline.settings import Settings
-
-    return Settings(**{name: value for name, value in flags.items() if value is not None})
-
-
-def _order(
-    terminal: "Terminal",
-    settings: "Settings",
-    steps: tuple[str, ...],
-    source: str | None = None,
-    dataset: str | None = None,
-) -> "Outcome":
-    """Do what is not done; Prefect is imported only where something is."""
-    from pipeline.lake import load, refuse_if_busy
-    from pipeline.work import Order, Outcome, is_idle, survey
-
-    if dataset not in (None, "ngsim", "highd"):
-        raise typer.BadParameter(f"--dataset is ngsim or highd; got {dataset!r}")
-    plain = settings.model_dump(mode="json", exclude_unset=True)
-    order = Order(str(settings.lake), steps, source, dataset, plain)
-    discovery = survey(order) if source is not None else None
-    if discovery is None:
-        load(order.root)  # raises where there is no lake to work on
-    if discovery is not None and not discovery.units:
-        # Nothing can come of it, so no lake is made for it either.
-        for message in discovery.refusals:
-            terminal.complain(message, label="refused")
-        raise typer.Exit(FAILED)
-    if is_idle(order, discovery):
-        terminal.say("nothing to do: the lake is up to date", style="dim")
-        return Outcome(refused=list(discovery.refusals) if discovery else [])
-    refuse_if_busy(order.root)
-    with terminal.working():
-        from pipeline.flows import execute
-
-        return execute(order)
-
-
-def _conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, headline: bool = True) -> None:
-    """Say what came of an order and exit with the code that fits."""
-    import json
-    from dataclasses import asdict
-
-    from pipeline.lake import load
-    from pipeline.lake.files import REPORTS
-    from pipeline.stages.report import DOCUMENT, PAGE
-    from pipeline.terminal import show_headline, show_outcome
-
-    show_outcome(terminal, outcome)
-    reports = settings.lake / REPORTS
-    record: dict[str, Any] = {"lake": settings.lake, **asdict(outcome)}
-    usable = bool(load(settings.lake).of_stage("ingest"))
-    if usable and headline and (reports / DOCUMENT).exists():
-        quality = json.loads((reports / DOCUMENT).read_text(encoding="utf-8"))
-        show_headline(terminal, quality, reports / PAGE, settings.lake)
-        record |= {"report": (reports / PAGE).resolve(), "headline": quality["headline"], "scores": quality["scores"]}
-    elif outcome.built:
-        terminal.say(f"done: {', '.join(f'{stage} {count}' for stage, count in outcome.built.items())}")
-    terminal.give(record)
-    if outcome.failed or not usable:
-        raise typer.Exit(FAILED)
-    if outcome.refused:
-        terminal.complain(f"{len(outcome.refused)} refused (above); everything else is done", label="refused")
-        raise typer.Exit(REFUSED)
 
 
 def _provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: "Terminal") -> Path:
@@ -348,11 +275,33 @@ def _provide_sample(lake: Path, minutes: float | None, seed: int | None, termina
     return out
 
 
+def _refuse_mixing(lake: Path, sample: str) -> None:
+    """Keep simulated recordings out of a lake of real ones, which they might even replace."""
+    from pipeline.lake import LakeError, LakeMissingError, load
+    from pipeline.work import INGEST, Order, survey
+
+    try:
+        entries = load(lake).of_stage(INGEST)
+    except LakeMissingError:
+        return
+    order = Order(str(lake.absolute()), (INGEST,), sample)
+    ours = {file.name for _, unit in survey(order).units for file in unit.files}
+    hashes = {file.sha256 for _, unit in survey(order).units for file in unit.files}
+    for source in (source for entry in entries for source in entry.built_from["sources"]):
+        if source["file"] not in ours or source["sha256"] not in hashes:
+            raise LakeError(
+                f"{lake}: holds recordings that are not this generated sample ({source['file']}). Without SOURCE, the "
+                "sample is what is ingested: name your own files as SOURCE, or another lake with --lake."
+            )
+
+
 def _write_sample(
     out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
 ) -> Any:  # noqa: ANN401 - SampleSummary, whose module is imported late
-    from pipeline.sample import DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
+    from pipeline.sample import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
 
+    if unknown := [name for name in formats or () if name not in ALL_FORMATS]:
+        raise typer.BadParameter(f"--format is one of {', '.join(ALL_FORMATS)}; got {', '.join(unknown)}")
     try:
         return write_sample(
             out,
@@ -361,9 +310,10 @@ def _write_sample(
             seed=1 if seed is None else seed,
             progress=lambda text: terminal.say(text, style="dim"),
         )
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
     except SumoError as error:
-        terminal.complain(str(error))
-        raise typer.Exit(FAILED) from None
+        raise failure(terminal, str(error)) from None
 
 
 if __name__ == "__main__":

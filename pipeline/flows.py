@@ -30,9 +30,19 @@ from pipeline.progress import reporter
 from pipeline.settings import Settings
 from pipeline.sources import RawFile, SourceError
 from pipeline.stages import ingest
-from pipeline.stages.base import Job, pending
+from pipeline.stages.base import Job
 from pipeline.stages.registry import STAGE_BY_NAME
-from pipeline.work import ALL_STEPS, INGEST, QUALITY_STEPS, Order, Outcome, explain_left_out, outstanding, survey
+from pipeline.work import (
+    ALL_STEPS,
+    INGEST,
+    QUALITY_STEPS,
+    Order,
+    Outcome,
+    explain_left_out,
+    outstanding,
+    plan_ingest,
+    survey,
+)
 from schemas import StructureError
 
 Results = Iterable[tuple[str, dict[str, Any] | BaseException]]
@@ -141,7 +151,8 @@ def _ingest(writer: Writer, order: Order, outcome: Outcome) -> None:
     outcome.passed_by += discovery.passed_by
     unknown = ingest.files_to_read(discovery, writer.manifest)
     _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, order, outcome)
-    jobs = pending(writer.root, writer.manifest, ingest.plan(discovery, writer.manifest))
+    jobs, conflicts = plan_ingest(order, discovery, writer.manifest)
+    outcome.refused += conflicts
     needed = {
         file.sha256: (job.inputs["dataset"], file)
         for job in jobs
@@ -198,17 +209,27 @@ def _work(order: Order) -> dict[str, Any]:
 
 
 @flow(name="tracklake-run", validate_parameters=False, task_runner=FEW_THREADS)
-def run(lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+def run(
+    lake: str,
+    source: str,
+    dataset: str | None = None,
+    settings: dict[str, Any] | None = None,
+    replace: bool = False,
+) -> dict[str, Any]:
     """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
-    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}))
+    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}, replace))
 
 
 @flow(name="tracklake-ingest", validate_parameters=False, task_runner=FEW_THREADS)
 def ingest_files(
-    lake: str, source: str, dataset: str | None = None, settings: dict[str, Any] | None = None
+    lake: str,
+    source: str,
+    dataset: str | None = None,
+    settings: dict[str, Any] | None = None,
+    replace: bool = False,
 ) -> dict[str, Any]:
     """Raw files to tracks, vehicles and subsets."""
-    return _work(Order(lake, (INGEST,), source, dataset, settings or {}))
+    return _work(Order(lake, (INGEST,), source, dataset, settings or {}, replace))
 
 
 @flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
@@ -229,7 +250,7 @@ def execute(order: Order) -> Outcome:
     chosen: Any = run_stage
     if INGEST in order.steps:
         chosen = run if tuple(order.steps) == ALL_STEPS else ingest_files
-        parameters |= {"source": order.source, "dataset": order.dataset}
+        parameters |= {"source": order.source, "dataset": order.dataset, "replace": order.replace}
     else:
         (parameters["stage"],) = order.steps
     changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it

@@ -14,9 +14,6 @@ class Reporter(Protocol):
     def advance(self, stage: str, title: str) -> None:
         """One of them is done."""
 
-    def say(self, text: str) -> None:
-        """A line worth reading."""
-
 
 class Silent:
     """Shows nothing: for scripts, tests and workers."""
@@ -25,9 +22,6 @@ class Silent:
         """Nothing."""
 
     def advance(self, stage: str, title: str) -> None:
-        """Nothing."""
-
-    def say(self, text: str) -> None:
         """Nothing."""
 
 

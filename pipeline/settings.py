@@ -1,10 +1,11 @@
 """Settings: `tracklake.toml`, then the environment (`TRACKLAKE_*`), then flags."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from schemas.protocols import PROTOCOLS, Protocol
@@ -23,7 +24,9 @@ class Settings(BaseSettings):
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"
     )
     dask_address: str | None = Field(None, description="of a Dask scheduler; none: a cluster on this machine")
-    thresholds: dict[str, float] = Field(default_factory=dict, description="of rules, by rule name")
+    thresholds: dict[str, float] = Field(
+        default_factory=dict, description="of rules, by threshold name, such as high_acceleration_mps2"
+    )
     max_backward_share: float = Field(
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"
     )
@@ -50,10 +53,13 @@ class Settings(BaseSettings):
         del dotenv_settings, file_secret_settings
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
+    @field_validator("protocol")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        if name not in PROTOCOLS:
+            raise ValueError(f"expected one of {', '.join(PROTOCOLS)}")
+        return name
+
     def get_protocol(self) -> Protocol:
         """The protocol with the settings that change it."""
-        from dataclasses import replace
-
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol {self.protocol!r} is unknown. Expected one of {', '.join(PROTOCOLS)}.")
         return replace(PROTOCOLS[self.protocol], min_future_s=self.min_future_s)

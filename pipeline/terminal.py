@@ -101,9 +101,6 @@ class _Bars:
     def advance(self, stage: str, title: str) -> None:
         self._progress.update(self._bars[stage], advance=1, title=escape(title))
 
-    def say(self, text: str) -> None:
-        self._progress.console.print(escape(text))
-
 
 def show_outcome(terminal: Terminal, outcome: "Outcome") -> None:
     """Print what came of an order: notes, refusals, failures."""
@@ -151,7 +148,8 @@ def command_here() -> str:
     found, called = shutil.which("tracklake"), Path(sys.argv[0])
     if called.name != "tracklake" or (found and Path(found).resolve() == called.resolve()):
         return "tracklake"
-    return os.path.relpath(called)
+    near = os.path.relpath(called)
+    return str(called.resolve()) if near.startswith("..") else near
 
 
 def _some(count: int | None) -> str:

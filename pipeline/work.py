@@ -11,6 +11,7 @@ from pipeline.stages import ingest
 from pipeline.stages.base import Job, Stage, pending
 from pipeline.stages.discovery import Digests, Discovery, discover
 from pipeline.stages.registry import STAGE_BY_NAME, STAGES
+from quality_reports.rules import RULES, resolve
 
 INGEST = "ingest"
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
@@ -27,6 +28,7 @@ class Order:
         source: raw file or folder; needed for ingest.
         dataset: read the source's files as this dataset's only.
         settings: of `pipeline.settings.Settings`, as plain values.
+        replace: whether recordings may lose rows of files that the source does not hold.
     """
 
     lake: str
@@ -34,6 +36,7 @@ class Order:
     source: str | None = None
     dataset: str | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+    replace: bool = False
 
     @property
     def root(self) -> Path:
@@ -43,6 +46,14 @@ class Order:
     def get_settings(self) -> Settings:
         """The settings, validated."""
         return Settings(**self.settings)
+
+    def check(self) -> None:
+        """Refuse settings that only a later stage would stumble over.
+
+        Raises:
+            ThresholdError: a threshold of no such name.
+        """
+        resolve(RULES, self.get_settings().thresholds)
 
     def stages(self) -> list[Stage]:
         """The stages after ingestion that are asked for."""
@@ -89,10 +100,17 @@ def is_idle(order: Order, discovery: Discovery | None) -> bool:
     except LakeMissingError:
         return False
     if discovery is not None and (
-        ingest.files_to_read(discovery, manifest) or pending(order.root, manifest, ingest.plan(discovery, manifest))
+        ingest.files_to_read(discovery, manifest) or any(plan_ingest(order, discovery, manifest))
     ):
         return False
     return not any(outstanding(stage, order.root, manifest, order.get_settings()) for stage in order.stages())
+
+
+def plan_ingest(order: Order, discovery: Discovery, manifest: Manifest) -> tuple[list[Job], list[str]]:
+    """The ingest jobs that are not done, and messages about those that would lose rows of other files."""
+    jobs = pending(order.root, manifest, ingest.plan(discovery, manifest))
+    conflicts = {} if order.replace else ingest.find_replaced(jobs, manifest)
+    return [job for job in jobs if job.key not in conflicts], sorted(conflicts.values())
 
 
 def outstanding(stage: Stage, root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
@@ -105,7 +123,7 @@ def outstanding(stage: Stage, root: Path, manifest: Manifest, settings: Settings
 
 
 def explain_left_out(manifest: Manifest) -> list[str]:
-    """Say which subsets took no part in the freeway-only stages, and which gave no samples, and why."""
+    """Say which subsets took no part in the freeway-only stages, and why."""
     arterials = sorted(
         subset["subset"]
         for entry in manifest.of_stage(INGEST)

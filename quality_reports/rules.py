@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import pandera.polars as pa
 import polars as pl
+from pandera.errors import SchemaErrors
 
 Severity = Literal["error", "warning", "info"]
 
@@ -172,12 +173,29 @@ def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | N
     )
 
 
+def select_broken(
+    tracks: pl.DataFrame, rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None
+) -> tuple[Rule, ...]:
+    """The rules that a subset's tracks break anywhere, by the Pandera checks.
+
+    Raises:
+        ThresholdError: see `resolve`.
+    """
+    try:
+        as_schema(rules, thresholds).validate(tracks, lazy=True)
+    except SchemaErrors as broken:
+        names = {error.check.name for error in broken.schema_errors if error.check is not None}
+        return tuple(rule for rule in rules if rule.name in names)
+    return ()
+
+
 def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
     """One rule as a Pandera check: true where an entry does not break it."""
     return pa.Check(
         lambda data: data.lazyframe.select(~broken),
         name=rule.name,
         error=f"{rule.name} ({rule.severity}): {rule.meaning}",
+        n_failure_cases=1,  # Polars counts and writes the entries; Pandera need not collect them
     )
 
 

@@ -13,7 +13,7 @@ HEAD = f"""# Tables
 Derived from `schemas/`; do not edit (`make docs` writes it). Schema version {SCHEMA_VERSION}.
 
 In SQL, `vehicles` also shows the columns of `vehicle_starts`, and `subsets` those of `subset_status`: null where that
-stage has not run. Every file is sorted by its table's key, which is unique within a partition.
+stage has not run. Every file is sorted by its table's key, which is unique within a file.
 """
 
 RAW_HEAD = """## Raw files

@@ -53,7 +53,6 @@ RAW_HIGHD_VEHICLES = Table(
         "numFrames": column(pl.Int32, "rows of the vehicle in the tracks file", ge=1),
         "class": column(pl.String, "Car or Truck"),
         "drivingDirection": column(pl.Int16, "1 upper carriageway (to the left), 2 lower", ge=1, le=2),
-        "numLaneChanges": column(pl.Int32, "lane changes of the vehicle", ge=0),
     },
 )
 

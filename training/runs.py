@@ -18,6 +18,10 @@ RUN_VERSION = 1
 """Counts changes of `config.json` that older runs cannot be read with."""
 
 
+class StaleRunError(ValueError):
+    """A run cannot be judged on these tensors: it was made for others."""
+
+
 @dataclass(frozen=True)
 class Run:
     """A run, loaded.
@@ -94,11 +98,11 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     """
     config = json.loads((path / "config.json").read_text(encoding="utf-8"))
     if config.get("version") != RUN_VERSION:
-        raise ValueError(
+        raise StaleRunError(
             f"{path / 'config.json'}: expected version {RUN_VERSION}, got {config.get('version')}; train it again"
         )
     if config["protocol"]["digest"] != protocol.digest:
-        raise ValueError(
+        raise StaleRunError(
             f"{path}: trained for the protocol {config['protocol']['name']} ({config['protocol']['digest']}), the "
             f"tensors are of {protocol.name} ({protocol.digest}); train it again on these tensors"
         )
@@ -131,7 +135,7 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
         return
     seen = sorted(set(config["train_subsets"]) & folder.subsets_of(part))
     if seen:
-        raise ValueError(
+        raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "
             f"`{part}` ({', '.join(seen[:5])}) were in its training part; train it again on these tensors"
         )

@@ -1,5 +1,6 @@
 """A query's result, for people or for programs."""
 
+import errno
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +9,7 @@ from pipeline.terminal import Terminal, show_relation
 
 if TYPE_CHECKING:
     import duckdb
+    import polars as pl
 
 FORMATS = ("table", "csv", "json", "parquet")
 
@@ -29,8 +31,18 @@ def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | Non
         return
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
-    target: Any = out or sys.stdout.buffer
-    frame = _flat(relation).pl() if form == "csv" else relation.pl()
+    try:
+        _write(_flat(relation).pl() if form == "csv" else relation.pl(), form, out or sys.stdout.buffer)
+    except OSError as error:
+        # Polars raises the system's error without its number.
+        if f"(os error {errno.EPIPE})" in str(error):
+            raise BrokenPipeError from error
+        raise
+    if out is None:
+        sys.stdout.buffer.flush()
+
+
+def _write(frame: "pl.DataFrame", form: str, target: Any) -> None:  # noqa: ANN401 - a path or a binary file
     if form == "csv":
         frame.write_csv(target)
     elif form == "json":
@@ -39,8 +51,6 @@ def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | Non
         frame.write_parquet(target)
     else:
         raise ValueError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
-    if out is None:
-        sys.stdout.buffer.flush()
 
 
 def _flat(relation: "duckdb.DuckDBPyRelation") -> "duckdb.DuckDBPyRelation":

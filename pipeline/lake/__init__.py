@@ -4,7 +4,7 @@ from pipeline.lake.catalog import connect, query, query_errors
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
 from pipeline.lake.files import is_intact, scan, write_folder, write_table
 from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
-from pipeline.lake.writer import Writer, open_for_writing, refuse_if_busy
+from pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
 
 __all__ = [
     "Entry",
@@ -22,6 +22,7 @@ __all__ = [
     "open_for_writing",
     "query",
     "query_errors",
+    "refuse_foreign",
     "refuse_if_busy",
     "scan",
     "write_aside",

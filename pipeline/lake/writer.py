@@ -94,7 +94,7 @@ def open_for_writing(root: Path) -> Iterator[Writer]:
         LakeLockedError: another process holds the lock.
         LakeError: the folder holds other things than a lake, or cannot be written to.
     """
-    _refuse_foreign(root)
+    refuse_foreign(root)
     descriptor = _open_lock(root)
     try:
         _take(root, descriptor)
@@ -119,7 +119,7 @@ def refuse_if_busy(root: Path) -> None:
         LakeLockedError: another process holds the lock.
         LakeError: the folder holds other things than a lake.
     """
-    _refuse_foreign(root)
+    refuse_foreign(root)
     if (root / LOCK).exists():
         descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -168,7 +168,12 @@ def _begin(root: Path, *, broken_off: bool) -> Writer:
     return Writer(root, manifest)
 
 
-def _refuse_foreign(root: Path) -> None:
+def refuse_foreign(root: Path) -> None:
+    """Refuse a place that is no lake and no place for one, before anything is written there.
+
+    Raises:
+        LakeError: a file, a folder of other things, or a manifest that is not ours.
+    """
     if root.exists() and not root.is_dir():
         raise LakeError(f"{root}: is a file; a lake is a folder. Name another with --lake.")
     if (root / MANIFEST).exists():

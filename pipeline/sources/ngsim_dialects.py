@@ -155,9 +155,10 @@ def layout_of(head: bytes, dialect: str, *, where: str) -> Layout:
     else:
         names = TEXT_FIELDS
     wanted = [name for name in RAW_NGSIM.columns if name in names and name != LINE]
+    # Every vehicle has a size, a lane and a place in the queue, so where a file has those columns no cell is empty.
     # The last field tells a cut line from a whole one, so it may not be empty even where the schema would let it.
     # (Direction may: freeways have none.)
-    required = (RAW_NGSIM.required & set(wanted)) | {names[-1]} & set(wanted) - {"Direction"}
+    required = (RAW_NGSIM.required | set(TEXT_FIELDS) | {names[-1]}) & set(wanted) - {"Direction"}
     if dialect != CSV:
         required = frozenset(wanted)
     return Layout(

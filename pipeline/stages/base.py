@@ -39,6 +39,10 @@ class Job:
         return self.key.rpartition("/")[2]
 
 
+Plan = Callable[[Path, Manifest, Settings], list[Job]]
+"""(lake, manifest, settings) to the jobs that would make a stage complete."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """A stage of the pipeline.
@@ -46,13 +50,13 @@ class Stage:
     Args:
         name: of the stage and of its command.
         meaning: one line for people.
-        plan: (lake, manifest, settings) to the jobs that would make the stage complete.
+        plan: what there would be to do.
         build: (lake, job, settings) to the entry to commit; writes the files.
     """
 
     name: str
     meaning: str
-    plan: Callable[[Path, Manifest, Settings], list[Job]]
+    plan: Plan
     build: Callable[[Path, Job, Settings], Entry]
 
 
@@ -96,18 +100,19 @@ def recordings(manifest: Manifest, *, freeway_only: bool = False) -> list[dict[s
     return found
 
 
-def upstream(manifest: Manifest, stage: str, recording: dict[str, Any]) -> str:
-    """Fingerprint of an earlier stage's entry for a recording.
+def upstream(plan: Plan, root: Path, manifest: Manifest, settings: Settings) -> dict[str, str]:
+    """Fingerprints of an earlier stage's entries by key, each as that stage would make it now.
 
     Raises:
-        StageError: the stage has not run on it, or ran on something older than what is in the lake now.
+        StageError: the stage has not run, or ran on other inputs or with other settings than now.
     """
-    key = f"{stage}/{recording['dataset']}/{recording['recording']}"
-    entry = manifest.entries.get(key)
-    if entry is None or entry.built_from.get("ingest") != recording["fingerprint"]:
-        state = "has not run on" if entry is None else "is out of date for"
-        raise StageError(
-            f"{stage} {state} {recording['dataset']} {recording['recording']}. Run `tracklake {stage}` first, "
-            "or `tracklake run` for everything."
-        )
-    return entry.fingerprint
+    found = {}
+    for job in plan(root, manifest, settings):
+        entry = manifest.entries.get(job.key)
+        if entry is None or entry.fingerprint != job.fingerprint:
+            stage = job.key.split("/", 1)[0]
+            what = f"{stage} of {job.title}" if job.title != stage else stage
+            state = "has not been made" if entry is None else "was made from other inputs or with other settings"
+            raise StageError(f"{what} {state}. Run `tracklake {stage}` first, or `tracklake run` for everything.")
+        found[job.key] = entry.fingerprint
+    return found

@@ -2,11 +2,13 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.lake import write_aside
+from pipeline.lake.manifest import MANIFEST
 from pipeline.sources import SOURCES, RawFile, Source, SourceError
 from pipeline.sources.base import Unit
 from pipeline.sources.raw_files import read_head
@@ -96,12 +98,15 @@ def _candidates(source: Path) -> list[Path]:
         )
     if source.is_file():
         return [source]
-    hidden = set(source.rglob(".*"))
-    return sorted(
-        path
-        for path in source.rglob("*")
-        if path.is_file() and path not in hidden and not hidden.intersection(path.parents)
-    )
+    found: list[Path] = []
+    visited: set[str] = set()
+    for folder, below, names in os.walk(source, followlinks=True):
+        real = os.path.realpath(folder)
+        below[:] = [] if real in visited else [name for name in below if not name.startswith(".")]
+        if real not in visited:
+            found += [Path(folder, name) for name in names if not name.startswith(".")]
+        visited.add(real)
+    return sorted(path for path in found if path.is_file())
 
 
 def _expected(sources: list[Source]) -> str:
@@ -127,6 +132,10 @@ def _nothing(source: Path, candidates: list[Path], sources: list[Source]) -> str
     )
 
 
+_HASHED: dict[str, list[object]] = {}
+"""Of this process: a lake that is still to be made has no place to keep hashes, and no file is read twice for them."""
+
+
 class Digests:
     """sha256 of files, remembered by path, size and modification time so that idle reruns read nothing."""
 
@@ -144,16 +153,17 @@ class Digests:
     def __call__(self, path: Path) -> str:
         """The sha256 of a file's bytes."""
         key, stat = str(path.resolve()), path.stat()
-        known = self._known.get(key)
-        if known is not None and known[:2] == [stat.st_size, stat.st_mtime_ns]:
-            return str(known[2])
-        with path.open("rb") as handle:
-            sha256 = hashlib.file_digest(handle, "sha256").hexdigest()
-        self._known[key] = [stat.st_size, stat.st_mtime_ns, sha256]
+        state = [stat.st_size, stat.st_mtime_ns]
+        if self._known.get(key, [])[:2] == state:
+            return str(self._known[key][2])
+        if _HASHED.get(key, [])[:2] != state:
+            with path.open("rb") as handle:
+                _HASHED[key] = [*state, hashlib.file_digest(handle, "sha256").hexdigest()]
+        self._known[key] = _HASHED[key]
         self._changed = True
-        return sha256
+        return str(self._known[key][2])
 
     def save(self) -> None:
-        """Keep what was computed beside the lake's manifest."""
-        if self._changed and self._path.parent.is_dir():
+        """Keep what was computed beside the lake's manifest, where there is a lake."""
+        if self._changed and self._path.with_name(MANIFEST).exists():
             write_aside(self._path, json.dumps(self._known).encode())

@@ -19,7 +19,7 @@ from schemas import INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 VERSION = 1
 SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
-_PLANNING_FACTS = ("subset", "site", "freeway", "vehicles", "entries")
+_PLANNING_FACTS = ("subset", "freeway")
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
 
@@ -108,6 +108,28 @@ def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
             jobs.append(_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
     jobs += [_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
     return jobs
+
+
+def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
+    """Messages, by key, about recordings whose earlier files these jobs do not hold: their rows would be lost.
+
+    A file of the same name with other content is a new version of that file, and replaces it.
+    """
+    messages = {}
+    for job in jobs:
+        entry = manifest.entries.get(job.key)
+        if entry is None:
+            continue
+        given = [job.built_from["sources"], entry.built_from["sources"]]
+        names, hashes = ({source[part] for source in given[0]} for part in ("file", "sha256"))
+        lost = [s["file"] for s in given[1] if s["file"] not in names and s["sha256"] not in hashes]
+        if lost:
+            messages[job.key] = (
+                f"recording {job.title}: it is in the lake already, from {', '.join(lost)}, and now came from "
+                f"{', '.join(sorted(names))}. Give all its files at once (a folder), or let these replace those with "
+                "--replace."
+            )
+    return messages
 
 
 def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:

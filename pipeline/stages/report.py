@@ -1,7 +1,6 @@
 """Report: the lake's quality as one page for people and one document for programs."""
 
 import hashlib
-import json
 import platform
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -10,7 +9,8 @@ from pathlib import Path
 from pipeline.lake import Entry, LakeFile, Manifest, connect, load, write_aside
 from pipeline.lake.files import REPORTS
 from pipeline.settings import Settings
-from pipeline.stages.base import Job, make_entry, make_job
+from pipeline.sources import SOURCES
+from pipeline.stages.base import Job, make_entry, make_job, recordings
 from pipeline.stages.score import collect_scores, finished_runs
 
 VERSION = 1
@@ -47,6 +47,11 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         "versions": {name: version(name) for name in SHOWN_VERSIONS},
         "thresholds": settings.thresholds,
         "settings": _shown(settings),
+        "data": {
+            source.name: {"title": source.title, "licence": source.licence, "citation": source.citation}
+            for source in SOURCES
+            if any(recording["dataset"] == source.name for recording in recordings(manifest))
+        },
         "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
     }
     with connect(root) as connection:
@@ -54,7 +59,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     folder = root / REPORTS
     folder.mkdir(exist_ok=True)
     files = []
-    for name, content in ((PAGE, report.html), (DOCUMENT, json.dumps(report.quality, indent=1, allow_nan=False))):
+    for name, content in ((PAGE, report.html), (DOCUMENT, report.json)):
         write_aside(folder / name, content.encode())
         files.append(LakeFile(f"{REPORTS}/{name}", None, (folder / name).stat().st_size))
-    return make_entry(job, {REPORTS: files}, {"headline": report.quality.get("headline", {})})
+    return make_entry(job, {REPORTS: files}, {})

@@ -1,9 +1,11 @@
 """Samples: prediction origins with maneuvers and neighbors, and every entry dropped by reason."""
 
 from pathlib import Path
+from typing import Any
 
 from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
 from pipeline.settings import Settings
+from pipeline.stages import repair, validate
 from pipeline.stages.base import Job, make_entry, make_job, recordings, upstream
 from pipeline.transforms.samples import draw_samples
 from schemas import MISSING_STARTS, NEIGHBORS, SAMPLE_DROPS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_STARTS
@@ -11,17 +13,19 @@ from schemas import MISSING_STARTS, NEIGHBORS, SAMPLE_DROPS, SAMPLES, SUBSET_STA
 VERSION = 1
 
 
-def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
+def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job per freeway recording; validation and repair come before."""
     protocol = settings.get_protocol()
+    validated = upstream(validate.plan, root, manifest, settings)
+    repaired = upstream(repair.plan, root, manifest, settings)
     return [
         make_job(
             f"samples/{recording['dataset']}/{recording['recording']}",
             version_of_stage=VERSION,
             made_of={
                 "ingest": recording["fingerprint"],
-                "validate": upstream(manifest, "validate", recording),
-                "repair": upstream(manifest, "repair", recording),
+                "validate": validated[f"validate/{recording['dataset']}/{recording['recording']}"],
+                "repair": repaired[f"repair/{recording['dataset']}/{recording['recording']}"],
                 "protocol": protocol.digest,
             },
             inputs={"dataset": recording["dataset"], "subsets": [item["subset"] for item in recording["subsets"]]},
@@ -34,7 +38,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Draw the samples of a recording's subsets."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
-    info = {"samples": 0, "collisions": 0}
+    info: dict[str, Any] = {"samples": 0, "collisions": 0, "notes": []}
     for subset in job.inputs["subsets"]:
         values = {"dataset": dataset, "subset": subset}
         facts = scan(root, manifest, SUBSETS, **values).collect().row(0, named=True)
@@ -58,4 +62,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
             files.setdefault(table.name, []).extend(written)
         info["samples"] += drawn.samples.height
         info["collisions"] += drawn.collisions
+        if drawn.samples.is_empty():
+            reasons = drawn.sample_drops.sort("entries", descending=True)["reason"].to_list()
+            info["notes"].append(f"{subset}: no samples ({', '.join(reasons) or 'no entries'})")
     return make_entry(job, files, info)

@@ -7,28 +7,29 @@ from typing import Any
 from pipeline.lake import Entry, LakeFile, Manifest, load
 from pipeline.lake.files import MODELS, TENSORS
 from pipeline.settings import Settings
-from pipeline.stages.base import Job, make_entry, make_job
+from pipeline.stages import tensors
+from pipeline.stages.base import Job, make_entry, make_job, upstream
 from pipeline.stages.tensors import tensor_folder
 
 VERSION = 1
 BASELINE = "constant-velocity"
 
 
-def plan(_root: Path, manifest: Manifest, _settings: Settings) -> list[Job]:
+def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job where there are tensors."""
-    tensors = manifest.entries.get(TENSORS)
-    if tensors is None or tensors.info["path"] is None:
+    made = upstream(tensors.plan, root, manifest, settings)
+    if not made or manifest.entries[TENSORS].info["path"] is None:
         return []
-    made_of = {"tensors": tensors.fingerprint, "model": BASELINE}
+    made_of = {**made, "model": BASELINE}
     return [make_job("score", version_of_stage=VERSION, made_of=made_of, inputs={})]
 
 
-def build(root: Path, job: Job, _settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Evaluate the baseline and write it as a run like any other."""
     from training.train import train
 
     out = root / MODELS / BASELINE
-    metrics = train(BASELINE, tensor_folder(root, load(root)), out)
+    metrics = train(BASELINE, tensor_folder(root, load(root), settings), out)
     files = [
         LakeFile(file.relative_to(root).as_posix(), None, file.stat().st_size)
         for file in sorted(out.iterdir())
@@ -51,7 +52,7 @@ def collect_scores(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
     """
     if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
         return []
-    index = json.loads((tensor_folder(root, manifest) / "index.json").read_text(encoding="utf-8"))
+    index = json.loads((root / manifest.entries[TENSORS].info["path"] / "index.json").read_text(encoding="utf-8"))
     scores = []
     for path in finished_runs(root):
         config = json.loads(path.with_name("config.json").read_text(encoding="utf-8"))

@@ -1,22 +1,22 @@
 """Split: which subsets train and which evaluate."""
 
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from pipeline.lake import Entry, Manifest, load, scan, write_table
 from pipeline.settings import Settings
-from pipeline.stages.base import Job, StageError, make_entry, make_job, recordings
+from pipeline.stages import samples
+from pipeline.stages.base import Job, make_entry, make_job, upstream
 from pipeline.transforms.splits import allocate_flow_balanced
 from schemas import SAMPLES, SPLIT_BALANCE, SPLITS, SUBSET_STATUS, SUBSETS
 
 VERSION = 1
 
 
-def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
+def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job over all freeway recordings; samples come before."""
-    drawn = samples_of(manifest)
+    drawn = upstream(samples.plan, root, manifest, settings)
     if not drawn:
         return []
     return [
@@ -32,24 +32,6 @@ def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
             inputs={},
         )
     ]
-
-
-def samples_of(manifest: Manifest) -> dict[str, str]:
-    """Fingerprints of the samples of every freeway recording.
-
-    Raises:
-        StageError: samples have not been drawn from a recording as it is in the lake now.
-    """
-    drawn: dict[str, Any] = {}
-    for recording in recordings(manifest, freeway_only=True):
-        key = f"samples/{recording['dataset']}/{recording['recording']}"
-        entry = manifest.entries.get(key)
-        if entry is None or entry.built_from["ingest"] != recording["fingerprint"]:
-            raise StageError(
-                f"samples of {recording['recording']} are missing or out of date. Run `tracklake samples`."
-            )
-        drawn[key] = entry.fingerprint
-    return drawn
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
@@ -78,6 +60,8 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         table.name: write_table(root, table, frame, {}, job.fingerprint, where=f"split {protocol.split}")
         for table, frame in ((SPLITS, allocation.splits), (SPLIT_BALANCE, allocation.balance))
     }
-    reasons = allocation.balance.filter(pl.col("relaxed")).select("dataset", "relaxed_reason").unique().sort("dataset")
-    notes = [f"split {protocol.split} of {dataset} is relaxed: {reason}" for dataset, reason in reasons.iter_rows()]
+    notes = [
+        f"split {protocol.split} of {dataset} is relaxed: {reason}"
+        for dataset, reason in sorted(allocation.relaxations.items())
+    ]
     return make_entry(job, files, {"notes": notes, "subsets": allocation.splits.height})

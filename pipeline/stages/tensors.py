@@ -8,8 +8,8 @@ import polars as pl
 from pipeline.lake import Entry, Manifest, load, scan, write_folder
 from pipeline.lake.files import TENSORS
 from pipeline.settings import Settings
-from pipeline.stages.base import Job, StageError, make_entry, make_job
-from pipeline.stages.split import samples_of
+from pipeline.stages import split
+from pipeline.stages.base import Job, StageError, make_entry, make_job, upstream
 from pipeline.tensor_files import write_tensors
 from pipeline.transforms.resample import put_on_clock
 from pipeline.transforms.tensors import build_subset_arrays, concatenate, describe_tensors
@@ -18,16 +18,13 @@ from schemas import NEIGHBORS, SAMPLES, SPLITS, SUBSETS, TRACKS
 VERSION = 1
 
 
-def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
+def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job over the split; the split comes before."""
-    drawn = samples_of(manifest)
-    if not drawn:
+    made = upstream(split.plan, root, manifest, settings)
+    if not made:
         return []
-    split = manifest.entries.get("split")
-    if split is None or split.built_from["samples"] != drawn:
-        raise StageError("the split is missing or out of date. Run `tracklake split`.")
     protocol = settings.get_protocol()
-    made_of = {"split": split.fingerprint, "protocol": protocol.digest}
+    made_of = {**made, "protocol": protocol.digest}
     return [make_job(TENSORS, version_of_stage=VERSION, made_of=made_of, inputs={"split": protocol.split})]
 
 
@@ -68,15 +65,21 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     return make_entry(job, {TENSORS: files}, info)
 
 
-def tensor_folder(root: Path, manifest: Manifest) -> Path:
+def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
     """Where the live tensors stand.
 
     Raises:
-        StageError: there are none.
+        StageError: there are none, or they are of another protocol than the settings name.
     """
     entry = manifest.entries.get(TENSORS)
     if entry is None or entry.info["path"] is None:
         raise StageError(
             f"{root}: the lake has no tensors. Run `tracklake tensors`; it needs freeway recordings with lanes."
+        )
+    protocol = settings.get_protocol()
+    if entry.built_from["protocol"] != protocol.digest:
+        raise StageError(
+            f"{root}: the tensors were made by another protocol than {protocol.name} ({protocol.digest}) as it is set "
+            "now. Run `tracklake run` with these settings, or set what they were made with."
         )
     return root / str(entry.info["path"])

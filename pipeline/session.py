@@ -1,0 +1,142 @@
+"""What every command does the same way: settings, doing what is not done, saying what came of it, exit codes.
+
+Like the commands, it imports heavy libraries where they are used.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+    from pipeline.terminal import Terminal
+    from pipeline.work import Outcome
+
+DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
+
+
+@contextmanager
+def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
+    """Give a command its terminal, and turn what a user can mend into a message and an exit code."""
+    from tomllib import TOMLDecodeError
+
+    from pydantic import ValidationError
+
+    from pipeline.lake import LakeError
+    from pipeline.sources import SourceError
+    from pipeline.stages.base import StageError
+    from pipeline.terminal import Terminal
+    from quality_reports.rules import ThresholdError
+
+    terminal = Terminal(quiet=quiet, as_json=json)
+    try:
+        yield terminal
+    except (LakeError, SourceError, StageError) as error:
+        raise failure(terminal, str(error)) from None
+    except (ThresholdError, TOMLDecodeError) as error:
+        where = "tracklake.toml: " if isinstance(error, TOMLDecodeError) else ""
+        raise failure(terminal, f"{where}{error}", USAGE) from None
+    except ValidationError as error:
+        for problem in error.errors():
+            where = ".".join(str(part) for part in problem["loc"])
+            terminal.complain(
+                f"setting {where}: {problem['msg']}; got {problem['input']!r}. See `tracklake.toml` and TRACKLAKE_*."
+            )
+        raise failure(terminal, "the settings are not valid", USAGE) from None
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; Python must not complain about it once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (ValueError, OSError, ImportError) as error:
+        raise failure(terminal, str(error)) from None
+    except KeyboardInterrupt:
+        told = "interrupted; what was committed stays, and the same command goes on from there"
+        raise failure(terminal, told) from None
+
+
+def failure(terminal: "Terminal", message: str, code: int = FAILED) -> typer.Exit:
+    """Say what went wrong, to people and to programs, and give the exit to raise."""
+    terminal.complain(message)
+    terminal.give({"error": message})
+    return typer.Exit(code)
+
+
+def read_settings(**flags: Any) -> "Settings":  # noqa: ANN401 - any setting
+    """The settings, with the flags that were given on top."""
+    from pipeline.settings import Settings
+
+    return Settings(**{name: value for name, value in flags.items() if value is not None})
+
+
+def carry_out(
+    terminal: "Terminal",
+    settings: "Settings",
+    steps: tuple[str, ...],
+    source: str | None = None,
+    dataset: str | None = None,
+    *,
+    replace: bool = False,
+) -> "Outcome":
+    """Do what is not done; Prefect is imported only where something is."""
+    from pipeline.lake import load, refuse_foreign, refuse_if_busy
+    from pipeline.work import Order, Outcome, is_idle, plan_ingest, survey
+    from schemas.columns import DATASETS
+
+    if dataset not in (None, *DATASETS):
+        raise typer.BadParameter(f"--dataset is {' or '.join(DATASETS)}; got {dataset!r}")
+    plain = settings.model_dump(mode="json", exclude_unset=True)
+    # Absolute, so that a worker in another folder finds the same places.
+    where = None if source is None else str(Path(source).absolute())
+    order = Order(str(settings.lake.absolute()), steps, where, dataset, plain, replace)
+    order.check()
+    refuse_foreign(order.root)
+    discovery = survey(order) if source is not None else None
+    if discovery is None:
+        load(order.root)  # raises where there is no lake to work on
+    if discovery is not None and not discovery.units:
+        # Nothing can come of it, so no lake is made for it either.
+        for message in discovery.refusals:
+            terminal.complain(message, label="refused")
+        terminal.give({"refused": list(discovery.refusals)})
+        raise typer.Exit(FAILED)
+    if is_idle(order, discovery):
+        terminal.say("nothing to do: the lake is up to date", style="dim")
+        conflicts = plan_ingest(order, discovery, load(order.root))[1] if discovery else []
+        return Outcome(refused=[*(discovery.refusals if discovery else ()), *conflicts])
+    refuse_if_busy(order.root)
+    with terminal.working():
+        from pipeline.flows import execute
+
+        return execute(order)
+
+
+def conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, headline: bool = True) -> None:
+    """Say what came of an order and exit with the code that fits."""
+    import json
+    from dataclasses import asdict
+
+    from pipeline.lake import load
+    from pipeline.lake.files import REPORTS
+    from pipeline.stages.report import DOCUMENT, PAGE
+    from pipeline.terminal import show_headline, show_outcome
+
+    show_outcome(terminal, outcome)
+    reports = settings.lake / REPORTS
+    record: dict[str, Any] = {"lake": settings.lake, **asdict(outcome)}
+    usable = bool(load(settings.lake).of_stage("ingest"))
+    if usable and headline and (reports / DOCUMENT).exists():
+        quality = json.loads((reports / DOCUMENT).read_text(encoding="utf-8"))
+        show_headline(terminal, quality, reports / PAGE, settings.lake)
+        record |= {"report": (reports / PAGE).resolve(), "headline": quality["headline"], "scores": quality["scores"]}
+    elif outcome.built:
+        terminal.say(f"done: {', '.join(f'{stage} {count}' for stage, count in outcome.built.items())}")
+    terminal.give(record)
+    if outcome.failed or not usable:
+        raise typer.Exit(FAILED)
+    if outcome.refused:
+        terminal.complain(f"{len(outcome.refused)} refused (above); everything else is done", label="refused")
+        raise typer.Exit(REFUSED)
