@@ -5,17 +5,14 @@ import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jinja2
 from markupsafe import Markup
 
 from quality_reports import plots
 from quality_reports.rules import RULES, Rule
-from quality_reports.summaries import Row, collect
-
-if TYPE_CHECKING:
-    import duckdb
+from quality_reports.summaries import Connection, Row, collect
 
 DASH = "\N{EN DASH}"
 """What a table shows where a number is unknown or was not computed."""
@@ -40,7 +37,7 @@ class Report:
 
 
 def build_report(
-    connection: "duckdb.DuckDBPyConnection",
+    connection: Connection,
     provenance: Mapping[str, Any],
     *,
     rules: Sequence[Rule] = RULES,

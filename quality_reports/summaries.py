@@ -5,19 +5,25 @@ from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from importlib.resources import files
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from quality_reports.rules import RULES, Rule, describe
 from schemas.columns import PARTS
-
-if TYPE_CHECKING:
-    import duckdb
 
 QUALITY_SCHEMA = "tracklake/quality/1"
 SIGNIFICANT_DIGITS = 10
 """A sum's last digits depend on the order in which threads add; beyond these the report would not repeat."""
 REJECTS_PER_FILE = 10
 REJECT_CHARACTERS = 300
+
+
+class Connection(Protocol):
+    """What the report needs of a lake's connection: DuckDB's own has it, and the read-only one of the lake."""
+
+    def execute(self, statement: str, parameters: Any = ..., /) -> Any:  # noqa: ANN401 - DuckDB's own types
+        """Run a statement; the result has `description` and `fetchall()`."""
+        ...
+
 
 Row = dict[str, Any]
 Parameters = Mapping[str, Any]
@@ -28,7 +34,7 @@ def statement(name: str) -> str:
     return (files("quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
 
 
-def query(connection: "duckdb.DuckDBPyConnection", name: str, parameters: Parameters | None = None) -> list[Row]:
+def query(connection: Connection, name: str, parameters: Parameters | None = None) -> list[Row]:
     """Run `sql/<name>.sql` and return its rows as dictionaries of plain values.
 
     Args:
@@ -69,7 +75,7 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a sett
 
 
 def collect(
-    connection: "duckdb.DuckDBPyConnection",
+    connection: Connection,
     provenance: Mapping[str, Any],
     *,
     rules: Sequence[Rule] = RULES,
@@ -135,9 +141,7 @@ def collect(
     }
 
 
-def _rules(
-    connection: "duckdb.DuckDBPyConnection", rules: Sequence[Rule], thresholds: Mapping[str, float]
-) -> list[Row]:
+def _rules(connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]) -> list[Row]:
     """Each rule's declaration, with what was found in the whole lake, per dataset and per subset."""
     rows = query(
         connection,

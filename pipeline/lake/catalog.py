@@ -2,10 +2,10 @@
 
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
@@ -158,11 +158,51 @@ def rebuild(root: Path, manifest: Manifest) -> None:
     write_aside(root / CATALOG, content)
 
 
-def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":
-    """Open a lake for SQL: an in-memory DuckDB with the views.
+Parameters = Mapping[str, Any] | Sequence[Any]
 
-    Nothing but the lake's live files can be reached, no extension loaded, no setting changed. Statements from others
-    go through `query`, which admits none that writes.
+
+class LakeConnection:
+    """A lake opened for SQL; made by `connect`. One SELECT at a time, and nothing else, as in `query`.
+
+    What it returns is DuckDB's own relation: `.pl()`, `.fetchall()`, `.columns` and the rest.
+    """
+
+    def __init__(self, raw: "duckdb.DuckDBPyConnection") -> None:
+        self._raw = raw
+
+    def sql(self, statement: str, parameters: Parameters | None = None) -> "duckdb.DuckDBPyRelation":
+        """The result of a statement.
+
+        Args:
+            statement: one SELECT.
+            parameters: values of its $names, or of its question marks in order.
+
+        Raises:
+            QueryError: see `query`.
+        """
+        return _select_only(self._raw, statement, parameters)
+
+    execute = sql
+    """As DuckDB's connections have it."""
+
+    def close(self) -> None:
+        """Let go of the lake's files."""
+        self._raw.close()
+
+    def __enter__(self) -> "LakeConnection":
+        """Use it in a `with` block."""
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        """Close it."""
+        self.close()
+
+
+def connect(lake: Path | str) -> LakeConnection:
+    """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
+
+    Nothing but the lake's live files can be reached, no statement but a SELECT is admitted, no extension loaded, no
+    setting changed.
 
     Args:
         lake: the lake's folder, wherever it stands now.
@@ -196,10 +236,10 @@ def connect(lake: Path | str) -> "duckdb.DuckDBPyConnection":
         "lock_configuration = true",
     ):
         connection.execute(f"SET {setting}")
-    return connection
+    return LakeConnection(connection)
 
 
-def query(connection: "duckdb.DuckDBPyConnection", sql: str) -> "duckdb.DuckDBPyRelation":
+def query(connection: LakeConnection, sql: str) -> "duckdb.DuckDBPyRelation":
     """Run one SELECT and return its result; EXPLAIN of one, DESCRIBE, SUMMARIZE and SHOW are selects, too.
 
     DuckDB computes a result when it is fetched: what fails only then fails there, see `query_errors`.
@@ -207,6 +247,12 @@ def query(connection: "duckdb.DuckDBPyConnection", sql: str) -> "duckdb.DuckDBPy
     Raises:
         QueryError: not exactly one SELECT, or DuckDB's own message with the list of tables.
     """
+    return connection.sql(sql)
+
+
+def _select_only(
+    connection: "duckdb.DuckDBPyConnection", sql: str, parameters: Parameters | None
+) -> "duckdb.DuckDBPyRelation":
     import duckdb
 
     with query_errors():
@@ -220,7 +266,7 @@ def query(connection: "duckdb.DuckDBPyConnection", sql: str) -> "duckdb.DuckDBPy
             _refuse_explained_writes(connection, statements[0].query)
         if switch := _SWITCHES.search(sql):
             raise QueryError(f"{switch[1]!r} is not available here; the lake is read-only.")
-        return connection.sql(statements[0].query)
+        return connection.sql(statements[0].query, params=parameters or None)
 
 
 @contextmanager

@@ -286,12 +286,34 @@ def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, folder: Path):
     script = (
         "import sys; from pipeline.lake import connect; connection = connect(sys.argv[1]);"
         "options = f\"storage = 'file', storage_path = '{sys.argv[1]}/splits'\";"
-        "connection.execute(f'FROM enable_logging({options})').fetchall();"
-        "connection.execute('SELECT count(*) FROM vehicles').fetchall()"
+        "raw = connection._raw;"  # past the admission of statements
+        "raw.execute(f'FROM enable_logging({options})').fetchall();"
+        "raw.execute('SELECT count(*) FROM vehicles').fetchall()"
     )
     done = subprocess.run([sys.executable, "-c", script, str(lake)], capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "file system operations are disabled" in done.stderr
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "COPY (SELECT 42 AS x) TO '{live}' (FORMAT parquet, USE_TMP_FILE false)",
+        "CREATE TABLE mine AS SELECT 1",
+        "ATTACH '{live}.db' AS other",
+        "SET memory_limit = '1GB'",
+        "SELECT 1; DROP VIEW tracks",
+    ],
+)
+def test_a_connection_admits_nothing_that_writes(lake: Path, folder: Path, statement: str):
+    before = snapshot(folder)
+    live = next(iter(sorted(lake.rglob("*.parquet"))))
+    with connect(lake) as connection:
+        for run in (connection.sql, connection.execute):
+            with pytest.raises(QueryError, match="read-only"):
+                run(statement.format(live=live))
+        assert connection.execute("SELECT $x AS y", {"x": 2}).fetchall() == [(2,)]
     assert snapshot(folder) == before
 
 
