@@ -17,8 +17,7 @@ from rich.table import Table
 from pipeline.progress import Silent, reporting_to
 
 if TYPE_CHECKING:
-    import duckdb
-
+    from pipeline.lake import LakeResult
     from pipeline.work import Outcome
 
 SHOWN_ROWS = 40
@@ -165,7 +164,7 @@ def _balance(quality: dict[str, Any]) -> str:
     return f"; split by vehicles: {', '.join(parts)}" if parts else ""
 
 
-def show_relation(relation: "duckdb.DuckDBPyRelation", terminal: Terminal) -> None:
+def show_relation(relation: "LakeResult", terminal: Terminal) -> None:
     """Print a query's first rows as a table that keeps every column."""
     rows = relation.limit(SHOWN_ROWS + 1).fetchall()
     cells = [list(relation.columns), *([_cell(value) for value in row] for row in rows[:SHOWN_ROWS])]

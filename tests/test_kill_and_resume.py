@@ -125,6 +125,7 @@ def test_one_writer_at_a_time_and_readers_do_not_wait(command, sample, tmp_path)
 
 
 def test_a_lake_can_be_moved(command, sample, lake, tmp_path):
+    assert command("run", sample, "--lake", lake.root, "--quiet").code == 0  # a run trained since is in the report now
     moved = tmp_path / "some where" / "else"
     shutil.copytree(lake.root, moved)
     query = "SELECT count(*) AS n FROM tracks"

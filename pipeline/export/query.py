@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 from pipeline.terminal import Terminal, show_relation
 
 if TYPE_CHECKING:
-    import duckdb
     import polars as pl
+
+    from pipeline.lake import LakeResult
 
 FORMATS = ("table", "csv", "json", "parquet")
 
 
-def write_result(relation: "duckdb.DuckDBPyRelation", form: str, out: Path | None, terminal: Terminal) -> None:
+def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: Terminal) -> None:
     """Write a result to a file, or to standard output.
 
     Args:
@@ -53,7 +54,7 @@ def _write(frame: "pl.DataFrame", form: str, target: Any) -> None:  # noqa: ANN4
         raise ValueError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
 
 
-def _flat(relation: "duckdb.DuckDBPyRelation") -> "duckdb.DuckDBPyRelation":
+def _flat(relation: "LakeResult") -> "LakeResult":
     """Lists and structs as text, which is all that CSV can hold."""
     columns = []
     for name, kind in zip(relation.columns, relation.types, strict=True):

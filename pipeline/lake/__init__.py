@@ -1,6 +1,6 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
-from pipeline.lake.catalog import connect, query, query_errors
+from pipeline.lake.catalog import LakeResult, connect, query, query_errors
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
 from pipeline.lake.files import is_intact, scan, write_folder, write_table
 from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
@@ -12,6 +12,7 @@ __all__ = [
     "LakeFile",
     "LakeLockedError",
     "LakeMissingError",
+    "LakeResult",
     "LakeVersionError",
     "Manifest",
     "QueryError",

@@ -161,16 +161,67 @@ def rebuild(root: Path, manifest: Manifest) -> None:
 Parameters = Mapping[str, Any] | Sequence[Any]
 
 
+class LakeResult:
+    """What a SELECT found; DuckDB computes it when it is fetched.
+
+    Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`.
+    """
+
+    def __init__(self, relation: "duckdb.DuckDBPyRelation") -> None:
+        self._relation = relation
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns' names."""
+        return self._relation.columns
+
+    @property
+    def types(self) -> list[Any]:
+        """The columns' DuckDB types; `str` gives their SQL names."""
+        return list(self._relation.types)
+
+    @property
+    def description(self) -> list[tuple[Any, ...]]:
+        """One tuple per column, as PEP 249 has it: its name, its type, and five that are unknown."""
+        return list(self._relation.description)
+
+    def fetchall(self) -> list[tuple[Any, ...]]:
+        """All rows that were not fetched yet."""
+        return self._relation.fetchall()
+
+    def fetchone(self) -> tuple[Any, ...] | None:
+        """The next row, or None after the last one."""
+        return self._relation.fetchone()
+
+    def pl(self) -> pl.DataFrame:
+        """The rows as a Polars frame."""
+        return self._relation.pl()
+
+    def limit(self, n: int, offset: int = 0) -> "LakeResult":
+        """At most n rows, after the first `offset`."""
+        return LakeResult(self._relation.limit(n, offset))
+
+    def project(self, expressions: str) -> "LakeResult":
+        """Other columns computed of these, a list of SQL expressions.
+
+        Raises:
+            QueryError: not admitted, or DuckDB's own message.
+        """
+        _refuse_switches(expressions)
+        with query_errors():
+            return LakeResult(self._relation.project(expressions))
+
+
 class LakeConnection:
     """A lake opened for SQL; made by `connect`. One SELECT at a time, and nothing else, as in `query`.
 
-    What it returns is DuckDB's own relation: `.pl()`, `.fetchall()`, `.columns` and the rest.
+    What it returns is a `LakeResult`: `.pl()`, `.fetchall()`, `.columns` and the rest of what reads.
     """
 
     def __init__(self, raw: "duckdb.DuckDBPyConnection") -> None:
         self._raw = raw
 
-    def sql(self, statement: str, parameters: Parameters | None = None) -> "duckdb.DuckDBPyRelation":
+    def sql(self, statement: str, parameters: Parameters | None = None) -> LakeResult:
         """The result of a statement.
 
         Args:
@@ -239,7 +290,7 @@ def connect(lake: Path | str) -> LakeConnection:
     return LakeConnection(connection)
 
 
-def query(connection: LakeConnection, sql: str) -> "duckdb.DuckDBPyRelation":
+def query(connection: LakeConnection, sql: str) -> LakeResult:
     """Run one SELECT and return its result; EXPLAIN of one, DESCRIBE, SUMMARIZE and SHOW are selects, too.
 
     DuckDB computes a result when it is fetched: what fails only then fails there, see `query_errors`.
@@ -250,9 +301,7 @@ def query(connection: LakeConnection, sql: str) -> "duckdb.DuckDBPyRelation":
     return connection.sql(sql)
 
 
-def _select_only(
-    connection: "duckdb.DuckDBPyConnection", sql: str, parameters: Parameters | None
-) -> "duckdb.DuckDBPyRelation":
+def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: Parameters | None) -> LakeResult:
     import duckdb
 
     with query_errors():
@@ -264,9 +313,13 @@ def _select_only(
             raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.")
         if kinds[0] == duckdb.StatementType.EXPLAIN:
             _refuse_explained_writes(connection, statements[0].query)
-        if switch := _SWITCHES.search(sql):
-            raise QueryError(f"{switch[1]!r} is not available here; the lake is read-only.")
-        return connection.sql(statements[0].query, params=parameters or None)
+        _refuse_switches(sql)
+        return LakeResult(connection.sql(statements[0].query, params=parameters or None))
+
+
+def _refuse_switches(sql: str) -> None:
+    if switch := _SWITCHES.search(sql):
+        raise QueryError(f"{switch[1]!r} is not available here; the lake is read-only.")
 
 
 @contextmanager

@@ -317,6 +317,24 @@ def test_a_connection_admits_nothing_that_writes(lake: Path, folder: Path, state
     assert snapshot(folder) == before
 
 
+def test_a_result_reads_and_has_no_method_that_writes(lake: Path):
+    with connect(lake) as connection:
+        found = connection.sql("SELECT vehicle_id, class FROM vehicles ORDER BY 1")
+        assert {name for name in dir(found) if not name.startswith("_")} == {
+            "columns", "description", "fetchall", "fetchone", "limit", "pl", "project", "types",
+        }  # fmt: skip
+        assert {name for name in dir(connection) if not name.startswith("_")} == {"close", "execute", "sql"}
+        assert found.columns == [column[0] for column in found.description] == ["vehicle_id", "class"]
+        assert [str(kind) for kind in found.types] == ["INTEGER", "VARCHAR"]
+        assert found.pl().rows() == [(0, "car"), (1, "car"), (2, "car")]
+        assert found.limit(1, 1).fetchall() == [(1, "car")]
+        assert found.project("vehicle_id + 10 AS more").fetchall() == [(10,), (11,), (12,)]
+        for expressions in ("(FROM enable_logging())", "1; CREATE TABLE x (a INT)"):
+            with pytest.raises(QueryError):
+                found.project(expressions)
+        assert (found.fetchone(), found.fetchall()) == ((0, "car"), [(1, "car"), (2, "car")])
+
+
 def test_python_variables_are_no_tables(lake: Path):
     hidden = pl.DataFrame({"a": [1]})
     with connect(lake) as connection, pytest.raises(QueryError, match="hidden"):
