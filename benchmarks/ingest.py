@@ -34,12 +34,12 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.work) as work:
         environment = {**os.environ, "PREFECT_HOME": f"{work}/prefect"}
-        with prefect_server(environment) as address:
+        with PrefectServer(environment) as address:
             environment["PREFECT_API_URL"] = address
             measure_all(Path(work), options.scale, environment)
 
 
-class prefect_server:  # noqa: N801 - a context manager, used as one
+class PrefectServer:
     """A standing server for the length of a block."""
 
     def __init__(self, environment: dict[str, str]) -> None:

@@ -19,7 +19,7 @@ def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
     assert "10,000 entries" in done.out
     query = "SELECT recording, direction, sum(entries)::INT AS entries FROM subsets GROUP BY ALL ORDER BY ALL"
     rows = json.loads(command("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
-    # Counted from the file with a spreadsheet's means: Global_Time - 100 * Frame_ID and Direction of every row.
+    # Counted over the file with the csv module alone: Global_Time - 100 * Frame_ID and Direction of every row.
     assert [tuple(row.values()) for row in rows] == [
         ("peachtree-1245", "north", 7613),
         ("peachtree-1245", "south", 6),

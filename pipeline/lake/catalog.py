@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import polars as pl
+from polars.datatypes import DataTypeClass
 
 from pipeline.lake.errors import LakeError, QueryError
 from pipeline.lake.files import partition_values
@@ -45,12 +46,12 @@ _SWITCHES = re.compile(
 they would write is refused by the file system all the same, but DuckDB then ends the whole process."""
 
 
-def sql_type(dtype: pl.DataType) -> str:
+def sql_type(dtype: pl.DataType | DataTypeClass) -> str:
     """DuckDB's name of a Polars dtype."""
     if isinstance(dtype, pl.List):
-        return f"{sql_type(pl.List(dtype.inner).inner)}[]"  # type: ignore[arg-type]  # inner may be a class
+        return f"{sql_type(dtype.inner)}[]"
     if isinstance(dtype, pl.Struct):
-        inner = ", ".join(f'"{field.name}" {sql_type(field.dtype)}' for field in dtype.fields)  # type: ignore[arg-type]
+        inner = ", ".join(f'"{field.name}" {sql_type(field.dtype)}' for field in dtype.fields)
         return f"STRUCT({inner})"
     instance = dtype() if isinstance(dtype, type) else dtype
     return _SQL_TYPES[instance]

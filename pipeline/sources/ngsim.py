@@ -99,14 +99,15 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     _, site_name = name_recording(key, location)
     one_direction = rows["Direction"].is_null().all()
     site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", None, (), "")
+    first_frame, last_frame = rows.select(first=pl.col("Frame_ID").min(), last=pl.col("Frame_ID").max()).row(0)
     recording_facts: dict[str, Any] = {
         "recording": recording,
         "site": site.name,
         "freeway": site.freeway,
         "frame_rate_hz": FRAME_RATE_HZ,
         "lanes": site.lanes,
-        "seconds": (rows["Frame_ID"].max() - rows["Frame_ID"].min() + 1) / FRAME_RATE_HZ,  # type: ignore[operator]
-        "first_frame": rows["Frame_ID"].min(),
+        "seconds": (last_frame - first_frame + 1) / FRAME_RATE_HZ,
+        "first_frame": first_frame,
         "on_ramp_lanes": list(site.on_ramp_lanes),
         "lane_markings_m": None,
     }

@@ -4,7 +4,7 @@ import gzip
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 import polars as pl
@@ -21,7 +21,8 @@ def open_raw(path: Path) -> BinaryIO:
     """Open a raw file for reading bytes; a gzip file is read without unpacking it to disk."""
     with path.open("rb") as probe:
         magic = probe.read(2)
-    return gzip.open(path, "rb") if magic == b"\x1f\x8b" else path.open("rb")  # type: ignore[return-value]
+    # A GzipFile reads as a binary file, though it is not declared as one.
+    return cast("BinaryIO", gzip.open(path, "rb")) if magic == b"\x1f\x8b" else path.open("rb")
 
 
 def _read_block(handle: BinaryIO, size: int, path: Path) -> bytes:
