@@ -30,25 +30,35 @@ def _write_highd_recording(folder: Path, number: int, rows: int) -> int:
     vehicle = np.repeat(np.arange(vehicles), HIGHD_FRAMES_PER_VEHICLE)
     step = np.tile(np.arange(HIGHD_FRAMES_PER_VEHICLE), vehicles)
     along = speed[vehicle] * step / 25
-    zeros = np.zeros(len(vehicle))
-    none = np.zeros(len(vehicle), dtype=np.int64)
     ahead = np.where(step < HIGHD_FRAMES_PER_VEHICLE - 12, np.maximum(vehicle + 1 - 4, 0), 0)
     sign = np.where(upper, -1, 1)[vehicle]
+    rows = len(vehicle)
+    gap = random.uniform(10, 80, rows).round(2)
+    beside = {
+        name: np.where(random.random(rows) < 0.5, ids[vehicle] + offset, 0)
+        for offset, name in enumerate(field for field in RAW_TRACKS_FIELDS if field.startswith(("left", "right")))
+    }
     columns = {
-        **dict.fromkeys(RAW_TRACKS_FIELDS, zeros),
         "frame": first_frame[vehicle] + step,
         "id": ids[vehicle],
         "x": np.where(upper[vehicle], 420 - along, along).round(2),
-        "y": np.where(upper[vehicle], 8.5, 21.0) + lane[vehicle],
-        "width": np.full(len(vehicle), 4.5),
-        "height": np.full(len(vehicle), 1.9),
+        "y": (np.where(upper[vehicle], 8.5, 21.0) + lane[vehicle] + random.normal(0, 0.2, rows)).round(2),
+        "width": np.full(rows, 4.5),
+        "height": np.full(rows, 1.9),
         "xVelocity": (sign * speed[vehicle]).round(2),
-        "xAcceleration": random.normal(0, 0.2, len(vehicle)).round(2),
-        "dhw": np.where(ahead > 0, 25.5, 0),
+        "yVelocity": random.normal(0, 0.1, rows).round(2),
+        "xAcceleration": random.normal(0, 0.2, rows).round(2),
+        "yAcceleration": random.normal(0, 0.1, rows).round(2),
+        "frontSightDistance": (420 - along).round(2),
+        "backSightDistance": along.round(2),
+        "dhw": np.where(ahead > 0, gap, 0),
+        "thw": np.where(ahead > 0, gap / speed[vehicle], 0).round(2),
+        "ttc": np.where(ahead > 0, gap * random.uniform(-9, 9, rows), 0).round(2),
+        "precedingXVelocity": np.where(ahead > 0, sign * speed[vehicle] + 0.5, 0).round(2),
         "precedingId": ahead,
-        "followingId": none,
+        "followingId": np.minimum(vehicle + 1 + 4, vehicles),
+        **beside,
         "laneId": lane[vehicle],
-        **{name: none for name in RAW_TRACKS_FIELDS if name.startswith(("left", "right"))},
     }
     tracks = pl.DataFrame({name: columns[name] for name in RAW_TRACKS_FIELDS})
     tracks.write_csv(folder / f"{number:02d}_tracks.csv")
@@ -91,6 +101,7 @@ def ngsim_rows(rows: int, recordings: int) -> pl.DataFrame:
         speed = random.uniform(20, 60, vehicles).round(2)
         along = (speed[vehicle] * step / 10).round(3)
         preceding = np.maximum(vehicle + 1 - 5, 0)
+        spacing = random.gamma(4, 25, len(vehicle)).round(2)
         frames.append(
             pl.DataFrame(
                 {
@@ -110,17 +121,22 @@ def ngsim_rows(rows: int, recordings: int) -> pl.DataFrame:
                     "Lane_ID": 1 + vehicle % 5,
                     "Preceding": preceding,
                     "Following": np.minimum(vehicle + 1 + 5, vehicles),
-                    "Space_Headway": np.where(preceding > 0, 1_056.25, 0.0),
-                    "Time_Headway": np.where(preceding > 0, 2.25, 0.0),
+                    "Space_Headway": np.where(preceding > 0, spacing, 0.0),
+                    "Time_Headway": np.where(preceding > 0, spacing / speed[vehicle], 0.0).round(2),
                 }
             )
         )
     return pl.concat(frames)
 
 
+TEXT_WIDTHS = (6, 6, 6, 14, 9, 9, 12, 12, 6, 6, 2, 8, 8, 4, 6, 6, 9, 8)
+"""Of the 18 fields; with the blanks between them a line has 156 bytes, the originals' about 160."""
+
+
 def write_text(path: Path, rows: pl.DataFrame) -> None:
     """The original whitespace-delimited text: columns padded to a width, blanks at both ends of a line."""
-    padded = [pl.col(name).cast(pl.String).str.pad_start(12) for name in rows.columns]
+    widths = zip(rows.columns, TEXT_WIDTHS, strict=True)
+    padded = [pl.col(name).cast(pl.String).str.pad_start(width) for name, width in widths]
     lines = rows.select(line=pl.concat_str(padded, separator=" ") + " ")
     lines.write_csv(path, include_header=False, quote_style="never")
 

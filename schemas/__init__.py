@@ -1,10 +1,12 @@
 """What every table of the lake is. Nothing but polars and pandera is imported here."""
 
 from schemas.columns import StructureError, Table, column
+from schemas.completeness import COMPLETENESS
 from schemas.findings import FINDINGS
 from schemas.ingestion import INGEST_LOG, REJECTS
 from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from schemas.samples import NEIGHBORS, SAMPLE_DROPS, SAMPLES
+from schemas.scores import SUBSET_SCORES, VEHICLE_SCORES
 from schemas.splits import SPLIT_BALANCE, SPLITS
 from schemas.subsets import SUBSET_STATUS, SUBSETS
 from schemas.tracks import TRACKS
@@ -19,9 +21,12 @@ TABLES: tuple[Table, ...] = (
     VEHICLE_STARTS,
     SUBSETS,
     SUBSET_STATUS,
+    COMPLETENESS,
     INGEST_LOG,
     REJECTS,
     FINDINGS,
+    VEHICLE_SCORES,
+    SUBSET_SCORES,
     START_CUTOFFS,
     MISSING_STARTS,
     SAMPLES,
@@ -32,6 +37,7 @@ TABLES: tuple[Table, ...] = (
 )
 
 __all__ = [
+    "COMPLETENESS",
     "FINDINGS",
     "INGEST_LOG",
     "MISSING_STARTS",
@@ -44,10 +50,12 @@ __all__ = [
     "SPLIT_BALANCE",
     "START_CUTOFFS",
     "SUBSETS",
+    "SUBSET_SCORES",
     "SUBSET_STATUS",
     "TABLES",
     "TRACKS",
     "VEHICLES",
+    "VEHICLE_SCORES",
     "VEHICLE_STARTS",
     "StructureError",
     "Table",

@@ -39,3 +39,17 @@ def test_all_excerpts_at_once(command, tmp_path):
     assert said["headline"]["rows_read"] - said["headline"]["rows_dropped"] == said["headline"]["entries"]
     assert said["headline"]["rows_dropped"] == 5_000
     assert said["headline"]["recordings"] == 7
+    query = """SELECT recording, measure, expected, found FROM completeness WHERE authority = 'published'
+               AND recording IN ('us-101-0750', 'i-80-1600') ORDER BY ALL"""
+    rows = json.loads(command("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
+    # Counted over the files with the csv module alone; seven rows of two other vehicles of US-101 07:50 are the API's.
+    assert [tuple(row.values()) for row in rows] == [
+        ("i-80-1600", "entries", 1_262_678, 1_005),
+        ("i-80-1600", "vehicles", 2_052, 1),
+        ("us-101-0750", "entries", 1_180_598, 155_611),
+        ("us-101-0750", "vehicles", 2_169, 292),
+    ]
+    about = [note for note in said["notes"] if note.startswith("us-101-0750") and "published" in note]
+    assert about == [
+        "us-101-0750: 155,611 of 1,180,598 published rows (13.1 %) and 292 of 2,169 vehicles: an excerpt, or incomplete"
+    ]

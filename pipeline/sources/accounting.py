@@ -18,24 +18,39 @@ def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFra
     """Part rows from exact repetitions of earlier ones.
 
     Args:
-        rows: values, with FILE and LINE saying where each row stands.
-        key: columns that sort equal rows next to each other.
+        rows: values, with FILE and LINE saying where each row stands, in the order of these two.
+        key: one or two Int32 columns that sort equal rows next to each other.
 
     Returns:
         (first occurrences, repetitions), sorted by key, then file and line.
     """
     values = [name for name in rows.columns if name not in (FILE, LINE)]
     rest = [name for name in values if name not in key]
-    rows = rows.sort([*key, FILE, LINE], maintain_order=False)
-    # Sorting by every column costs seconds and is needed only where a key repeats at all.
-    repeated = pl.all_horizontal(pl.col(name).eq_missing(pl.col(name).shift(1)) for name in key)
-    if not rows.select(repeated.slice(1).any()).item():
+    rows = rows.with_columns(_pack(key).alias(_PACKED))
+    if not rows[_PACKED].is_sorted():
+        # One packed number sorts three times as fast as the columns it is made of.
+        rows = rows.sort(_PACKED, maintain_order=True)
+    repeated = rows.select((pl.col(_PACKED) == pl.col(_PACKED).shift(1)).any()).item()
+    rows = rows.drop(_PACKED)
+    # Comparing all columns costs seconds and is needed only where a key repeats at all.
+    if not repeated:
         return rows, rows.clear()
     rows = rows.sort([*key, *rest, FILE, LINE], maintain_order=False)
     same = pl.all_horizontal(pl.col(name).eq_missing(pl.col(name).shift(1)) for name in values)
     rows = rows.with_columns((same & (pl.int_range(pl.len()) > 0)).alias("repeats"))
     first, again = rows.filter(~pl.col("repeats")).drop("repeats"), rows.filter("repeats").drop("repeats")
     return first, again
+
+
+_PACKED = "packed_key"
+
+
+def _pack(key: Sequence[str]) -> pl.Expr:
+    """One Int64 that sorts as one or two non-negative Int32 columns do."""
+    packed = pl.lit(0, pl.Int64)
+    for name in key:
+        packed = packed * 2**31 + pl.col(name).cast(pl.Int64)
+    return packed
 
 
 def account(
@@ -63,7 +78,7 @@ def account(
         at_parsing = part.rejects if part.rejects is not None else pl.DataFrame(schema=REJECT_SCHEMA)
         mine = pl.concat([rows.filter(pl.col(FILE) == index) for rows in later] or [pl.DataFrame(schema=_LATER)])
         if not mine.is_empty():
-            mine = mine.join(fetch_lines(part.file.path, mine[LINE]), on=LINE, how="left")
+            mine = mine.join(fetch_lines(part.file, mine[LINE]), on=LINE, how="left")
         refused = pl.concat([at_parsing, mine.select(*REJECT_SCHEMA)] if not mine.is_empty() else [at_parsing])
         log.append(
             {

@@ -6,7 +6,8 @@ from typing import Any
 import polars as pl
 
 from pipeline.sources.base import RawFile, Subset
-from pipeline.transforms.kinematics import add_gaps, add_kinematics, central_difference
+from pipeline.transforms.gaps import add_gaps
+from pipeline.transforms.kinematics import add_kinematics, central_difference
 from schemas import SUBSETS, TRACKS, VEHICLES
 from schemas.columns import Dataset
 

@@ -1,8 +1,9 @@
 """What a dataset's source is: data and a few functions, listed in an explicit registry."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 import polars as pl
 
@@ -15,19 +16,46 @@ class SourceError(Exception):
 
 @dataclass(frozen=True)
 class RawFile:
-    """A raw file that a source recognises.
+    """A raw file: one in a folder, or a member of a zip archive.
 
     Args:
-        path: where it is.
-        name: as tables and messages call it: relative to the folder given.
-        dialect: how its source reads it.
-        sha256: of its bytes.
+        path: where it is, or the archive that holds it.
+        name: as tables and messages call it: relative to the folder given; a member's begins with its archive's.
+        dialect: how its source reads it; empty until it is recognised.
+        sha256: of its bytes (a member's own, whatever the archive's are); empty until it is recognised.
+        member: of the archive, as the archive calls it; None where the file stands by itself.
     """
 
     path: Path
     name: str
-    dialect: str
-    sha256: str
+    dialect: str = ""
+    sha256: str = ""
+    member: str | None = None
+
+    @property
+    def folder(self) -> str:
+        """The folder it lies in; an archive is a folder with folders in it."""
+        return str(self._place.parent)
+
+    @property
+    def filename(self) -> str:
+        """Its name in its folder."""
+        return self._place.name
+
+    @property
+    def _place(self) -> PurePosixPath:
+        # Some programs write the folders of an archive with backslashes.
+        inside = "" if self.member is None else self.member.replace("\\", "/")
+        return PurePosixPath(self.path.as_posix(), inside.lstrip("/"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, fit for a job's inputs or a task's arguments."""
+        return {**asdict(self), "path": str(self.path)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "RawFile":
+        """The file that `to_dict` described."""
+        return cls(**{**values, "path": Path(values["path"])})
 
 
 @dataclass(frozen=True)
@@ -35,7 +63,7 @@ class Spilled:
     """What reading one file that holds several recordings left in the staging folder.
 
     Args:
-        recordings: rows by recording; each stands in `<folder>/<recording>/*.parquet`.
+        recordings: rows by recording; each stands in `<folder>/<recording>/*.arrow`.
         rows_read: data lines of the file.
         rejects: `line`, `reason`, `text` of those that belong to no recording.
     """
@@ -85,12 +113,14 @@ class Canonical:
         subsets: the carriageways that have entries.
         log: one row per file of schemas.INGEST_LOG.
         rejects: schemas.REJECTS.
+        completeness: schemas.COMPLETENESS.
         notes: what the reader of the run's output should know.
     """
 
     subsets: tuple[Subset, ...]
     log: pl.DataFrame
     rejects: pl.DataFrame
+    completeness: pl.DataFrame
     notes: tuple[str, ...] = ()
 
 

@@ -2,19 +2,23 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import PurePosixPath
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
+from pipeline.sources.completeness import Announced, compare
 from pipeline.sources.lines import Chunk, Layout, read_chunks
 from pipeline.sources.raw_files import LINE
 from pipeline.transforms.orientation import LOWER, UPPER, orient_highd
 from schemas import Table
+from schemas.completeness import RECORDING_META, TRACKS_META
 from schemas.raw_highd import (
     RAW_HIGHD_RECORDING,
     RAW_HIGHD_TRACKS,
@@ -32,6 +36,9 @@ FIRST_FRAME = 1
 
 CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
 
+_Set = tuple[tuple[str, str], dict[str, RawFile]]
+"""Folder and number; files by dialect."""
+
 
 def detect(head: bytes, _name: str) -> str | None:
     """Recognise one of the three files by its header."""
@@ -43,28 +50,17 @@ def detect(head: bytes, _name: str) -> str | None:
 def group(files: Sequence[RawFile]) -> Grouping:
     """Gather each recording's three files by folder and number (`NN_tracks.csv`); incomplete ones are refused.
 
-    Of two files of one kind the one that is named as shipped is taken and the other refused.
+    An archive is a folder. What is incomplete there is gathered once more by the folder that the archive lies in, so
+    that three archives of one file each are a recording too. Of two files of one kind the one that is named as shipped
+    is taken and the other refused.
     """
-    gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
-    refusals = []
-    for file in sorted(files, key=lambda file: (not file.path.stem.endswith(_kind(file.dialect)), file.name)):
-        number = re.match(r"(\d+)_", file.path.name)
-        if number is None:
-            refusals.append(
-                f"{file.name}: has the columns of a highD {_kind(file.dialect)} file, but its name does not begin with "
-                f"the recording's number. Expected `NN_{_kind(file.dialect)}.csv`, as shipped; rename it."
-            )
-            continue
-        found = gathered.setdefault((str(file.path.parent), number.group(1)), {})
-        if file.dialect in found:
-            refusals.append(
-                f"{file.name}: a second {_kind(file.dialect)} file of recording {number.group(1)} beside "
-                f"{found[file.dialect].name}, which was taken. Expected one; remove one of the two."
-            )
-            continue
-        found[file.dialect] = file
+    together, refusals = _gather(files, lambda file: file.folder)
+    scattered = [file for _, found in together if len(found) < len(FIELDS) for file in found.values()]
+    beside, more_refusals = _gather(scattered, lambda file: str(file.path.parent))
+    together = [*(each for each in together if len(each[1]) == len(FIELDS)), *beside]
+    refusals += more_refusals
     units: list[Unit] = []
-    for (_, digits), found in sorted(gathered.items(), key=lambda item: item[0][::-1]):
+    for (_, digits), found in sorted(together, key=lambda each: each[0][::-1]):
         recording = f"{int(digits):02d}"
         missing = [f"{digits}_{_kind(dialect)}.csv" for dialect in FIELDS if dialect not in found]
         there = ", ".join(file.name for file in found.values())
@@ -80,6 +76,33 @@ def group(files: Sequence[RawFile]) -> Grouping:
         else:
             units.append(Unit((found[RECORDING], found[VEHICLES], found[TRACKS]), recording))
     return Grouping(tuple(units), tuple(refusals))
+
+
+def _gather(files: Sequence[RawFile], folder_of: Callable[[RawFile], str]) -> tuple[list[_Set], list[str]]:
+    """Files by folder and number, then by dialect; and messages about those that have no place."""
+    gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
+    refusals = []
+    for file in sorted(files, key=lambda file: (not _is_named_as_shipped(file), file.name)):
+        number = re.match(r"(\d+)_", file.filename)
+        if number is None:
+            refusals.append(
+                f"{file.name}: has the columns of a highD {_kind(file.dialect)} file, but its name does not begin with "
+                f"the recording's number. Expected `NN_{_kind(file.dialect)}.csv`, as shipped; rename it."
+            )
+            continue
+        found = gathered.setdefault((folder_of(file), number.group(1)), {})
+        if file.dialect in found:
+            refusals.append(
+                f"{file.name}: a second {_kind(file.dialect)} file of recording {number.group(1)} beside "
+                f"{found[file.dialect].name}, which was taken. Expected one; remove one of the two."
+            )
+            continue
+        found[file.dialect] = file
+    return list(gathered.items()), refusals
+
+
+def _is_named_as_shipped(file: RawFile) -> bool:
+    return PurePosixPath(file.filename).stem.endswith(_kind(file.dialect))
 
 
 def _kind(dialect: str) -> str:
@@ -102,11 +125,7 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             "Two recordings' files are mixed; restore the originals."
         )
     entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
-    if again.height < tracks.frame.height:
-        entries = entries.sort("id", "frame", LINE)
-    conflicting = (pl.col("id") == pl.col("id").shift(1)) & (pl.col("frame") == pl.col("frame").shift(1))
-    entries = entries.with_columns(conflicting.fill_null(value=False).alias("conflicts"))
-    conflicts, entries = entries.filter("conflicts"), entries.filter(~pl.col("conflicts"))
+    entries, conflicts = _split_conflicts(entries)
     if entries.is_empty():
         raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
     known, known_again = _unique_vehicles(vehicles.frame, vehicles_file)
@@ -118,15 +137,38 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
     log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
-    subsets = [_to_subset(entries, known, direction, recording, meta, meta_file, files) for direction in CARRIAGEWAYS]
+    direction_of_entry = _directions(entries, known)
+    subsets = [
+        _to_subset(entries.filter(direction_of_entry == direction), known, direction, recording, meta, meta_file, files)
+        for direction in CARRIAGEWAYS
+    ]
     found = tuple(subset for subset in subsets if subset is not None)
-    return Canonical(found, log, rejects, tuple(_remark(found, meta)))
+    whole = compare("highd", recording, found, _announced(meta, known), log.filter(pl.col("dialect") == TRACKS))
+    return Canonical(found, log, rejects, whole.table, whole.notes)
+
+
+def _split_conflicts(entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The first row of every vehicle and frame in the order of lines, and the others, which contradict it."""
+    conflicting = entries.select(
+        ((pl.col("id") == pl.col("id").shift(1)) & (pl.col("frame") == pl.col("frame").shift(1))).fill_null(value=False)
+    ).to_series()
+    if not conflicting.any():
+        return entries, entries.clear()
+    entries = entries.sort("id", "frame", LINE)
+    return entries.filter(~conflicting), entries.filter(conflicting)
+
+
+def _directions(entries: pl.DataFrame, vehicles: pl.DataFrame) -> pl.Series:
+    """The driving direction of every entry; entries are sorted by id."""
+    runs = entries["id"].rle().struct.unnest()
+    directions = runs.join(vehicles, left_on="value", right_on="id", how="left", maintain_order="left")
+    return pl.Series(np.repeat(directions["drivingDirection"].to_numpy(), runs["len"].to_numpy()))
 
 
 def _read(file: RawFile) -> Chunk:
     raw = RAW[file.dialect]
     layout = _layout(file.dialect, raw)
-    chunks = list(read_chunks(file.path, layout))
+    chunks = list(read_chunks(file, layout))
     if not chunks:
         raise SourceError(
             f"{file.name}: empty. Expected the header {','.join(layout.names[:4])}, ... and rows under it."
@@ -141,7 +183,7 @@ def _layout(dialect: str, raw: Table) -> Layout:
     return Layout(
         names=FIELDS[dialect],
         dtypes={name: raw.dtypes[name] for name in wanted},
-        required=frozenset(wanted),
+        required=raw.required & set(wanted),
         bounds={name: limits for name, limits in raw.bounds.items() if name != LINE},
         choices={"class": ("car", "truck")} if dialect == VEHICLES else {},
     )
@@ -203,10 +245,9 @@ def _to_subset(
     meta_file: RawFile,
     files: Sequence[RawFile],
 ) -> Subset | None:
-    mine = vehicles.filter(pl.col("drivingDirection") == direction)
-    entries = entries.join(mine.select("id"), on="id", how="semi", maintain_order="left")
     if entries.is_empty():
         return None
+    mine = vehicles.filter(pl.col("drivingDirection") == direction)
     upper_m = _markings(meta["upperLaneMarkings"], meta_file)
     lower_m = _markings(meta["lowerLaneMarkings"], meta_file)
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
@@ -256,14 +297,16 @@ def _to_subset(
     )
 
 
-def _remark(subsets: Sequence[Subset], meta: dict[str, Any]) -> list[str]:
-    found = sum(subset.vehicles.height for subset in subsets)
-    notes = []
-    if found != meta["numVehicles"]:
-        notes.append(
-            f"{meta['id']:02d}: recordingMeta announces {meta['numVehicles']} vehicles, the tracks have {found}"
-        )
-    return notes
+def _announced(meta: dict[str, Any], vehicles: pl.DataFrame) -> Announced:
+    """What recordingMeta and tracksMeta say that the tracks hold."""
+    return Announced(
+        totals={"vehicles": meta["numVehicles"], "cars": meta["numCars"], "trucks": meta["numTrucks"]},
+        totals_by=RECORDING_META,
+        vehicles=vehicles.select(
+            source_vehicle_id="id", entries_announced="numFrames", first_frame="initialFrame", last_frame="finalFrame"
+        ),
+        vehicles_by=TRACKS_META,
+    )
 
 
 HIGHD = Source(

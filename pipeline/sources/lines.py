@@ -5,14 +5,31 @@ all of its lines is the chunk (not the file) looked at line by line.
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import TypeVar
 
-import numpy as np
 import polars as pl
 
-from pipeline.sources.raw_files import BOM, CHUNK_BYTES, LINE, open_raw, split_lines, squeeze_blanks, whole_lines
+from pipeline.sources.base import RawFile
+from pipeline.sources.quotes import are_paired, unquote_thousands
+from pipeline.sources.raw_files import (
+    BOM,
+    CHUNK_BYTES,
+    LINE,
+    count_byte,
+    count_lines,
+    open_raw,
+    separate_fields,
+    split_lines,
+    squeeze_blanks,
+    whole_lines,
+)
+
+Result = TypeVar("Result")
 
 REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
 THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
@@ -70,41 +87,62 @@ class Chunk:
     rows_read: int
 
 
-def read_chunks(path: Path, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Chunk]:
-    """Read a file chunk by chunk.
+def read_chunks(file: RawFile, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Chunk]:
+    """Read a file chunk by chunk; see `map_chunks`."""
+    return map_chunks(file, layout, lambda _number, chunk: chunk, threads=1, chunk_bytes=chunk_bytes)
+
+
+def map_chunks(
+    file: RawFile,
+    layout: Layout,
+    work: Callable[[int, Chunk], Result],
+    *,
+    threads: int,
+    chunk_bytes: int = CHUNK_BYTES,
+) -> Iterator[Result]:
+    """Read a file chunk by chunk and do something with each; gives the results in order.
 
     Args:
-        path: the file; gzip is recognised.
+        file: the file, compressed or not.
         layout: how to read its lines.
-        chunk_bytes: about how much to hold at once.
+        work: takes a chunk's number, from 0, and the chunk; called in the thread that parsed it.
+        threads: how many chunks are parsed and worked on at once; as many are held, and one more.
+        chunk_bytes: about how much is read at once.
 
     Raises:
         SourceError: a compressed file is damaged or cut short.
     """
-    first_line = 1
-    with open_raw(path) as handle:
-        for data in whole_lines(handle, chunk_bytes, path):
-            lines = data.count(b"\n") + (not data.endswith(b"\n"))
-            skip = layout.header_lines if first_line == 1 else 0
-            yield parse(data, layout, first_line=first_line, skip=skip)
-            first_line += lines
+    line = 1
+    numbers = count()
+    ahead: deque[Future[Result]] = deque()
+
+    def parse_and_work(number: int, data: bytes, first_line: int) -> Result:
+        return work(number, parse(data, layout, first_line=first_line))
+
+    with open_raw(file) as handle, ThreadPoolExecutor(threads) as pool:
+        for data in whole_lines(handle, chunk_bytes, file, heading_lines=layout.header_lines):
+            if line > layout.header_lines:
+                ahead.append(pool.submit(parse_and_work, next(numbers), data, line))
+            line += count_lines(data)
+            if len(ahead) > threads:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    if line == layout.header_lines + 1 > 1:
+        yield parse_and_work(0, b"", line)  # a header and nothing under it is not an empty file
 
 
-def parse(data: bytes, layout: Layout, *, first_line: int = 1, skip: int = 0) -> Chunk:
+def parse(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:
     """Parse whole lines.
 
     Args:
         data: the lines; the last may lack its newline.
         layout: how to read them.
         first_line: number of the first of them in its file.
-        skip: header lines at the start, neither kept nor counted.
     """
     if first_line == 1:
         data = data.removeprefix(BOM)
-    for _ in range(skip):
-        data = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
-    first_line += skip
-    rows_read = data.count(b"\n") + (bool(data) and not data.endswith(b"\n"))
+    rows_read = count_lines(data)
     kept = _parse_strictly(data, layout, rows_read, first_line)
     if kept is not None:
         return Chunk(kept, pl.DataFrame(schema=REJECT_SCHEMA), rows_read)
@@ -114,66 +152,50 @@ def parse(data: bytes, layout: Layout, *, first_line: int = 1, skip: int = 0) ->
 def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int) -> pl.DataFrame | None:
     """All lines typed at once, or None where a single one cannot be accounted for."""
     # A byte order mark inside a file comes from joining files; the CSV reader would take it only at a chunk's start.
-    if b"\0" in data or BOM in data:
+    if b"\0" in data or (BOM[:1] in data and BOM in data):
         return None
     if not rows_read:
         return pl.DataFrame(schema={LINE: pl.Int64(), **layout.dtypes})
     if layout.blanks:
-        data = squeeze_blanks(data)
-    elif not _is_well_quoted(data):
-        return None
-    typed = {
-        name: pl.String() if name in layout.thousands else layout.dtypes.get(name, pl.String()) for name in layout.names
-    }
+        if b"," in data or b'"' in data:
+            return None
+        data, layout = separate_fields(data), replace(layout, blanks=False)
+    elif b'"' in data:
+        if not are_paired(data):
+            return None
+        data = unquote_thousands(data) if layout.thousands else data
     try:
-        frame = _scan(data, layout, typed, first_line=first_line)
+        frame = _scan(data, layout, layout.dtypes, first_line=first_line)
     except (pl.exceptions.ComputeError, pl.exceptions.NoDataError, pl.exceptions.SchemaError):
         return None
-    # Where a line has too few fields its last one is missing; one with too many has failed the scan.
+    # Where a line has too few fields its last one is missing; if then the separators come to the right number, no
+    # line has too many either, which the reader, looking no further than what it was asked for, would not notice.
     if frame.height != rows_read or frame[layout.names[-1]].null_count():
         return None
-    separated = sorted(layout.thousands & layout.dtypes.keys())
-    if not all(frame[name].str.contains(THOUSANDS).all() for name in separated):
-        return None
-    empty = frame.select(pl.col(separated).null_count())
-    frame = frame.with_columns(
-        pl.col(LINE).cast(pl.Int64),
-        *(
-            pl.col(name).str.replace_all(",", "", literal=True).cast(layout.dtypes[name], strict=False)
-            for name in separated
-        ),
-    )
-    # A number that its dtype cannot hold has become null.
-    if not frame.select(pl.col(separated).null_count()).equals(empty):
-        return None
-    return frame.select(LINE, *layout.dtypes) if frame.select(~_is_bad(layout).any()).item() else None
+    surplus = count_byte(data, layout.separator) - rows_read * (len(layout.names) - 1)
+    if surplus:
+        texts = [name for name in layout.names if not layout.dtypes.get(name, pl.String()).is_numeric()]
+        if b'"' not in data or surplus != _count_separators(_scan_text(data, layout, texts), layout):
+            return None
+    frame = frame.select(pl.col(LINE).cast(pl.Int64), *layout.dtypes)
+    return frame if frame.select(_is_sound(layout)).item() else None
 
 
-def _is_well_quoted(data: bytes) -> bool:
-    """Whether quotes surround whole fields; elsewhere the CSV reader and the one for single lines might disagree."""
-    if b'"' not in data:
-        return True
-    text = np.frombuffer(data, np.uint8)
-    quotes = np.flatnonzero(text == ord('"'))
-    if quotes.size % 2:
-        return False
-    opening, closing = quotes[0::2], quotes[1::2]
-    before = text[opening[opening > 0] - 1]
-    after = text[closing[closing + 1 < text.size] + 1]
-    if not (np.isin(before, (10, 44)).all() and np.isin(after, (10, 13, 44)).all()):
-        return False
-    return data.count(b'"\r') == data.count(b'"\r\n')
+def _count_separators(fields: pl.DataFrame, layout: Layout) -> int:
+    """Separators inside quoted fields."""
+    counts = fields.select(pl.all().str.count_matches(layout.separator, literal=True).sum())
+    return int(counts.sum_horizontal().sum())
 
 
-def _is_bad(layout: Layout) -> pl.Expr:
-    """True for typed rows with a value that may not be: empty, not finite or not among those allowed."""
-    bad = [pl.col(name).is_null() for name in sorted(layout.required)]
-    bad += [
-        ~pl.col(name).is_finite().fill_null(value=True) for name, dtype in layout.dtypes.items() if dtype.is_float()
-    ]
-    bad += [_outside(name, low, high) for name, (low, high) in layout.bounds.items()]
-    bad += [_not_among(name, allowed) for name, allowed in layout.choices.items()]
-    return pl.any_horizontal(bad)
+def _is_sound(layout: Layout) -> pl.Expr:
+    """True for typed rows without a value that may not be: empty, not finite or not among those allowed."""
+    sound = [pl.col(name).null_count() == 0 for name in sorted(layout.required)]
+    sound += [pl.col(name).is_finite().all() for name, dtype in layout.dtypes.items() if dtype.is_float()]
+    for name, (low, high) in layout.bounds.items():
+        sound += [] if low is None else [pl.col(name).min().fill_null(low) >= low]
+        sound += [] if high is None else [pl.col(name).max().fill_null(high) <= high]
+    sound += [~_not_among(pl.col(name).unique(), allowed).any() for name, allowed in layout.choices.items()]
+    return pl.all_horizontal(sound)
 
 
 def _outside(name: str, low: float | None, high: float | None) -> pl.Expr:
@@ -182,8 +204,8 @@ def _outside(name: str, low: float | None, high: float | None) -> pl.Expr:
     return (below | above).fill_null(value=False)
 
 
-def _not_among(name: str, allowed: tuple[str, ...]) -> pl.Expr:
-    return ~pl.col(name).str.to_lowercase().is_in(list(allowed)).fill_null(value=True)
+def _not_among(values: pl.Expr, allowed: tuple[str, ...]) -> pl.Expr:
+    return ~values.str.to_lowercase().is_in(list(allowed)).fill_null(value=True)
 
 
 def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line: int) -> Chunk:
@@ -241,7 +263,7 @@ def _complaints(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
     complaints += [_say(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
     complaints += [_say(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
     complaints += [
-        _say(_not_among(name, allowed), f"unknown value: {name}") for name, allowed in layout.choices.items()
+        _say(_not_among(pl.col(name), allowed), f"unknown value: {name}") for name, allowed in layout.choices.items()
     ]
     return complaints
 
@@ -280,19 +302,26 @@ def _split_fields(text: pl.Series, layout: Layout) -> pl.DataFrame:
         return pl.DataFrame(schema=dict.fromkeys(layout.dtypes, pl.String()))
     data = "\n".join(text.to_list()).encode()
     data = squeeze_blanks(data) if layout.blanks else data
-    fields = _scan(data, layout, dict.fromkeys(layout.names, pl.String()), first_line=1).select(*layout.dtypes)
-    return fields.with_columns(pl.all().str.strip_chars().replace("", None))
+    return _scan_text(data, layout, [*layout.dtypes]).with_columns(pl.all().str.strip_chars().replace("", None))
+
+
+def _scan_text(data: bytes, layout: Layout, names: Sequence[str]) -> pl.DataFrame:
+    return _scan(data, layout, dict.fromkeys(names, pl.String()), first_line=1).select(*names)
 
 
 def _scan(data: bytes, layout: Layout, dtypes: Mapping[str, pl.DataType], *, first_line: int) -> pl.DataFrame:
-    # All fields, wanted or not: the reader looks no further than the last one asked for, so that a field too many in
-    # the middle of a line would shift the others unnoticed.
-    return pl.scan_csv(
-        data,
-        has_header=False,
-        separator=layout.separator,
-        quote_char=None if layout.blanks else '"',
-        schema=dtypes,
-        row_index_name=LINE,
-        row_index_offset=first_line,
-    ).collect()
+    """The fields of `dtypes`, the line's last one, and its number."""
+    wanted = list(dict.fromkeys((*dtypes, layout.names[-1])))
+    return (
+        pl.scan_csv(
+            data,
+            has_header=False,
+            separator=layout.separator,
+            quote_char=None if layout.blanks else '"',
+            schema={name: dtypes.get(name, pl.String()) for name in layout.names},
+            row_index_name=LINE,
+            row_index_offset=first_line,
+        )
+        .select(LINE, *wanted)
+        .collect()
+    )

@@ -1,7 +1,7 @@
 """NGSIM: the US DOT's trajectories of two freeways and two arterials, 10 Hz, in feet."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,15 @@ import polars as pl
 from pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, Spilled, Subset, Unit
-from pipeline.sources.lines import REJECT_SCHEMA, read_chunks
-from pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording
-from pipeline.sources.raw_files import read_head
+from pipeline.sources.completeness import Announced, compare
+from pipeline.sources.derived import IN_FULLER_FILE, split_derived
+from pipeline.sources.lines import REJECT_SCHEMA, Chunk, map_chunks
+from pipeline.sources.ngsim_dialects import PUBLISHED_TOTALS, SITES, Site, detect, layout_of, name_recording, site_of
+from pipeline.sources.raw_files import LINE, read_head
 from pipeline.transforms.identities import identify_vehicles
 from pipeline.transforms.orientation import DIRECTIONS, orient_ngsim
 from schemas.columns import FOOT_M
+from schemas.completeness import PUBLISHED, TOTAL_FRAMES
 from schemas.raw_ngsim import RAW_NGSIM
 
 FRAME_RATE_HZ = 10.0
@@ -26,6 +29,9 @@ DECIMALS = 6
 
 CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
 """The same in all rows of one vehicle, so that they tell apart vehicles that share an id."""
+
+PARSING_THREADS = 3
+"""Chunks of one file worked on at once: more help little, as the parser has threads of its own, and cost memory."""
 
 FED_BY = {
     "Lane_ID": ("lane",),
@@ -50,30 +56,43 @@ def spill(file: RawFile, folder: Path) -> Spilled:
 
     Args:
         file: any NGSIM dialect.
-        folder: receives `<recording>/<chunk>.parquet` with the columns of schemas.RAW_NGSIM.
+        folder: receives `<recording>/<chunk>.arrow` with the columns of schemas.RAW_NGSIM, less Location.
     """
-    layout = layout_of(read_head(file.path), file.dialect, where=file.name)
-    counts: Counter[str] = Counter()
-    rejects, rows_read = [pl.DataFrame(schema=REJECT_SCHEMA)], 0
-    for number, chunk in enumerate(read_chunks(file.path, layout)):
-        rows_read += chunk.rows_read
-        rejects.append(chunk.rejects)
-        absent = [
-            pl.lit(None, dtype).alias(name) for name, dtype in RAW_NGSIM.dtypes.items() if name not in chunk.frame
-        ]
+    layout = layout_of(read_head(file), file.dialect, where=file.name)
+    absent = [
+        pl.lit(None, dtype).alias(name)
+        for name, dtype in RAW_NGSIM.dtypes.items()
+        if name not in (LINE, *layout.dtypes)
+    ]
+
+    def spill_chunk(number: int, chunk: Chunk) -> tuple[Counter[str], pl.DataFrame, int]:
+        counts: Counter[str] = Counter()
         raw = RAW_NGSIM.validate(chunk.frame.with_columns(absent).select(*RAW_NGSIM.dtypes), where=file.name)
-        raw = raw.with_columns(
-            pl.col(pl.Float64).round(DECIMALS),
-            pl.col("Location").str.to_lowercase(),
-            key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64),
-        )
-        for share, ((key, location), rows) in enumerate(raw.partition_by("key", "Location", as_dict=True).items()):
-            recording, _ = name_recording(int(key), None if location is None else str(location))
+        for share, (recording, rows) in enumerate(
+            _part_recordings(raw.with_columns(pl.col(pl.Float64).round(DECIMALS)))
+        ):
             counts[recording] += rows.height
             target = folder / recording
             target.mkdir(parents=True, exist_ok=True)
-            rows.drop("key").write_parquet(target / f"{number:06d}-{share:06d}.parquet", compression="lz4")
-    return Spilled(dict(counts), rows_read, pl.concat(rejects))
+            # Plain Arrow costs a quarter of the time of compressed Parquet, and lives no longer than the run.
+            rows.write_ipc(target / f"{number:06d}-{share:06d}.arrow", compression="uncompressed")
+        return counts, chunk.rejects, chunk.rows_read
+
+    spilled = list(map_chunks(file, layout, spill_chunk, threads=PARSING_THREADS))
+    recordings = sum((counts for counts, _, _ in spilled), Counter())
+    rejects = pl.concat([pl.DataFrame(schema=REJECT_SCHEMA), *(rejects for _, rejects, _ in spilled)])
+    return Spilled(dict(recordings), sum(rows_read for _, _, rows_read in spilled), rejects)
+
+
+def _part_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
+    """(recording, its rows); once more for another spelling of the site.
+
+    Not every dialect says the site; the recording's name does, so that rows which differ only in that are repetitions.
+    """
+    rows = rows.with_columns(key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64))
+    for part in rows.partition_by("key", "Location"):
+        key, location = part.head(1).select("key", pl.col("Location").str.to_lowercase()).row(0)
+        yield name_recording(key, location), part.drop("key", "Location")
 
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
@@ -89,14 +108,11 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         if part.rows is not None
     ]
     raw = pl.concat(shares)
-    location: str | None = raw.select(pl.col("Location").drop_nulls().first()).item()
-    # Not every dialect says where it is from; the recording does, so rows that differ only in that are repetitions.
-    raw = raw.drop("Location")
+    raw, derived = split_derived(raw, shares, ["Vehicle_ID", "Frame_ID", "Local_X", "Local_Y"])
     rows, duplicates = split_duplicates(raw, ["Vehicle_ID", "Frame_ID"])
-    log, rejects = account("ngsim", recording, parts, [share.height for share in shares], [(duplicates, DUPLICATE)])
-    first = rows.row(0, named=True)
-    key = first["Global_Time"] - 100 * first["Frame_ID"]
-    _, site_name = name_recording(key, location)
+    dropped = [(derived, IN_FULLER_FILE), (duplicates, DUPLICATE)]
+    log, rejects = account("ngsim", recording, parts, [share.height for share in shares], dropped)
+    site_name = site_of(recording)
     one_direction = rows["Direction"].is_null().all()
     site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", None, (), "")
     first_frame, last_frame = rows.select(first=pl.col("Frame_ID").min(), last=pl.col("Frame_ID").max()).row(0)
@@ -123,7 +139,10 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             facts = {**recording_facts, "direction": direction}
             oriented_as = code if code in DIRECTIONS else None
             subsets.append(_to_subset(entries, f"{recording}-{direction}", oriented_as, facts, files))
-    return Canonical(tuple(subsets), log, rejects, tuple(_remark(subsets)))
+    totals = PUBLISHED_TOTALS.get(recording, {})
+    announced = Announced(totals, totals_by=PUBLISHED, vehicles=None, vehicles_by=TOTAL_FRAMES)
+    whole = compare("ngsim", recording, subsets, announced, log)
+    return Canonical(tuple(subsets), log, rejects, whole.table, (*_remark(subsets), *whole.notes))
 
 
 def _to_subset(
@@ -143,15 +162,21 @@ def _to_subset(
         follower_source_id="Following",
         headway_recorded_m=pl.col("Space_Headway") * FOOT_M,
     )
-    identified = identify_vehicles(entries, constants=CONSTANTS)
+    identified = identify_vehicles(
+        entries,
+        constants=CONSTANTS,
+        frame_rate_hz=FRAME_RATE_HZ,
+        announced="Total_Frames",
+        one_way=facts["freeway"],
+    )
     has_leader = pl.col("leader_id").is_not_null() if "leader_id" not in missing else pl.col("headway_recorded_m") != 0
     entries = identified.entries.with_columns(headway_recorded_m=pl.when(has_leader).then(pl.col("headway_recorded_m")))
     sizes = entries.group_by("vehicle_id").agg(
         source_vehicle_id=pl.col("source_id").first(),
-        entries_announced=pl.col("Total_Frames").first(),
-        length_m=pl.col("v_length").first() * FOOT_M,
-        width_m=pl.col("v_Width").first() * FOOT_M,
-        **{"class": pl.col("v_Class").first().replace_strict(CLASSES, return_dtype=pl.String)},
+        entries_announced=pl.col("Total_Frames").first(ignore_nulls=True),
+        length_m=pl.col("v_length").first(ignore_nulls=True) * FOOT_M,
+        width_m=pl.col("v_Width").first(ignore_nulls=True) * FOOT_M,
+        **{"class": pl.col("v_Class").first(ignore_nulls=True).replace_strict(CLASSES, return_dtype=pl.String)},
     )
     return assemble_subset(
         entries.drop(*CONSTANTS, "source_id", "leader_source_id", "follower_source_id"),

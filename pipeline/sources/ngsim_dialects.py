@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from zoneinfo import ZoneInfo
 
 from pipeline.sources.base import SourceError
@@ -44,7 +45,6 @@ ALIASES = {
 }
 """Every name a header has used, in lower case, and what the raw schema calls it."""
 
-THOUSANDS = frozenset({"Total_Frames", "Preceding", "Following", "Space_Headway", "Time_Headway"})
 LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
 ESSENTIAL = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel")
 TEXT, CSV = "ngsim-text", "ngsim-csv"
@@ -98,28 +98,44 @@ Peachtree's clock counts seconds since 1970 (shifted by a time zone) yet advance
 apart, the 3 h 15 min between its two periods.
 """
 
+PUBLISHED_TOTALS: dict[str, dict[str, int]] = {
+    "i-80-1600": {"vehicles": 2_052, "entries": 1_262_678},
+    "i-80-1700": {"vehicles": 1_836, "entries": 1_549_918},
+    "i-80-1715": {"vehicles": 1_790, "entries": 1_753_791},
+    "us-101-0750": {"vehicles": 2_169, "entries": 1_180_598},
+    "us-101-0805": {"vehicles": 2_017, "entries": 1_403_095},
+    "us-101-0820": {"vehicles": 1_915, "entries": 1_515_240},
+}
+"""Vehicles (ids) and rows of the freeway recordings as published; together 11,779 and 8,665,320."""
+
+UNKNOWN = "unknown"
 _LOCAL = ZoneInfo("America/Los_Angeles")
 
 
-def name_recording(key: int, location: str | None) -> tuple[str, str]:
-    """(recording, site) of a Global_Time - 100 * Frame_ID.
+@cache
+def name_recording(key: int, location: str | None) -> str:
+    """The recording of a Global_Time - 100 * Frame_ID; its name begins with its site's.
 
     Unknown keys are a recording of their own, named by site, local date and local time of frame 1. Where the file does
     not say the site, it is the one that was recorded on that day, else `unknown`.
     """
     if key in RECORDINGS:
-        recording = RECORDINGS[key]
-        return recording, recording.rpartition("-")[0]
+        return RECORDINGS[key]
     start_ms = key + 100
     try:
         start = datetime.fromtimestamp(start_ms / 1000, tz=UTC).astimezone(_LOCAL)
     except (OverflowError, ValueError, OSError):
-        return f"{location or 'unknown'}-{key}", location or "unknown"
+        return f"{location or UNKNOWN}-{key}"
     by_day = {site.day: site.name for site in SITES.values()}
-    site = location or by_day.get(f"{start:%Y-%m-%d}", "unknown")
+    site = location or by_day.get(f"{start:%Y-%m-%d}", UNKNOWN)
     rest = f"-{start_ms % 1000:03d}" if start_ms % 1000 else ""
     again = "-again" if start.fold else ""  # the hour that summer time's end repeats
-    return f"{site}-{start:%Y%m%d-%H%M%S}{rest}{again}", site
+    return f"{site}-{start:%Y%m%d-%H%M%S}{rest}{again}"
+
+
+def site_of(recording: str) -> str:
+    """The site that a recording's name begins with."""
+    return next((site for site in SITES if recording.startswith(f"{site}-")), UNKNOWN)
 
 
 def detect(head: bytes, _name: str) -> str | None:
@@ -165,7 +181,8 @@ def layout_of(head: bytes, dialect: str, *, where: str) -> Layout:
         names=names,
         dtypes={name: RAW_NGSIM.dtypes[name] for name in wanted},
         required=required,
-        thousands=THOUSANDS & set(names) if dialect == CSV else frozenset(),
+        # The portal's export has them in five columns; no number is refused for having them in another.
+        thousands=frozenset(name for name in wanted if dialect == CSV and RAW_NGSIM.dtypes[name].is_numeric()),
         bounds={name: limits for name, limits in RAW_NGSIM.bounds.items() if name in wanted},
         choices={"Location": LOCATIONS} if "Location" in names else {},
         header_lines=1 if dialect == CSV else 0,

@@ -1,70 +1,171 @@
 """Raw files as bytes and lines: compressed or not, chunks of whole lines, the text of single lines."""
 
 import gzip
+import hashlib
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import ExitStack, contextmanager
+from io import BufferedReader
 from typing import BinaryIO, cast
+from zipfile import BadZipFile
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from pipeline.sources.base import SourceError
+from pipeline.sources.archives import open_member
+from pipeline.sources.base import RawFile, SourceError
 
-CHUNK_BYTES = 32 << 20
+CHUNK_BYTES = 12 << 20
+HASH_BYTES = 1 << 20
+CACHED_BYTES = 1 << 19
+"""Byte-wise work done in blocks that stay in a core's cache takes half the time."""
 LINE = "line"
 BOM = b"\xef\xbb\xbf"
+GZIP = b"\x1f\x8b"
 
 
-def open_raw(path: Path) -> BinaryIO:
-    """Open a raw file for reading bytes; a gzip file is read without unpacking it to disk."""
-    with path.open("rb") as probe:
-        magic = probe.read(2)
-    # A GzipFile reads as a binary file, though it is not declared as one.
-    return cast("BinaryIO", gzip.open(path, "rb")) if magic == b"\x1f\x8b" else path.open("rb")
+def _open_packed(file: RawFile) -> BufferedReader:
+    return file.path.open("rb") if file.member is None else open_member(file)
 
 
-def _read_block(handle: BinaryIO, size: int, path: Path) -> bytes:
+@contextmanager
+def open_raw(file: RawFile) -> Iterator[BinaryIO]:
+    """Open a raw file for reading bytes; what is compressed is read without unpacking it to disk.
+
+    Raises:
+        SourceError: a zip archive is damaged, or its member cannot be read.
+    """
+    with ExitStack() as stack:
+        handle = stack.enter_context(_open_packed(file))
+        with _explain_damage(file):
+            is_gzip = handle.peek(len(GZIP)).startswith(GZIP)
+        # A GzipFile reads as a binary file, though it is not declared as one.
+        yield stack.enter_context(cast("BinaryIO", gzip.GzipFile(fileobj=handle))) if is_gzip else handle
+
+
+def hash_raw(file: RawFile) -> str:
+    """The sha256 of a file's bytes: those of a gzip file as it is, those of an archive's member unpacked.
+
+    Raises:
+        SourceError: a zip archive is damaged, or its member cannot be read.
+    """
+    digest = hashlib.sha256()
+    with _open_packed(file) as handle:
+        while block := _read_block(handle, HASH_BYTES, file):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+@contextmanager
+def _explain_damage(file: RawFile) -> Iterator[None]:
     try:
-        return handle.read(size)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as damage:
+        yield
+    except (EOFError, gzip.BadGzipFile, BadZipFile, zlib.error) as damage:
+        kind = "gzip file" if file.member is None else "zip archive"
         raise SourceError(
-            f"{path.name}: the compressed file is damaged or cut short ({damage}). Expected a whole gzip file. "
+            f"{file.name}: the compressed file is damaged or cut short ({damage}). Expected a whole {kind}. "
             "Download it again."
         ) from None
 
 
-def whole_lines(handle: BinaryIO, chunk_bytes: int, path: Path) -> Iterator[bytes]:
+def _read_block(handle: BinaryIO, size: int, file: RawFile) -> bytes:
+    with _explain_damage(file):
+        return handle.read(size)
+
+
+def whole_lines(handle: BinaryIO, chunk_bytes: int, file: RawFile, *, heading_lines: int = 0) -> Iterator[bytes]:
     """The bytes of an open file in chunks that end with a line (the last one perhaps without its newline).
+
+    Args:
+        handle: the open file.
+        chunk_bytes: about the size of a chunk.
+        file: for messages.
+        heading_lines: at the file's start, each given as a chunk of its own.
 
     Raises:
         SourceError: a compressed file is damaged or cut short.
     """
-    rest = b""
-    while block := _read_block(handle, chunk_bytes, path):
-        cut = block.rfind(b"\n") + 1
-        if cut == 0:
-            rest += block
-            continue
-        yield rest + block[:cut]
-        rest = block[cut:]
-    if rest:
-        yield rest
+    with _explain_damage(file):
+        for _ in range(heading_lines):
+            if line := handle.readline():
+                yield line
+        while block := handle.read(chunk_bytes):
+            yield block if block.endswith(b"\n") else block + handle.readline()
+
+
+def count_lines(data: bytes) -> int:
+    """Lines, the last of which may lack its newline."""
+    return count_byte(data, "\n") + (bool(data) and not data.endswith(b"\n"))
+
+
+def count_byte(data: bytes, character: str) -> int:
+    """How often an ASCII character occurs; four times as fast as bytes.count where that is often."""
+    text = np.frombuffer(data, np.uint8)
+    blocks = (text[start : start + CACHED_BYTES] for start in range(0, text.size, CACHED_BYTES))
+    return sum(int(np.count_nonzero(block == ord(character))) for block in blocks)
+
+
+def separate_fields(data: bytes) -> bytes:
+    """Fields between runs of blanks as fields between commas, for data without commas.
+
+    Numbers may keep blanks before them, which the CSV reader passes over, so that nothing has to be moved: the first
+    blank after a field becomes a comma. Where that is a line's end, line feed and blank change places.
+    """
+    blocks = [_separate(block) for block in cut_at_lines(data)]
+    if blocks:
+        blocks[-1] = blocks[-1].removesuffix(b" ")
+    return b"".join(blocks)
+
+
+def _separate(lines: bytes) -> bytes:
+    text = np.frombuffer(lines, np.uint8)
+    ends = np.flatnonzero(text == 10)
+    first = text[1:] == 32
+    first &= text[:-1] > 32
+    marked = text.copy()
+    marked[1:] += first.view(np.uint8) * np.uint8(ord(",") - 32)
+    last = marked[ends - 1] if ends.size and ends[0] else np.zeros(1, np.uint8)
+    if not lines.endswith(b"\n") or b"\t" in lines or b"\r" in lines or (last <= 32).any():
+        return squeeze_blanks(lines).replace(b" ", b",")
+    trailing = ends[last == ord(",")]
+    marked[trailing - 1], marked[trailing] = 10, 32
+    return marked.tobytes()
 
 
 def squeeze_blanks(data: bytes) -> bytes:
     """Runs of blanks, tabs and carriage returns to one blank; none at the start or the end of a line."""
+    return b"".join(_squeeze(block) for block in cut_at_lines(data))
+
+
+def cut_at_lines(data: bytes, size: int = CACHED_BYTES) -> Iterator[bytes]:
+    """Blocks of whole lines of about a size: byte-wise work in them stays in a core's cache."""
+    start = 0
+    while start < len(data):
+        end = data.rfind(b"\n", start, start + size) + 1 or data.find(b"\n", start + size) + 1 or len(data)
+        yield data[start:end]
+        start = end
+
+
+def _squeeze(data: bytes) -> bytes:
     text = np.frombuffer(data, np.uint8)
-    blank = (text == 32) | (text == 9) | (text == 13)
-    last_of_run = np.empty_like(blank)
-    last_of_run[:-1] = ~blank[1:] & (text[1:] != 10)
-    last_of_run[-1:] = False
-    text = np.where(blank, np.uint8(32), text)[~blank | last_of_run]
-    leading = text == 32
-    leading[1:] &= text[:-1] == 10
-    squeezed: bytes = text[~leading].tobytes()
-    return squeezed
+    blank = text == 32
+    if b"\t" in data or b"\r" in data:
+        blank |= (text == 9) | (text == 13)
+        text = np.where(blank, np.uint8(32), text)
+    # Of a run the last one stays, and that only before something solid.
+    kept = ~blank
+    kept[:-1] |= ~(blank | (text == 10))[1:]
+    # Polars filters bytes ten times as fast as NumPy.
+    squeezed = pl.Series(text).filter(pl.Series(kept)).to_numpy()
+    starts = np.concatenate([[0], np.flatnonzero(squeezed == 10) + 1])
+    leading = starts[starts < squeezed.size]
+    leading = leading[squeezed[leading] == 32]
+    if leading.size:
+        kept = np.ones(squeezed.size, dtype=bool)
+        kept[leading] = False
+        squeezed = pl.Series(squeezed).filter(pl.Series(kept)).to_numpy()
+    return bytes(squeezed.tobytes())
 
 
 def split_lines(data: bytes, first_line: int = 1) -> pl.DataFrame:
@@ -96,34 +197,34 @@ def split_lines(data: bytes, first_line: int = 1) -> pl.DataFrame:
     )
 
 
-def fetch_lines(path: Path, numbers: pl.Series) -> pl.DataFrame:
+def fetch_lines(file: RawFile, numbers: pl.Series) -> pl.DataFrame:
     """The text of some lines of a file: `line`, `text`.
 
     Args:
-        path: the file.
+        file: the file.
         numbers: line numbers from 1.
     """
     wanted = pl.DataFrame({LINE: numbers.cast(pl.Int64)}).unique()
     found = []
     first_line = 1
-    with open_raw(path) as handle:
-        for data in whole_lines(handle, CHUNK_BYTES, path):
+    with open_raw(file) as handle:
+        for data in whole_lines(handle, CHUNK_BYTES, file):
             lines = split_lines(data.removeprefix(BOM) if first_line == 1 else data, first_line)
             found.append(lines.join(wanted, on=LINE, how="semi").select(LINE, "text"))
             first_line += lines.height
     return pl.concat(found) if found else pl.DataFrame(schema={LINE: pl.Int64(), "text": pl.String()})
 
 
-def read_head(path: Path, size: int = 65_536) -> bytes:
+def read_head(file: RawFile, size: int = 65_536) -> bytes:
     """The first bytes of a raw file (of its content, where it is compressed; up to where that is damaged).
 
     Raises:
         SourceError: not one byte of a compressed file can be read.
     """
     head = b""
-    with open_raw(path) as handle:
+    with open_raw(file) as handle:
         try:
-            while len(head) < size and (block := _read_block(handle, 1024, path)):
+            while len(head) < size and (block := _read_block(handle, 1024, file)):
                 head += block
         except SourceError:
             if not head:

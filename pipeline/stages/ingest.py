@@ -1,7 +1,7 @@
 """Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ from pipeline.sources.accounting import count_reasons, to_rejects
 from pipeline.sources.base import Canonical, Part
 from pipeline.stages.base import Job, make_entry, make_job
 from pipeline.stages.discovery import Discovery
-from schemas import INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
+from schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
-VERSION = 1
+VERSION = 2
 SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
 _PLANNING_FACTS = ("subset", "freeway")
@@ -120,40 +120,45 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
         entry = manifest.entries.get(job.key)
         if entry is None:
             continue
-        given = [job.built_from["sources"], entry.built_from["sources"]]
-        names, hashes = ({source[part] for source in given[0]} for part in ("file", "sha256"))
-        lost = [s["file"] for s in given[1] if s["file"] not in names and s["sha256"] not in hashes]
-        if lost:
+        if lost := find_lost(job, entry):
+            names = (source["file"] for source in job.built_from["sources"])
             messages[job.key] = (
-                f"recording {job.title}: it is in the lake already, from {', '.join(lost)}, and now came from "
-                f"{', '.join(sorted(names))}. Give all its files at once (a folder), or let these replace those with "
-                "--replace."
+                f"recording {job.title}: it is in the lake already, from {', '.join(s['file'] for s in lost)}, and now "
+                f"came from {', '.join(sorted(names))}. Give all its files at once (a folder), or let these replace "
+                "those with --replace."
             )
     return messages
 
 
+def find_lost(job: Job, entry: Entry) -> list[dict[str, Any]]:
+    """The sources of a recording's entry that a job for it does not hold, neither by name nor by content."""
+    names, hashes = ({source[part] for source in job.built_from["sources"]} for part in ("file", "sha256"))
+    return [s for s in entry.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
+
+
 def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
-    return make_job(
+    sources = [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files]
+    job = make_job(
         f"ingest/{dataset}/{title}",
         version_of_stage=VERSION,
         made_of={
-            "sources": [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files],
+            "sources": sources,
             "source_version": SOURCE_BY_NAME[dataset].version,
         },
         inputs={
             "dataset": dataset,
             "recording": recording,
-            "files": [
-                {"path": str(file.path), "name": file.name, "dialect": file.dialect, "sha256": file.sha256}
-                for file in files
-            ],
+            "files": [file.to_dict() for file in files],
         },
     )
+    # Where they stand is remembered, and is no part of the fingerprint: a moved folder has the same content.
+    placed = [{**source, "path": str(file.path)} for source, file in zip(sources, files, strict=True)]
+    return replace(job, built_from={**job.built_from, "sources": placed})
 
 
 def files_of(job: Job) -> list[RawFile]:
     """The raw files of an ingest job."""
-    return [RawFile(Path(file["path"]), file["name"], file["dialect"], file["sha256"]) for file in job.inputs["files"]]
+    return [RawFile.from_dict(file) for file in job.inputs["files"]]
 
 
 def needs_spill(job: Job) -> bool:
@@ -204,7 +209,7 @@ def _spilled_part(root: Path, file: RawFile, recording: str) -> Part:
     folder = spill_folder(root, file)
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
     rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
-    return Part(file, pl.scan_parquet(folder / recording / "*.parquet"), rejects)
+    return Part(file, pl.scan_ipc(folder / recording / "*.arrow"), rejects)
 
 
 def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFile]]:
@@ -215,7 +220,11 @@ def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFil
         for table, frame in ((TRACKS, subset.tracks), (VEHICLES, subset.vehicles), (SUBSETS, subset.facts)):
             written = write_table(root, table, frame, values, job.fingerprint, where=f"recording {recording}")
             files.setdefault(table.name, []).extend(written)
-    for table, frame in ((INGEST_LOG, canonical.log), (REJECTS, canonical.rejects)):
+    for table, frame in (
+        (INGEST_LOG, canonical.log),
+        (REJECTS, canonical.rejects),
+        (COMPLETENESS, canonical.completeness),
+    ):
         files[table.name] = write_table(
             root, table, frame, {"dataset": dataset}, job.fingerprint, where=f"recording {recording}"
         )

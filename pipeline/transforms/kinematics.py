@@ -1,4 +1,4 @@
-"""Speeds and accelerations recomputed from positions, and the gap to the leader."""
+"""Speeds and accelerations recomputed from positions."""
 
 import math
 
@@ -70,27 +70,4 @@ def add_kinematics(tracks: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     return tracks.with_columns(
         _difference(x, steps=step, rate_hz=rate_hz).alias("speed_10hz_mps"),
         pl.when(_is_contiguous(double)).then(second).alias("accel_10hz_mps2"),
-    )
-
-
-def add_gaps(tracks: pl.DataFrame, vehicles: pl.DataFrame, *, use_recorded_headway: bool) -> pl.DataFrame:
-    """Add gap_m: the leader's front - the leader's length - the own front, rounded to 1 mm.
-
-    Args:
-        tracks: vehicle_id, frame, x_m, leader_id, headway_recorded_m; one subset.
-        vehicles: vehicle_id, length_m; a leader of unknown length has no gap.
-        use_recorded_headway: where the leader has no entry at that frame but a headway was recorded, take that headway
-            (front to front) - the leader's length.
-    """
-    length = pl.col("length_m").cast(pl.Float64)
-    lengths = vehicles.select(leader_id="vehicle_id", leader_length_m=length)
-    leaders = tracks.select("frame", leader_id="vehicle_id", leader_x_m="x_m")
-    headway = pl.col("leader_x_m") - pl.col("x_m")
-    if use_recorded_headway:
-        headway = pl.coalesce(headway, pl.col("headway_recorded_m").cast(pl.Float64))
-    return (
-        tracks.join(leaders, on=["frame", "leader_id"], how="left", maintain_order="left")
-        .join(lengths, on="leader_id", how="left", maintain_order="left")
-        .with_columns((headway - pl.col("leader_length_m")).round(3).alias("gap_m"))
-        .drop("leader_x_m", "leader_length_m")
     )

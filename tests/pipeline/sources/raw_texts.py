@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -89,9 +90,10 @@ def write(path, data):
 
 def raw_file(path, source=NGSIM):
     """A recognised RawFile (its sha256 is not what is tested here)."""
-    dialect = source.detect(read_head(path), path.name)
+    file = RawFile(path, path.name)
+    dialect = source.detect(read_head(file), path.name)
     assert dialect is not None, f"{path.name} is not recognised"
-    return RawFile(path, path.name, dialect, f"sha256-of-{path.name}")
+    return replace(file, dialect=dialect, sha256=f"sha256-of-{path.name}")
 
 
 def read_ngsim(folder, *paths):
@@ -105,7 +107,7 @@ def read_ngsim(folder, *paths):
         spills.append(spilled)
         for recording in spilled.recordings:
             rejects = spilled.rejects if len(spilled.recordings) == 1 else None
-            rows = pl.scan_parquet(target / recording / "*.parquet")
+            rows = pl.scan_ipc(target / recording / "*.arrow")
             parts.setdefault(recording, []).append(Part(file, rows, rejects))
     return {recording: NGSIM.to_canonical(shares, recording) for recording, shares in parts.items()}, spills
 

@@ -102,7 +102,7 @@ def test_no_damage_to_an_ngsim_file_crashes_or_loses_a_row(tmp_path_factory, nam
     assert spilled.rows_read == len(lines) == sum(spilled.recordings.values()) + spilled.rejects.height
     assert all(lines[line] == text for line, _, text in spilled.rejects.rows())
     for recording, rows in spilled.recordings.items():
-        found = pl.read_parquet(folder / "spilled" / recording / "*.parquet")
+        found = pl.scan_ipc(folder / "spilled" / recording / "*.arrow").collect()
         assert found.height == rows
         assert set(found["line"]) <= lines.keys()
     try:

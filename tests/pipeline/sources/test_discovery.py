@@ -9,14 +9,14 @@ import pytest
 from highd_files import write_recording
 from raw_texts import TEXT_NAMES, as_csv, as_text, ngsim_row, write
 
-from pipeline.sources import SourceError
+from pipeline.sources import RawFile, SourceError
 from pipeline.stages.discovery import Digests, discover
 
 ROWS = [ngsim_row(5, frame) for frame in range(1, 4)]
 
 
-def sha256(path):
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def sha256(file):
+    return hashlib.sha256(file.path.read_bytes()).hexdigest()
 
 
 def find(source, dataset=None):
@@ -133,9 +133,9 @@ def test_a_file_that_may_not_be_read_is_refused(tmp_path, monkeypatch):
     write(tmp_path / "a.csv", as_csv(ROWS))
     write(tmp_path / "b.csv", as_csv(ROWS[:2]))
 
-    def deny(path):
-        if path.name == "a.csv":
-            raise PermissionError(13, "Permission denied", str(path))
+    def deny(file):
+        if file.name == "a.csv":
+            raise PermissionError(13, "Permission denied", str(file.path))
         return as_csv(ROWS)
 
     monkeypatch.setattr("pipeline.stages.discovery.read_head", deny)
@@ -147,20 +147,21 @@ def test_a_file_that_may_not_be_read_is_refused(tmp_path, monkeypatch):
 def test_digests_are_remembered_until_the_file_changes(tmp_path):
     path = write(tmp_path / "a.csv", b"one")
     digests = Digests(tmp_path)
-    first = digests(path)
+    file = RawFile(path, "a.csv")
+    first = digests(file)
     assert first == hashlib.sha256(b"one").hexdigest()
     digests.save()
     stat = path.stat()
     path.write_bytes(b"two")
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     # Same size and time: not read again.
-    assert Digests(tmp_path)(path) == first
+    assert Digests(tmp_path)(file) == first
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
-    assert Digests(tmp_path)(path) == hashlib.sha256(b"two").hexdigest()
+    assert Digests(tmp_path)(file) == hashlib.sha256(b"two").hexdigest()
 
 
 @pytest.mark.parametrize("remembered", [b"", b"\xff\xfe", b"[]", b"{", json.dumps({"x": 1, "/y": [1]}).encode()])
 def test_a_damaged_memory_of_digests_is_forgotten(tmp_path, remembered):
     write(tmp_path / ".hashes.json", remembered)
     path = write(tmp_path / "a.csv", b"one")
-    assert Digests(tmp_path)(path) == hashlib.sha256(b"one").hexdigest()
+    assert Digests(tmp_path)(RawFile(path, "a.csv")) == hashlib.sha256(b"one").hexdigest()

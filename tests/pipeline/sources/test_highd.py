@@ -93,7 +93,7 @@ def test_lanes_count_from_the_drivers_left_over_three_and_three(tmp_path):
 def test_one_vehicle_with_one_row_is_a_recording_with_one_subset(tmp_path):
     canonical = read_highd(write_recording(tmp_path, tracks=TRACKS[-1:]))
     assert list(by_name(canonical)) == ["01-lower"]
-    assert canonical.notes == ("01: recordingMeta announces 4 vehicles, the tracks have 1",)
+    assert canonical.notes[0] == "01: recordingMeta announces 4 vehicles, 3 cars, the tracks have 1, 0"
     check_accounts(canonical, entries_from=TRACKS_FILE)
 
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
-from raw_texts import physical_lines, write
+from raw_texts import physical_lines
+from raw_texts import write as write_bytes
 
-from pipeline.sources.base import SourceError
+from pipeline.sources.base import RawFile, SourceError
 from pipeline.sources.lines import Layout, _parse_line_by_line, _parse_strictly, parse, read_chunks
 from pipeline.sources.raw_files import fetch_lines, read_head, split_lines, squeeze_blanks
 
@@ -32,6 +33,11 @@ PLAIN = Layout(
 )
 HEADER = b"id,note,count,x,site\n"
 GOOD = b'1,a,"1,156",2.5,here\n2,,3,-1e1,There\n3,"b,c",,.5,here\n'
+
+
+def write(path, data):
+    """The file, as readers take it."""
+    return RawFile(write_bytes(path, data), path.name)
 
 
 def rows_of(frame):

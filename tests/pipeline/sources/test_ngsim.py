@@ -18,7 +18,7 @@ from raw_texts import (
 
 from pipeline.sources.base import SourceError
 from pipeline.sources.ngsim import NGSIM
-from pipeline.sources.ngsim_dialects import name_recording
+from pipeline.sources.ngsim_dialects import name_recording, site_of
 from schemas import SUBSETS, TRACKS, VEHICLES
 
 PEACHTREE_1600 = 1163030300
@@ -134,9 +134,9 @@ def test_columns_that_are_missing_are_null_and_named(tmp_path):
     assert all(tracks[name].null_count() == 5 for name in missing)
     vehicles = canonical.subsets[0].vehicles
     assert all(vehicles[name].null_count() == 2 for name in ("class", "length_m", "width_m", "entries_announced"))
-    assert canonical.notes == (
+    assert canonical.notes[0] == (
         "us-101-0750: the files have no accel_mps2, follower_id, gap_m, headway_recorded_m, lane, leader_id; those "
-        "columns are null",
+        "columns are null"
     )
 
 
@@ -192,7 +192,8 @@ def test_a_last_column_of_no_meaning_does_not_hide_a_cut_line(tmp_path):
     ],
 )
 def test_recordings_are_named_by_their_key(key, location, recording, site):
-    assert name_recording(key, location) == (recording, site)
+    assert name_recording(key, location) == recording
+    assert site_of(recording) == site
 
 
 def test_recordings_are_told_apart_and_ids_restart_in_each(tmp_path):

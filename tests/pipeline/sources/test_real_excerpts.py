@@ -133,3 +133,45 @@ def test_one_vehicle_number_in_five_recordings(read):
     assert len(found) == raw["key"].n_unique()
     with_five = [name for name, canonical in found.items() if 5 in tracks_of(canonical)["vehicle_id"]]
     assert len(with_five) == raw.filter(pl.col("vehicle_id") == 5)["key"].n_unique()
+
+
+@pytest.mark.parametrize("constants", [True, False], ids=["as published", "by position alone"])
+def test_real_vehicles_that_share_an_id_and_a_frame_are_told_apart(tmp_path, constants):
+    """The portal's first rows as if their clock did not tell the two recordings apart: 24 collisions.
+
+    Whose each row is, is known from the clock that was taken out.
+    """
+    names = ["Vehicle_ID", "Frame_ID", "Direction", "Local_Y", "Global_Time"]
+    raw = pl.read_csv(excerpt(PORTAL), infer_schema=False).rename(lambda name: name.removeprefix("\ufeff"))
+    truth = raw.select(names).cast({"Vehicle_ID": pl.Int32, "Frame_ID": pl.Int32, "Global_Time": pl.Int64})
+    clock = pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64)
+    truth = truth.filter(pl.col("Direction") == "2").with_columns(clock.alias("recording"))
+    merged = raw.with_columns(Global_Time=1163030300 + 100 * pl.col("Frame_ID").cast(pl.Int64))
+    if not constants:
+        merged = merged.drop("Total_Frames", "v_length", "v_Width", "v_Class")
+    path = tmp_path / "merged.csv"
+    merged.write_csv(path)
+    (canonical,) = read_ngsim(tmp_path, path)[0].values()
+    check_accounts(canonical, entries_from=["merged.csv"])
+    assert tracks_of(canonical).height == 10_000
+    (north,) = (subset for subset in canonical.subsets if subset.name.endswith("north"))
+    assert north.tracks.select("vehicle_id", "frame").is_unique().all()
+    found = north.tracks.join(north.vehicles.select("vehicle_id", "source_vehicle_id"), on="vehicle_id")
+    per_place = found.group_by("source_vehicle_id", "frame").agg(pl.col("vehicle_id").n_unique())
+    assert per_place.filter(pl.col("vehicle_id") == 2).height == 24
+    # Each row found is the one in the file at the same place to the centimetre.
+    joined = found.join(truth, left_on=["source_vehicle_id", "frame"], right_on=["Vehicle_ID", "Frame_ID"])
+    place_m = pl.col("Local_Y").cast(pl.Float64) * 0.3048
+    joined = joined.filter((pl.col("x_m").cast(pl.Float64) - place_m).abs() < 0.01)
+    assert joined.height == found.height == truth.height
+    recordings = joined.group_by("vehicle_id").agg(pl.col("recording").n_unique(), pl.col("source_vehicle_id").first())
+    vehicles = joined.group_by("source_vehicle_id", "recording").agg(pl.col("vehicle_id").n_unique())
+    # No vehicle comes apart, and those whose frames collide never mix.
+    assert vehicles["vehicle_id"].to_list() == [1] * vehicles.height
+    colliding = set(per_place.filter(pl.col("vehicle_id") == 2)["source_vehicle_id"])
+    mixed = set(recordings.filter(pl.col("recording") > 1)["source_vehicle_id"])
+    assert not mixed & colliding
+    shared = vehicles.group_by("source_vehicle_id").len().filter(pl.col("len") > 1)["source_vehicle_id"]
+    assert north.facts["ids_split"].item() + len(mixed) == len(shared) == 6
+    # On a street a vehicle may come back: without its size, one that nothing contradicts stays one.
+    assert len(mixed) == (0 if constants else 5)

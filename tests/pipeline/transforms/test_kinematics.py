@@ -1,4 +1,4 @@
-"""Differences of positions against a slow loop over frames, and the gap to the leader by hand."""
+"""Differences of positions against a slow loop over frames."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.transforms.kinematics import add_gaps, add_kinematics, central_difference
+from pipeline.transforms.kinematics import add_kinematics, central_difference
 
 DERIVED = ("speed_cd_mps", "accel_cd_mps2", "speed_10hz_mps", "accel_10hz_mps2")
 
@@ -134,39 +134,3 @@ def test_against_a_slow_loop(tracks, gap, rate):
 def test_any_column_can_be_differentiated():
     frame = make_tracks({1: {1: 0.0, 2: 1.0, 3: 5.0}}).with_columns(y_m=-pl.col("x_m"))
     assert frame.select(central_difference("y_m", 25.0)).to_series().to_list() == [None, pytest.approx(-62.5), None]
-
-
-GAP_SCHEMA = {
-    "vehicle_id": pl.Int32,
-    "frame": pl.Int32,
-    "x_m": pl.Float64,
-    "leader_id": pl.Int32,
-    "headway_recorded_m": pl.Float32,
-}
-
-
-@pytest.mark.parametrize("use_recorded", [True, False])
-def test_gaps_by_hand(use_recorded):
-    tracks = pl.DataFrame(
-        [
-            (1, 1, 10.0, 2, 99.0),  # 30 - 4.5 - 10, whatever was recorded
-            (1, 2, 11.0, 2, 20.25),  # the leader has no entry: 20.25 - 4.5, if recorded headways count
-            (1, 3, 12.0, 2, None),  # no entry, nothing recorded
-            (1, 4, 13.0, 8, 20.0),  # an unknown leader
-            (1, 5, 14.0, None, 20.0),  # no leader
-            (1, 6, 15.0, 3, 20.0),  # a leader of unknown length
-            (2, 1, 30.0, None, None),
-            (2, 7, 10.0004, 1, None),  # overlap: 9.9996 - 5 - 10.0004, to the millimetre
-            (1, 7, 9.9996, None, None),
-            (3, 6, 50.0, None, None),
-        ],
-        schema=GAP_SCHEMA,
-        orient="row",
-    )
-    vehicles = pl.DataFrame(
-        {"vehicle_id": [1, 2, 3], "length_m": [5.0, 4.5, None]}, schema_overrides={"vehicle_id": pl.Int32}
-    )
-    found = add_gaps(tracks, vehicles, use_recorded_headway=use_recorded)
-    second = 15.75 if use_recorded else None
-    assert found["gap_m"].to_list() == [15.5, second, None, None, None, None, None, -5.001, None, None]
-    assert found.drop("gap_m").equals(tracks)

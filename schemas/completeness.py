@@ -1,0 +1,51 @@
+"""`completeness`: what publishers and metadata announce of a recording, beside what was found."""
+
+import polars as pl
+
+from schemas.columns import DATASET, Table, column
+
+RECORDING_META, TRACKS_META, PUBLISHED, TOTAL_FRAMES = "recordingMeta", "tracksMeta", "published", "Total_Frames"
+AUTHORITIES = (RECORDING_META, TRACKS_META, PUBLISHED, TOTAL_FRAMES)
+
+MEASURES = {
+    "vehicles": "vehicles with rows (source ids)",
+    "cars": "of them, cars",
+    "trucks": "of them, trucks",
+    "entries": "rows kept; where each vehicle announces its own, those of the vehicles that do",
+    "vehicles_without_rows": "announced vehicles of which no row was kept",
+    "vehicles_incomplete": "vehicles with another number of rows than they announce (none at all apart)",
+    "first_frames_differ": "vehicles whose first row is of another frame than announced",
+    "last_frames_differ": "vehicles whose last row is of another frame than announced",
+}
+"""What is counted over a recording. `vehicles_...` and `..._differ` are expected to be 0."""
+
+COMPLETENESS = Table(
+    "completeness",
+    "One row per (recording, measure, authority): how much there should be and how much was found. Measures: "
+    + "; ".join(f"`{name}`: {meaning}" for name, meaning in MEASURES.items())
+    + ". Which vehicles they are: `SELECT * FROM vehicles WHERE entries <> entries_announced` (on arterials a vehicle "
+    "that turns stands in several subsets, whose entries add up; here they are counted together).",
+    key=("recording", "measure", "authority"),
+    partition=("dataset",),
+    columns={
+        "dataset": DATASET,
+        "recording": column(pl.String, "one continuous camera recording"),
+        "measure": column(pl.String, "what is counted", isin=tuple(MEASURES)),
+        "authority": column(
+            pl.String,
+            "who announces it: recordingMeta, tracksMeta (highD), Total_Frames (NGSIM, per vehicle) or published "
+            "(NGSIM's freeways)",
+            isin=AUTHORITIES,
+        ),
+        "expected": column(pl.Int64, "as announced; null where the files do not say", nullable=True, ge=0),
+        "found": column(pl.Int64, "in the lake; null where it cannot be told", nullable=True, ge=0),
+        "agrees": column(pl.Boolean, "found = expected; null where either is unknown", nullable=True),
+        "rows_dropped": column(
+            pl.Int64,
+            "beside entries: rows in rejects that could be some of those missing (not blank lines, repeated headers, "
+            "lines that belong to no recording, or what several files repeat)",
+            nullable=True,
+            ge=0,
+        ),
+    },
+)
