@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
 
-from pipeline.lake import Entry, LakeFile, Writer, is_intact, open_for_writing
+from pipeline.lake import Entry, LakeFile, Writer, is_intact, list_ingested, open_for_writing
 from pipeline.progress import reporter
 from pipeline.settings import Settings
 from pipeline.sources import RawFile, SourceError
@@ -39,8 +39,11 @@ from pipeline.work import (
     Order,
     Outcome,
     explain_left_out,
+    explain_not_rebuilt,
     outstanding,
     plan_ingest,
+    prune,
+    remember_places,
     survey,
 )
 from schemas import StructureError
@@ -66,11 +69,10 @@ RETRIES: dict[str, Any] = {"retries": 2, "retry_delay_seconds": 1, "retry_condit
 
 
 @task(task_run_name="read {title}", cache_policy=NO_CACHE, **RETRIES)
-def read_file(title: str, lake: str, dataset: str, file: dict[str, str]) -> dict[str, Any]:
+def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
     """Read one file that holds several recordings into the staging folder."""
     del title
-    raw = RawFile(Path(file["path"]), file["name"], file["dialect"], file["sha256"])
-    return ingest.read_file(Path(lake), dataset, raw)
+    return ingest.read_file(Path(lake), dataset, RawFile.from_dict(file))
 
 
 @task(
@@ -123,16 +125,17 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], order: Order, outcom
         chosen = build.with_options(refresh_cache=True) if refresh else build
         return chosen.submit(stage, job.title, order.lake, writer.manifest.lake_id, asdict(job), settings)
 
-    by_title = {job.title: job for job in jobs}
+    by_key = {job.key: job for job in jobs}
     for title, record in _settle({submit(job): job.title for job in jobs}):
         if isinstance(record, dict) and not is_intact(writer.root, _files(_entry(record))):
             # A cached record whose files were swept since: the work is done again.
-            again = submit(by_title[title], refresh=True)
+            again = submit(by_key[record["key"]], refresh=True)
             again.wait()
             record = again.state.result(raise_on_failure=False)
         if isinstance(record, dict):
             entry = _entry(record)
-            writer.commit(entry)
+            # A cached record tells where the raw files stood when it was made.
+            writer.commit(replace(entry, built_from=by_key[entry.key].built_from))
             outcome.built[stage] = outcome.built.get(stage, 0) + 1
             outcome.notes += entry.info.get("notes", [])
         else:
@@ -151,17 +154,19 @@ def _ingest(writer: Writer, order: Order, outcome: Outcome) -> None:
     outcome.passed_by += discovery.passed_by
     unknown = ingest.files_to_read(discovery, writer.manifest)
     _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, order, outcome)
-    jobs, conflicts = plan_ingest(order, discovery, writer.manifest)
-    outcome.refused += conflicts
+    plan = plan_ingest(order, discovery, writer.manifest)
+    outcome.refused += plan.conflicts
+    remember_places(writer, order, plan)
+    prune(writer, order, plan, outcome)
     needed = {
         file.sha256: (job.inputs["dataset"], file)
-        for job in jobs
+        for job in plan.jobs
         if ingest.needs_spill(job)
         for file in ingest.files_of(job)
         if not ingest.spill_folder(writer.root, file).exists()
     }
     _read_all(writer, needed, order, outcome)
-    _build_all(writer, INGEST, jobs, order, outcome)
+    _build_all(writer, INGEST, plan.jobs, order, outcome)
 
 
 def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Order, outcome: Outcome) -> None:
@@ -170,12 +175,7 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Orde
     show = reporter()
     show.begin("read", len(files))
     futures = {
-        read_file.submit(
-            file.name,
-            order.lake,
-            dataset,
-            {"path": str(file.path), "name": file.name, "dialect": file.dialect, "sha256": sha256},
-        ): sha256
+        read_file.submit(file.name, order.lake, dataset, file.to_dict()): sha256
         for sha256, (dataset, file) in files.items()
     }
     contents = {}
@@ -190,21 +190,23 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Orde
 
 def _work(order: Order) -> dict[str, Any]:
     outcome = Outcome()
-    with open_for_writing(order.root) as writer:
+    before = list_ingested(order.root) if order.rebuild else set()
+    if order.rebuild and not survey(order).units:
+        raise SourceError(f"{order.source}: nothing in it can be used, so the lake was not begun anew.")
+    with open_for_writing(order.root, rebuild=order.rebuild) as writer:
         if INGEST in order.steps:
             _ingest(writer, order, outcome)
         for stage in order.stages():
             if outcome.failed and stage.name != "report":
                 continue  # what comes later builds on what failed; the report shows what there is
-            _build_all(
-                writer,
-                stage.name,
-                outstanding(stage, writer.root, writer.manifest, order.get_settings()),
-                order,
-                outcome,
-            )
+            if INGEST in order.steps and not writer.manifest.of_stage(INGEST):
+                continue  # everything was refused
+            jobs, stale = outstanding(stage, writer.root, writer.manifest, order.get_settings())
+            writer.remove(stale)
+            _build_all(writer, stage.name, jobs, order, outcome)
         if set(order.steps) & {"repair", "samples", "split", "tensors"}:
             outcome.notes += explain_left_out(writer.manifest)
+        outcome.notes += explain_not_rebuilt(before, writer.manifest)
     return asdict(outcome)
 
 
@@ -215,9 +217,11 @@ def run(
     dataset: str | None = None,
     settings: dict[str, Any] | None = None,
     replace: bool = False,
+    prune: bool = False,
+    rebuild: bool = False,
 ) -> dict[str, Any]:
     """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
-    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}, replace))
+    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild))
 
 
 @flow(name="tracklake-ingest", validate_parameters=False, task_runner=FEW_THREADS)
@@ -227,9 +231,11 @@ def ingest_files(
     dataset: str | None = None,
     settings: dict[str, Any] | None = None,
     replace: bool = False,
+    prune: bool = False,
+    rebuild: bool = False,
 ) -> dict[str, Any]:
     """Raw files to tracks, vehicles and subsets."""
-    return _work(Order(lake, (INGEST,), source, dataset, settings or {}, replace))
+    return _work(Order(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild))
 
 
 @flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
@@ -250,7 +256,8 @@ def execute(order: Order) -> Outcome:
     chosen: Any = run_stage
     if INGEST in order.steps:
         chosen = run if tuple(order.steps) == ALL_STEPS else ingest_files
-        parameters |= {"source": order.source, "dataset": order.dataset, "replace": order.replace}
+        parameters |= {"source": order.source, "dataset": order.dataset}
+        parameters |= {"replace": order.replace, "prune": order.prune, "rebuild": order.rebuild}
     else:
         (parameters["stage"],) = order.steps
     changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it

@@ -14,8 +14,9 @@ import typer
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
+    from pipeline.stages.discovery import Discovery
     from pipeline.terminal import Terminal
-    from pipeline.work import Outcome
+    from pipeline.work import Order, Outcome
 
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
 
@@ -80,10 +81,13 @@ def carry_out(
     dataset: str | None = None,
     *,
     replace: bool = False,
+    prune: bool = False,
+    rebuild: bool = False,
 ) -> "Outcome":
     """Do what is not done; Prefect is imported only where something is."""
     from pipeline.lake import load, refuse_foreign, refuse_if_busy
-    from pipeline.work import Order, Outcome, is_idle, plan_ingest, survey
+    from pipeline.sources import SourceError
+    from pipeline.work import Order, conclude_idle, is_idle
     from schemas.columns import DATASETS
 
     if dataset not in (None, *DATASETS):
@@ -91,27 +95,65 @@ def carry_out(
     plain = settings.model_dump(mode="json", exclude_unset=True)
     # Absolute, so that a worker in another folder finds the same places.
     where = None if source is None else str(Path(source).absolute())
-    order = Order(str(settings.lake.absolute()), steps, where, dataset, plain, replace)
+    order = Order(str(settings.lake.absolute()), steps, where, dataset, plain, replace, prune, rebuild)
     order.check()
-    refuse_foreign(order.root)
-    discovery = survey(order) if source is not None else None
+    refuse_foreign(order.root, rebuild=rebuild)
+    if prune and source is not None and Path(source).is_file():
+        raise typer.BadParameter(f"--prune compares a folder with the lake; {source} is a file")
+    try:
+        discovery = _survey_while_importing(order) if source is not None else None
+    except SourceError as nothing:
+        raise SourceError(f"{nothing}{_prune_nothing(order.root)}" if prune else str(nothing)) from None
     if discovery is None:
         load(order.root)  # raises where there is no lake to work on
     if discovery is not None and not discovery.units:
         # Nothing can come of it, so no lake is made for it either.
         for message in discovery.refusals:
             terminal.complain(message, label="refused")
+        if prune:
+            terminal.complain(_prune_nothing(order.root).strip(), label="refused")
         terminal.give({"refused": list(discovery.refusals)})
         raise typer.Exit(FAILED)
     if is_idle(order, discovery):
         terminal.say("nothing to do: the lake is up to date", style="dim")
-        conflicts = plan_ingest(order, discovery, load(order.root))[1] if discovery else []
-        return Outcome(refused=[*(discovery.refusals if discovery else ()), *conflicts])
-    refuse_if_busy(order.root)
+        return conclude_idle(order, discovery)
+    refuse_if_busy(order.root, rebuild=rebuild)
     with terminal.working():
         from pipeline.flows import execute
 
         return execute(order)
+
+
+SOON_S = 0.3
+
+
+def _survey_while_importing(order: "Order") -> "Discovery":
+    """Find the raw files; Prefect is imported meanwhile where that takes longer than looking up known hashes.
+
+    Files that must be hashed are new, so there will be work for it.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+    from contextlib import suppress
+    from importlib import import_module
+
+    from pipeline.work import survey
+
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        discovery = thread.submit(survey, order)
+        with suppress(TimeoutError):
+            return discovery.result(timeout=SOON_S)
+        import_module("pipeline.flows")
+        return discovery.result()
+
+
+def _prune_nothing(lake: Path) -> str:
+    """To follow the message about a source in which there is nothing to use."""
+    import shlex
+
+    return (
+        "\n--prune removed nothing: what holds no raw files may be a mistyped folder, or a disk that is not there. To "
+        f"remove a recording by its name: `tracklake remove RECORDING --lake {shlex.quote(str(lake))}`."
+    )
 
 
 def conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, headline: bool = True) -> None:
@@ -132,10 +174,12 @@ def conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, 
         quality = json.loads((reports / DOCUMENT).read_text(encoding="utf-8"))
         show_headline(terminal, quality, reports / PAGE, settings.lake)
         record |= {"report": (reports / PAGE).resolve(), "headline": quality["headline"], "scores": quality["scores"]}
+    elif not usable and not outcome.refused:
+        terminal.say(f"{settings.lake}: the lake holds no recordings; `tracklake ingest SOURCE` adds some")
     elif outcome.built:
         terminal.say(f"done: {', '.join(f'{stage} {count}' for stage, count in outcome.built.items())}")
     terminal.give(record)
-    if outcome.failed or not usable:
+    if outcome.failed or (outcome.refused and not usable):
         raise typer.Exit(FAILED)
     if outcome.refused:
         terminal.complain(f"{len(outcome.refused)} refused (above); everything else is done", label="refused")

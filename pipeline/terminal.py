@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 SHOWN_ROWS = 40
 """Rows of a query's result that are shown to a person; csv, json and parquet give all."""
+SHOWN_CHARACTERS = 120
+"""Of one value in them."""
 
 
 class Terminal:
@@ -165,7 +167,7 @@ def _balance(quality: dict[str, Any]) -> str:
 
 
 def show_relation(relation: "LakeResult", terminal: Terminal) -> None:
-    """Print a query's first rows as a table that keeps every column."""
+    """Print a query's first rows as a table that keeps every column, and on stderr how many rows there are."""
     rows = relation.limit(SHOWN_ROWS + 1).fetchall()
     cells = [list(relation.columns), *([_cell(value) for value in row] for row in rows[:SHOWN_ROWS])]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -177,7 +179,10 @@ def show_relation(relation: "LakeResult", terminal: Terminal) -> None:
         ]
         terminal.say("  ".join(shown).rstrip(), style="" if number else "bold")
     if len(rows) > SHOWN_ROWS:
-        terminal.err.print(f"[dim]the first {SHOWN_ROWS} rows; --format csv, json or parquet gives all[/]")
+        rest = f"the first {SHOWN_ROWS} of {relation.count():,} rows; --format csv, json or parquet gives all"
+        terminal.err.print(f"[dim]{rest}[/]")
+    else:
+        terminal.err.print(f"[dim]{len(rows)} {'row' if len(rows) == 1 else 'rows'}[/]")
 
 
 _NUMERIC = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UBIGINT", "UINTEGER", "FLOAT", "DOUBLE", "DECIMAL")
@@ -186,7 +191,9 @@ _NUMERIC = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UBIGINT", "U
 def _cell(value: object) -> str:
     if value is None:
         return "null"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    # A plan is drawn over many lines.
+    return text if len(text) <= SHOWN_CHARACTERS or "\n" in text else text[: SHOWN_CHARACTERS - 1] + "…"
 
 
 def show_scores(terminal: Terminal, evaluations: Sequence[dict[str, Any]]) -> None:

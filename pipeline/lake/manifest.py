@@ -3,7 +3,9 @@
 import json
 import os
 import re
+import shlex
 import uuid
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -72,6 +74,7 @@ class Manifest:
         entries: by key.
         sources: by sha256: which dataset, dialect and recordings a raw file holds.
         retired: files to delete two generations after they were replaced.
+        ingested_from: the SOURCEs it was made from, the last one last.
     """
 
     lake_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -79,6 +82,7 @@ class Manifest:
     entries: dict[str, Entry] = field(default_factory=dict)
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     retired: tuple[Retired, ...] = ()
+    ingested_from: tuple[str, ...] = ()
 
     def live(self, table: str) -> list[LakeFile]:
         """The live files of a table, sorted by path."""
@@ -95,11 +99,18 @@ class Manifest:
 
     def committing(self, entry: Entry, generation: int) -> "Manifest":
         """The manifest with an entry added or replaced; what it replaces is retired."""
-        before = self.entries.get(entry.key)
-        changed = replace(self, entries={**self.entries, entry.key: entry}, generation=generation)
+        replaced = [self.entries[entry.key]] if entry.key in self.entries else []
+        return self._becoming({**self.entries, entry.key: entry}, replaced, generation)
+
+    def removing(self, keys: Collection[str], generation: int) -> "Manifest":
+        """The manifest without some entries; their files are retired."""
+        removed = [entry for key, entry in self.entries.items() if key in keys]
+        return self._becoming({k: e for k, e in self.entries.items() if k not in keys}, removed, generation)
+
+    def _becoming(self, entries: dict[str, Entry], replaced: Iterable[Entry], generation: int) -> "Manifest":
+        changed = replace(self, entries=entries, generation=generation)
         live = changed.live_paths()
-        replaced = before.files.values() if before is not None else ()
-        gone = {file.path for files in replaced for file in files} - live
+        gone = {file.path for entry in replaced for files in entry.files.values() for file in files} - live
         kept = tuple(item for item in self.retired if item.path not in live)
         return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(gone)))
 
@@ -110,6 +121,26 @@ def load(root: Path) -> Manifest:
     Raises:
         LakeMissingError: no manifest there.
         LakeVersionError: tables of another schema version.
+        LakeError: not a manifest of ours.
+    """
+    document = read_document(root)
+    version = document["schema_version"]
+    if version != SCHEMA_VERSION:
+        raise LakeVersionError(
+            f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
+            f"{SCHEMA_VERSION}. Rebuild it from the raw files: {_rebuilding(root, document)}."
+        )
+    try:
+        return _parse(document)
+    except (ValueError, KeyError, TypeError, AttributeError) as broken:
+        raise not_ours(root / MANIFEST, broken) from broken
+
+
+def read_document(root: Path) -> dict[str, Any]:
+    """A lake's manifest of any schema version; only `schema_version` is sure to be in it.
+
+    Raises:
+        LakeMissingError: no manifest there.
         LakeError: not a manifest of ours.
     """
     path = root / MANIFEST
@@ -125,24 +156,33 @@ def load(root: Path) -> Manifest:
             f"{path}: cannot be read ({failed.strerror}). A lake's manifest is a readable file."
         ) from failed
     except UnicodeDecodeError as broken:
-        raise _not_ours(path, broken) from broken
+        raise not_ours(path, broken) from broken
     try:
-        document = json.loads(text)
-        version = document["schema_version"]
+        document: dict[str, Any] = json.loads(text)
+        document["schema_version"]
     except (ValueError, KeyError, TypeError) as broken:
-        raise _not_ours(path, broken) from broken
-    if version != SCHEMA_VERSION:
-        raise LakeVersionError(
-            f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
-            f"{SCHEMA_VERSION}. Rebuild it from the raw files: `tracklake run SOURCE --lake NEW_FOLDER`."
-        )
-    try:
-        return _parse(document)
-    except (ValueError, KeyError, TypeError, AttributeError) as broken:
-        raise _not_ours(path, broken) from broken
+        raise not_ours(path, broken) from broken
+    return document
 
 
-def _not_ours(path: Path, broken: Exception) -> LakeError:
+def remembered_sources(document: dict[str, Any]) -> tuple[str, ...]:
+    """The SOURCEs that a manifest of any version remembers, as far as it does."""
+    found = document.get("ingested_from")
+    return tuple(item for item in found if isinstance(item, str)) if isinstance(found, list) else ()
+
+
+def _rebuilding(root: Path, document: dict[str, Any]) -> str:
+    """The commands that make a lake anew of the SOURCEs it was made from, the last one first."""
+    there = [Path(name) for name in reversed(remembered_sources(document)) if Path(name).exists()]
+    outer = [path for path in there if not any(path != other and path.is_relative_to(other) for other in there)]
+    first, *others = (shlex.quote(str(path)) for path in outer or [Path("SOURCE")])
+    lake = shlex.quote(str(root))
+    commands = [f"`tracklake run {first} --lake {lake} --rebuild`"]
+    return ", then ".join(commands + [f"`tracklake run {source} --lake {lake}`" for source in others])
+
+
+def not_ours(path: Path, broken: Exception) -> LakeError:
+    """The error of a manifest.json that some other program wrote, or that is damaged."""
     return LakeError(
         f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
     )
@@ -165,6 +205,7 @@ def _parse(document: dict[str, Any]) -> Manifest:
         entries=entries,
         sources=document["sources"],
         retired=tuple(Retired(**item) for item in document["retired"]),
+        ingested_from=remembered_sources(document),
     )
 
 

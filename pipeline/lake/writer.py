@@ -4,7 +4,7 @@ import fcntl
 import os
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 from pipeline.lake import catalog, files
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
 from pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, remove_leftovers, store
+from pipeline.lake.rebuild import begin_anew
 
 LOCK = ".lock"
 KEPT_GENERATIONS = 2
@@ -56,6 +57,19 @@ class Writer:
             if merged != self.manifest.sources:
                 self._store(replace(self.manifest, sources=merged, generation=self._generation))
 
+    def remove(self, keys: Collection[str]) -> None:
+        """Take entries out of the lake; their files are retired like replaced ones."""
+        with self._guard:
+            if not self.manifest.entries.keys().isdisjoint(keys):
+                self._store(self.manifest.removing(keys, self._generation))
+
+    def remember_origin(self, source: str) -> None:
+        """Record a SOURCE as the last one, so that a rebuild can be told where the raw files are."""
+        with self._guard:
+            origins = (*(name for name in self.manifest.ingested_from if name != source), source)
+            if origins != self.manifest.ingested_from:
+                self._store(replace(self.manifest, ingested_from=origins))
+
     def finish(self) -> None:
         """Rebuild the catalog, then sweep what neither it nor a reader of the one before needs: a session's last step.
 
@@ -85,16 +99,20 @@ class Writer:
 
 
 @contextmanager
-def open_for_writing(root: Path) -> Iterator[Writer]:
+def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     """Lock a lake (making it where there is none) and yield its writer; the catalog is rebuilt at the end.
 
     The lock is the kernel's: it goes with the process, however that ends, and is not inherited by children.
+
+    Args:
+        root: the lake.
+        rebuild: begin with nothing live, whatever schema version the lake is of; see `rebuild.begin_anew`.
 
     Raises:
         LakeLockedError: another process holds the lock.
         LakeError: the folder holds other things than a lake, or cannot be written to.
     """
-    refuse_foreign(root)
+    refuse_foreign(root, rebuild=rebuild)
     descriptor = _open_lock(root)
     try:
         _take(root, descriptor)
@@ -102,7 +120,7 @@ def open_for_writing(root: Path) -> Iterator[Writer]:
         broken_off = bool(os.pread(descriptor, 1, 0))
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
-        writer = _begin(root, broken_off=broken_off)
+        writer = _begin(root, broken_off=broken_off, rebuild=rebuild)
         yield writer
         writer.finish()
         os.ftruncate(descriptor, 0)
@@ -112,14 +130,14 @@ def open_for_writing(root: Path) -> Iterator[Writer]:
             os.close(descriptor)
 
 
-def refuse_if_busy(root: Path) -> None:
+def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
     """Raise what `open_for_writing` would raise now, before anything expensive is started for it.
 
     Raises:
         LakeLockedError: another process holds the lock.
         LakeError: the folder holds other things than a lake.
     """
-    refuse_foreign(root)
+    refuse_foreign(root, rebuild=rebuild)
     if (root / LOCK).exists():
         descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -151,33 +169,39 @@ def _take(root: Path, descriptor: int) -> None:
         ) from None
 
 
-def _begin(root: Path, *, broken_off: bool) -> Writer:
+def _begin(root: Path, *, broken_off: bool, rebuild: bool) -> Writer:
     """Load the manifest (or make the first), sweep what was half written, and bring the catalog up to date."""
     try:
-        manifest = load(root)
+        manifest = begin_anew(root) if rebuild else load(root)
+        if rebuild:
+            store(root, manifest)
     except LakeMissingError:
         manifest = Manifest()
         store(root, manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
     remove_leftovers(root)
     remove_leftovers(root / files.REPORTS)
-    if broken_off:
+    if broken_off and not rebuild:
         # Readers of the catalog must not fall behind by more generations than files are kept for.
         with suppress(LakeError):  # files are missing: this session may be the one that makes them again
             catalog.rebuild(root, manifest)
     return Writer(root, manifest)
 
 
-def refuse_foreign(root: Path) -> None:
+def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:
     """Refuse a place that is no lake and no place for one, before anything is written there.
 
+    Args:
+        root: the place.
+        rebuild: whether a lake of another schema version will do.
+
     Raises:
-        LakeError: a file, a folder of other things, or a manifest that is not ours.
+        LakeError: a file, a folder of other things, a manifest that is not ours, or one of another schema version.
     """
     if root.exists() and not root.is_dir():
         raise LakeError(f"{root}: is a file; a lake is a folder. Name another with --lake.")
     if (root / MANIFEST).exists():
-        load(root)  # another program's manifest is found out before anything is touched
+        (begin_anew if rebuild else load)(root)  # another program's manifest is found out before anything is touched
     elif root.is_dir():
         foreign = sorted(item.name for item in root.iterdir() if not item.name.startswith("."))
         if foreign:
