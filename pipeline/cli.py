@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.allocation import keep_freed_memory
 from pipeline.session import DONE, FAILED, carry_out, command, conclude, failure, read_settings
 
 if TYPE_CHECKING:
@@ -25,13 +26,20 @@ app = typer.Typer(
 )
 
 LakeOption = Annotated[
-    Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake [env: TRACKLAKE_LAKE; default: lake].")
+    Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim or highd.")]
 ReplaceOption = Annotated[
     bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
+]
+PruneOption = Annotated[
+    bool, typer.Option("--prune", help="Remove recordings whose files once stood in SOURCE, a folder, and are gone.")
+]
+RebuildOption = Annotated[
+    bool,
+    typer.Option("--rebuild", help="Begin the lake anew in its place, also one of another schema version; redo all."),
 ]
 WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="Recordings worked on at once.")]
 ProtocolOption = Annotated[str | None, typer.Option("--protocol", help="Name of the protocol [default: csp].")]
@@ -41,6 +49,7 @@ SeedOption = Annotated[int | None, typer.Option("--seed", help="Of the generated
 
 def main() -> None:
     """Entry point of the `tracklake` command."""
+    keep_freed_memory()
     app()
 
 
@@ -64,6 +73,8 @@ def run(
     dataset: DatasetOption = None,
     workers: WorkersOption = None,
     replace: ReplaceOption = False,
+    prune: PruneOption = False,
+    rebuild: RebuildOption = False,
     minutes: MinutesOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -75,11 +86,14 @@ def run(
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers)
         if source is None:
+            if prune or rebuild:
+                raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
             source = str(_provide_sample(settings.lake, minutes, seed, terminal))
             _refuse_mixing(settings.lake, source)
         elif minutes is not None or seed is not None:
             raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
-        outcome = carry_out(terminal, settings, ALL_STEPS, source, dataset, replace=replace)
+        flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
+        outcome = carry_out(terminal, settings, ALL_STEPS, source, dataset, **flags)
         conclude(terminal, settings, outcome)
 
 
@@ -90,14 +104,41 @@ def ingest(
     dataset: DatasetOption = None,
     workers: WorkersOption = None,
     replace: ReplaceOption = False,
+    prune: PruneOption = False,
+    rebuild: RebuildOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Raw files to tracks, vehicles and subsets (the format is detected)."""
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers)
-        outcome = carry_out(terminal, settings, ("ingest",), source, dataset, replace=replace)
+        flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
+        outcome = carry_out(terminal, settings, ("ingest",), source, dataset, **flags)
         conclude(terminal, settings, outcome, headline=False)
+
+
+@app.command()
+def remove(
+    recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...", help="For instance 03, or highd/03.")],
+    lake: LakeOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Take recordings out of the lake, with all that was made of them; raw files are not touched."""
+    from dataclasses import asdict
+
+    with command(quiet=quiet, json=json) as terminal:
+        from pipeline.stages.removal import remove_recordings
+
+        root = read_settings(lake=lake).lake
+        removed, outdated = remove_recordings(root, recordings)
+        for gone in removed:
+            terminal.say(f"removed {gone.name}: {', '.join(gone.subsets)}; {gone.entries:,} rows of tracks")
+            if gone.files:
+                terminal.say(f"note: {gone.files[0]} is still there, and ingesting it brings {gone.name} back")
+        if outdated:
+            terminal.say(f"note: {', '.join(outdated)} were made of it and went, too; `tracklake run` makes them anew")
+        terminal.give({"lake": root, "removed": [asdict(gone) for gone in removed], "outdated": outdated})
 
 
 def _add_stage(name: str, meaning: str) -> None:
@@ -133,19 +174,25 @@ for _name, _meaning in STAGE_COMMANDS.items():
 
 @app.command()
 def sql(
-    query: Annotated[str, typer.Argument(help="One SELECT; `-` reads it from standard input.")],
+    query: Annotated[str | None, typer.Argument(help="One SELECT; `-` reads it from standard input.")] = None,
     lake: LakeOption = None,
     format: Annotated[str, typer.Option("--format", help="table, csv, json or parquet.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", help="Write the result to this file.")] = None,
+    names: Annotated[bool, typer.Option("--list", help="List the tables and macros, and what they are.")] = False,
 ) -> None:
     """Ask SQL of the tracks, read-only, from anywhere."""
-    from pipeline.export.query import FORMATS, write_result
+    from pipeline.export.query import FORMATS, show_names, write_result
     from pipeline.lake import connect, query_errors
     from pipeline.lake import query as run_query
 
     with command() as terminal:
         if format not in FORMATS:
             raise typer.BadParameter(f"--format is one of {', '.join(FORMATS)}; got {format!r}")
+        if names:
+            show_names(terminal)
+            return
+        if query is None:
+            raise typer.BadParameter("give one SELECT, `-` to read it from standard input, or --list")
         with connect(read_settings(lake=lake).lake) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
             with query_errors():  # DuckDB computes while the result is fetched

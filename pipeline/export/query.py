@@ -22,7 +22,7 @@ def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: 
         relation: of `pipeline.lake.query`.
         form: table (the first rows, aligned), csv (with header), json (an array of objects) or parquet.
         out: the file; none: standard output.
-        terminal: for tables.
+        terminal: for tables, and to say how many rows went to the file.
 
     Raises:
         ValueError: Parquet, which is no text, was asked for on a terminal.
@@ -33,7 +33,8 @@ def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: 
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
     try:
-        _write(_flat(relation).pl() if form == "csv" else relation.pl(), form, out or sys.stdout.buffer)
+        frame = _flat(relation).pl() if form == "csv" else relation.pl()
+        _write(frame, form, out or sys.stdout.buffer)
     except OSError as error:
         # Polars raises the system's error without its number.
         if f"(os error {errno.EPIPE})" in str(error):
@@ -41,6 +42,27 @@ def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: 
         raise
     if out is None:
         sys.stdout.buffer.flush()
+    else:
+        terminal.say(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+
+
+def show_names(terminal: Terminal) -> None:
+    """Print every table and macro with what it is; the same for all lakes."""
+    from pipeline.lake.macros import MACROS
+    from schemas import TABLES
+
+    for title, meanings in (
+        ("Tables (columns: DESCRIBE tracks)", {table.name: _first_sentence(table.meaning) for table in TABLES}),
+        ("Macros (call: FROM track('01-upper', 5))", {macro.signature: macro.meaning for macro in MACROS}),
+    ):
+        terminal.say(title, style="bold")
+        width = max(map(len, meanings)) + 2
+        for name, meaning in meanings.items():
+            terminal.say(f"  {name:<{width}}{meaning}")
+
+
+def _first_sentence(text: str) -> str:
+    return text.split(". ")[0].removesuffix(".") + "."
 
 
 def _write(frame: "pl.DataFrame", form: str, target: Any) -> None:  # noqa: ANN401 - a path or a binary file

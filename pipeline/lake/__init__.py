@@ -1,9 +1,10 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
-from pipeline.lake.catalog import LakeResult, connect, query, query_errors
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
 from pipeline.lake.files import is_intact, scan, write_folder, write_table
 from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
+from pipeline.lake.rebuild import list_ingested
+from pipeline.lake.sandbox import LakeResult, connect, query, query_errors
 from pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Writer",
     "connect",
     "is_intact",
+    "list_ingested",
     "load",
     "open_for_writing",
     "query",
