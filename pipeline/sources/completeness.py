@@ -114,20 +114,36 @@ def compare(
 
 
 def _compare_vehicles(vehicles: pl.DataFrame, announced: pl.DataFrame | None) -> pl.DataFrame:
-    """One row per vehicle that is announced: entries_announced, entries (0 = none), and FAULTS that can be judged.
+    """One row per VEHICLE announced: vehicles, entries_announced, entries (0 = none), and FAULTS that can be judged.
 
     A fault is null where it cannot be told of the vehicle; its column is absent where it can be told of none.
     """
-    found = vehicles.group_by(VEHICLE).agg(
-        pl.col("entries").cast(pl.Int64).sum(),
-        first_frame_found=pl.col("first_frame").min(),
-        last_frame_found=pl.col("last_frame").max(),
+    found = (
+        vehicles.group_by("subset", *VEHICLE)
+        .agg(
+            pl.len().cast(pl.Int64).alias("vehicles"),
+            pl.col("entries").cast(pl.Int64).sum(),
+            first_frame_found=pl.col("first_frame").min(),
+            last_frame_found=pl.col("last_frame").max(),
+        )
+        .group_by(VEHICLE)
+        .agg(
+            # An id that was split stands for several, each of which announces as many.
+            pl.col("vehicles").max(),
+            pl.col("entries").sum(),
+            first_frame_found=pl.col("first_frame_found").min(),
+            last_frame_found=pl.col("last_frame_found").max(),
+        )
     )
     everyone = found.select(VEHICLE) if announced is None else announced
     each = (
         everyone.filter(pl.col("entries_announced").is_not_null())
         .join(found, on=VEHICLE, how="left")
-        .with_columns(pl.col("entries_announced").cast(pl.Int64), pl.col("entries").fill_null(0))
+        .with_columns(
+            pl.col("entries_announced").cast(pl.Int64) * pl.col("vehicles").fill_null(1),
+            pl.col("vehicles").fill_null(1),
+            pl.col("entries").fill_null(0),
+        )
         .sort(VEHICLE)
     )
     has_rows = pl.col("entries") > 0
@@ -184,7 +200,7 @@ def _remark_vehicles(
     expected, found = int(each["entries_announced"].sum()), int(each["entries"].sum())
     return (
         f"{recording}: {announced.vehicles_by} announces {_number(expected, 'row')} of "
-        f"{_number(each.height, 'vehicle')}, the tracks have {found:,}; {', '.join(said)}"
+        f"{_number(int(each['vehicles'].sum()), 'vehicle')}, the tracks have {found:,}; {', '.join(said)}"
         f"{_explain(expected - found, dropped)}"
     )
 

@@ -7,13 +7,19 @@ from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
 from pipeline.sources.completeness import Announced, compare
+from pipeline.sources.highd_rows import (
+    STRANGER,
+    find_directions,
+    split_conflicts,
+    split_impossible,
+    split_strangers,
+)
 from pipeline.sources.lines import Chunk, Layout, read_chunks
 from pipeline.sources.raw_files import LINE
 from pipeline.transforms.orientation import LOWER, UPPER, orient_highd
@@ -125,44 +131,32 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             "Two recordings' files are mixed; restore the originals."
         )
     entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
-    entries, conflicts = _split_conflicts(entries)
+    entries, conflicts = split_conflicts(entries)
     if entries.is_empty():
         raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
     known, known_again = _unique_vehicles(vehicles.frame, vehicles_file)
-    _require_known(entries, known, tracks_file, vehicles_file)
+    entries, strangers = split_strangers(entries, known, tracks_file, vehicles_file)
+    markings = {
+        UPPER: _markings(meta["upperLaneMarkings"], meta_file),
+        LOWER: _markings(meta["lowerLaneMarkings"], meta_file),
+    }
+    entries, impossible = split_impossible(entries, known, *(len(marked) - 1 for marked in markings.values()))
     rejected = [
         Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
     ]
     parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
     dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
+    dropped += [(strangers, STRANGER), *impossible]
     log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
-    direction_of_entry = _directions(entries, known)
+    direction_of_entry = find_directions(entries, known)
     subsets = [
-        _to_subset(entries.filter(direction_of_entry == direction), known, direction, recording, meta, meta_file, files)
+        _to_subset(entries.filter(direction_of_entry == direction), known, direction, recording, meta, markings, files)
         for direction in CARRIAGEWAYS
     ]
     found = tuple(subset for subset in subsets if subset is not None)
     whole = compare("highd", recording, found, _announced(meta, known), log.filter(pl.col("dialect") == TRACKS))
     return Canonical(found, log, rejects, whole.table, whole.notes)
-
-
-def _split_conflicts(entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """The first row of every vehicle and frame in the order of lines, and the others, which contradict it."""
-    conflicting = entries.select(
-        ((pl.col("id") == pl.col("id").shift(1)) & (pl.col("frame") == pl.col("frame").shift(1))).fill_null(value=False)
-    ).to_series()
-    if not conflicting.any():
-        return entries, entries.clear()
-    entries = entries.sort("id", "frame", LINE)
-    return entries.filter(~conflicting), entries.filter(conflicting)
-
-
-def _directions(entries: pl.DataFrame, vehicles: pl.DataFrame) -> pl.Series:
-    """The driving direction of every entry; entries are sorted by id."""
-    runs = entries["id"].rle().struct.unnest()
-    directions = runs.join(vehicles, left_on="value", right_on="id", how="left", maintain_order="left")
-    return pl.Series(np.repeat(directions["drivingDirection"].to_numpy(), runs["len"].to_numpy()))
 
 
 def _read(file: RawFile) -> Chunk:
@@ -212,17 +206,6 @@ def _unique_vehicles(vehicles: pl.DataFrame, file: RawFile) -> tuple[pl.DataFram
     return unique, again
 
 
-def _require_known(entries: pl.DataFrame, vehicles: pl.DataFrame, tracks_file: RawFile, vehicles_file: RawFile) -> None:
-    strangers = entries.join(vehicles, on="id", how="anti")
-    if not strangers.is_empty():
-        first = strangers.row(0, named=True)
-        raise SourceError(
-            f"{tracks_file.name}, line {first[LINE]}: vehicle {first['id']} has no row in {vehicles_file.name} "
-            f"({strangers['id'].n_unique()} such vehicles). The files do not belong together or one is cut short; "
-            "restore the originals."
-        )
-
-
 def _markings(text: str, file: RawFile) -> list[float]:
     try:
         values = [float(value) for value in text.split(";")]
@@ -242,14 +225,13 @@ def _to_subset(
     direction: int,
     recording: str,
     meta: dict[str, Any],
-    meta_file: RawFile,
+    markings_m: dict[int, list[float]],
     files: Sequence[RawFile],
 ) -> Subset | None:
     if entries.is_empty():
         return None
     mine = vehicles.filter(pl.col("drivingDirection") == direction)
-    upper_m = _markings(meta["upperLaneMarkings"], meta_file)
-    lower_m = _markings(meta["lowerLaneMarkings"], meta_file)
+    upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)
     canonical = orient_highd(entries, direction, upper_m, lower_m).select(

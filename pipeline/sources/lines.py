@@ -195,6 +195,9 @@ def _is_sound(layout: Layout) -> pl.Expr:
         sound += [] if low is None else [pl.col(name).min().fill_null(low) >= low]
         sound += [] if high is None else [pl.col(name).max().fill_null(high) <= high]
     sound += [~_not_among(pl.col(name).unique(), allowed).any() for name, allowed in layout.choices.items()]
+    # Blanks around a text are taken off line by line only; texts of given choices have none, as those are compared.
+    free = [name for name, dtype in layout.dtypes.items() if dtype == pl.String() and name not in layout.choices]
+    sound += [~pl.col(name).ne_missing(pl.col(name).str.strip_chars()).any() for name in free]
     return pl.all_horizontal(sound)
 
 

@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
 from pipeline.sources.assemble import assemble_subset
-from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, Spilled, Subset, Unit
+from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Spilled, Subset, Unit
 from pipeline.sources.completeness import Announced, compare
 from pipeline.sources.derived import IN_FULLER_FILE, split_derived
 from pipeline.sources.lines import REJECT_SCHEMA, Chunk, map_chunks
@@ -32,6 +32,9 @@ CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
 
 PARSING_THREADS = 3
 """Chunks of one file worked on at once: more help little, as the parser has threads of its own, and cost memory."""
+
+MOST_RECORDINGS = 200
+"""If these do not hold half of a file's rows, Global_Time and Frame_ID tell no recordings apart. (Known are nine.)"""
 
 FED_BY = {
     "Lane_ID": ("lane",),
@@ -76,12 +79,28 @@ def spill(file: RawFile, folder: Path) -> Spilled:
             target.mkdir(parents=True, exist_ok=True)
             # Plain Arrow costs a quarter of the time of compressed Parquet, and lives no longer than the run.
             rows.write_ipc(target / f"{number:06d}-{share:06d}.arrow", compression="uncompressed")
+        _require_constant_keys(counts, file)
         return counts, chunk.rejects, chunk.rows_read
 
     spilled = list(map_chunks(file, layout, spill_chunk, threads=PARSING_THREADS))
     recordings = sum((counts for counts, _, _ in spilled), Counter())
+    _require_constant_keys(recordings, file)
     rejects = pl.concat([pl.DataFrame(schema=REJECT_SCHEMA), *(rejects for _, rejects, _ in spilled)])
     return Spilled(dict(recordings), sum(rows_read for _, _, rows_read in spilled), rejects)
+
+
+def _require_constant_keys(counts: Counter[str], file: RawFile) -> None:
+    """Refuse a file in which nearly every row has a key of its own, for its times or frames are not what they say.
+
+    Single rows with a damaged time make recordings of their own; that many rows of a file have one is what a rounded
+    Global_Time or swapped columns do.
+    """
+    if 2 * sum(rows for _, rows in counts.most_common(MOST_RECORDINGS)) < counts.total():
+        raise SourceError(
+            f"{file.name}: {len(counts):,} recordings by Global_Time - 100 * Frame_ID in {counts.total():,} rows. "
+            f"Expected the same number in all rows of a recording, and no more than {MOST_RECORDINGS} recordings in a "
+            "file. Global_Time was rounded or columns are swapped; restore the original file."
+        )
 
 
 def _part_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
@@ -196,9 +215,10 @@ def _remark(subsets: Sequence[Subset]) -> list[str]:
         if facts["ids_split"]:
             notes.append(f"{subset.name}: {facts['ids_split']} ids stood for more than one vehicle and were split")
         if facts["columns_missing"]:
-            notes.append(
-                f"{subset.name}: the files have no {', '.join(facts['columns_missing'])}; those columns are null"
-            )
+            # Lanes are what samples, and with them splits and tensors, cannot be made without.
+            missing = facts["columns_missing"]
+            stages = "; no samples, split or tensors without lane" if "lane" in missing else ""
+            notes.append(f"{subset.name}: the files have no {', '.join(missing)}; those columns are null{stages}")
     return notes
 
 

@@ -187,7 +187,8 @@ def recordings(draw):
 def test_found_and_missing_rows_add_up_to_the_announced_ones(recording, repeated):
     vehicles, order, lost = recording
     kept = [row for row in order if row not in lost]
-    lines = [track_row(frame, vehicle, (100, 9, 4, 2), (25, 0), 2) for vehicle, frame in kept]
+    lane = {1: 2, 2: 5}
+    lines = [track_row(frame, vehicle, (100, 9, 4, 2), (25, 0), lane[vehicles[vehicle][0]]) for vehicle, frame in kept]
     meta = [
         f"{vehicle},4,2,{first},{first + count - 1},{count},Car,{direction},1,25,25,25,-1,-1,-1,0"
         for vehicle, (direction, first, count) in vehicles.items()

@@ -136,7 +136,7 @@ def test_columns_that_are_missing_are_null_and_named(tmp_path):
     assert all(vehicles[name].null_count() == 2 for name in ("class", "length_m", "width_m", "entries_announced"))
     assert canonical.notes[0] == (
         "us-101-0750: the files have no accel_mps2, follower_id, gap_m, headway_recorded_m, lane, leader_id; those "
-        "columns are null"
+        "columns are null; no samples, split or tensors without lane"
     )
 
 
