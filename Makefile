@@ -42,6 +42,7 @@ bench: install
 
 docs: install
 	$(BIN)/python -m schemas.markdown > docs/tables.md
+	$(BIN)/python -m quality_reports.markdown > docs/rules.md
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

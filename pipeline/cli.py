@@ -153,7 +153,7 @@ def _add_stage(name: str, meaning: str) -> None:
         with command(quiet=quiet, json=json) as terminal:
             settings = read_settings(lake=lake, workers=workers)
             outcome = carry_out(terminal, settings, (name,))
-            conclude(terminal, settings, outcome, headline=name == "report")
+            conclude(terminal, settings, outcome, headline=False)
 
     stage.__doc__ = meaning
     app.command(name=name)(stage)
@@ -169,7 +169,28 @@ STAGE_COMMANDS = {
     "report": "Write the quality report.",
 }
 for _name, _meaning in STAGE_COMMANDS.items():
-    _add_stage(_name, _meaning)
+    if _name != "report":
+        _add_stage(_name, _meaning)
+
+
+@app.command(help=STAGE_COMMANDS["report"])
+def report(
+    lake: LakeOption = None,
+    compare: Annotated[
+        Path | None, typer.Option("--compare", metavar="OTHER_LAKE", help="Also show what differs from this lake.")
+    ] = None,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write the quality report, and where asked to compare the lake with another."""
+    with command(quiet=quiet, json=json) as terminal:
+        if compare is not None:
+            from pipeline.lake import load
+
+            load(compare)  # raises where there is no lake, before any work is done
+        settings = read_settings(lake=lake, workers=workers)
+        conclude(terminal, settings, carry_out(terminal, settings, ("report",)), compare=compare)
 
 
 @app.command()

@@ -18,13 +18,16 @@ from typing import Any
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
 
+import httpx
 from prefect import flow, task
+from prefect.artifacts import create_link_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE, CacheKeyFnPolicy
 from prefect.futures import PrefectFuture, as_completed
 from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.task_runners import ThreadPoolTaskRunner
 
+from pipeline.artifacts import summarise_report
 from pipeline.lake import Entry, LakeFile, Writer, is_intact, list_ingested, open_for_writing
 from pipeline.progress import reporter
 from pipeline.settings import Settings
@@ -47,6 +50,10 @@ from pipeline.work import (
     survey,
 )
 from schemas import StructureError
+
+REPORT = "report"
+OUR_FAULTS = (400, 422)
+"""Answers of Prefect's API to a request that is wrong in itself."""
 
 Results = Iterable[tuple[str, dict[str, Any] | BaseException]]
 
@@ -197,7 +204,7 @@ def _work(order: Order) -> dict[str, Any]:
         if INGEST in order.steps:
             _ingest(writer, order, outcome)
         for stage in order.stages():
-            if outcome.failed and stage.name != "report":
+            if outcome.failed and stage.name != REPORT:
                 continue  # what comes later builds on what failed; the report shows what there is
             if INGEST in order.steps and not writer.manifest.of_stage(INGEST):
                 continue  # everything was refused
@@ -207,7 +214,29 @@ def _work(order: Order) -> dict[str, Any]:
         if set(order.steps) & {"repair", "samples", "split", "tensors"}:
             outcome.notes += explain_left_out(writer.manifest)
         outcome.notes += explain_not_rebuilt(before, writer.manifest)
+        made = writer.manifest
+    if REPORT in order.steps and not outstanding(STAGE_BY_NAME[REPORT], order.root, made, order.get_settings())[0]:
+        outcome.notes += _publish(order.root)
     return asdict(outcome)
+
+
+def _publish(root: Path) -> list[str]:
+    """Attach the report's tables and its address to the flow run; returns a note where Prefect's API is not up to it.
+
+    The lake is whole without them, so that a server that is busy, gone or forbids it fails no run. One that
+    understands the request and calls it wrong has found a fault of ours, which is raised.
+    """
+    tables, link = summarise_report(root)
+    try:
+        for table in tables:
+            create_table_artifact(table=table.rows, key=table.key, description=table.description)
+        create_link_artifact(link=link.address, link_text=link.text, key=link.key, description=link.description)
+    except (httpx.TransportError, httpx.HTTPStatusError) as failed:
+        if isinstance(failed, httpx.HTTPStatusError) and failed.response.status_code in OUR_FAULTS:
+            raise
+        reason = str(failed).splitlines()[0] if str(failed) else type(failed).__name__
+        return [f"Prefect did not take the report's tables as artifacts ({reason}); the lake and its report are whole"]
+    return []
 
 
 @flow(name="tracklake-run", validate_parameters=False, task_runner=FEW_THREADS)

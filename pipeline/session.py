@@ -156,8 +156,15 @@ def _prune_nothing(lake: Path) -> str:
     )
 
 
-def conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, headline: bool = True) -> None:
-    """Say what came of an order and exit with the code that fits."""
+def conclude(
+    terminal: "Terminal",
+    settings: "Settings",
+    outcome: "Outcome",
+    *,
+    headline: bool = True,
+    compare: Path | None = None,
+) -> None:
+    """Say what came of an order, and what differs from a lake to compare with; exit with the code that fits."""
     import json
     from dataclasses import asdict
 
@@ -178,6 +185,10 @@ def conclude(terminal: "Terminal", settings: "Settings", outcome: "Outcome", *, 
         terminal.say(f"{settings.lake}: the lake holds no recordings; `tracklake ingest SOURCE` adds some")
     elif outcome.built:
         terminal.say(f"done: {', '.join(f'{stage} {count}' for stage, count in outcome.built.items())}")
+    if compare is not None and not outcome.failed:
+        from pipeline.comparing import compare_lakes
+
+        record |= compare_lakes(terminal, settings.lake, compare)
     terminal.give(record)
     if outcome.failed or (outcome.refused and not usable):
         raise typer.Exit(FAILED)

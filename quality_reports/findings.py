@@ -24,19 +24,20 @@ def find(
     Entries are consecutive when their frames differ by exactly 1; a frame gap ends a run.
 
     Args:
-        tracks: ONE subset's entries, sorted by vehicle_id, frame, with the columns that the rules read.
+        tracks: ONE subset's entries, sorted by vehicle_id, frame, with the columns that the rules name (see
+            `quality_reports.derived.prepare` for the derived ones).
         rules: the rules to judge by.
         thresholds: overrides of the rules' thresholds by name.
 
     Returns:
-        `findings`, sorted by rule, vehicle_id, first_frame; `worst` is the extreme of the rule's value as recorded.
+        `findings`, sorted by rule, vehicle_id, first_frame; `worst` is the extreme of the rule's value.
 
     Raises:
         SubsetOrderError: more than one subset, or not sorted.
         ThresholdError: see `quality_reports.rules.resolve`.
     """
     limits = resolve(rules, thresholds)
-    _require_one_sorted_subset(tracks)
+    require_one_sorted_subset(tracks)
     if not rules or tracks.is_empty():
         return FINDINGS.empty()
     runs = [_runs(tracks.lazy(), rule, limits) for rule in rules]
@@ -53,7 +54,7 @@ def _runs(tracks: pl.LazyFrame, rule: Rule, limits: Mapping[str, float]) -> pl.L
     value = pl.col("value")
     return (
         tracks.filter(rule.broken(limits))
-        .select("dataset", "subset", "vehicle_id", "frame", value=rule.value.cast(pl.Float64))
+        .select("dataset", "subset", "vehicle_id", "frame", value=rule.measure(limits).cast(pl.Float64))
         .with_columns(run=begins.fill_null(value=True).cum_sum())
         .group_by("run")
         .agg(
@@ -86,7 +87,7 @@ def judge_subset(tracks: pl.DataFrame, *, max_backward_share: float = MAX_BACKWA
     """
     if not 0 <= max_backward_share <= 1:
         raise ValueError(f"max_backward_share must be between 0 and 1, got {max_backward_share}")
-    _require_one_sorted_subset(tracks)
+    require_one_sorted_subset(tracks)
     if tracks.is_empty():
         return SUBSET_STATUS.empty()
     vehicles = tracks["vehicle_id"].n_unique()
@@ -108,8 +109,12 @@ def judge_subset(tracks: pl.DataFrame, *, max_backward_share: float = MAX_BACKWA
     return pl.DataFrame(row, schema=SUBSET_STATUS.dtypes)
 
 
-def _require_one_sorted_subset(tracks: pl.DataFrame) -> None:
-    """Raise SubsetOrderError unless all rows are of one subset, sorted by vehicle_id, frame, without repetition."""
+def require_one_sorted_subset(tracks: pl.DataFrame) -> None:
+    """Refuse tracks of more than one subset, or not sorted by vehicle_id, frame, each pair once.
+
+    Raises:
+        SubsetOrderError: saying which.
+    """
     if tracks.is_empty():
         return
     another, in_order = tracks.select(

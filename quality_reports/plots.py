@@ -13,6 +13,8 @@ from typing import Any
 import altair as alt
 import vl_convert
 
+from quality_reports.rasters import VIRIDIS
+
 Row = dict[str, Any]
 
 INK = "#1f2328"
@@ -22,6 +24,13 @@ BLUE = "#0072b2"
 ORANGE = "#d55e00"
 GREEN = "#009e73"
 SERIES = (BLUE, ORANGE, GREEN)
+
+FLOW = (
+    ("flow_veh_per_h", "flow (veh/h)"),
+    ("density_veh_per_km", "density (veh/km)"),
+    ("speed_mps", "speed (m/s)"),
+)
+"""Columns of subset_flow.sql and their axis titles."""
 
 WIDTH = 760
 ROW_HEIGHT = 18
@@ -172,6 +181,38 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
     return _svg((subsets + deviation + mean).properties(width=WIDTH, height=52 * max(1, len(present))))
 
 
+def draw_fundamental(intervals: Sequence[Row]) -> str:
+    """The fundamental diagram: flow against density, one plot per lane and one mark per interval, coloured by speed.
+
+    Args:
+        intervals: rows of subset_flow.sql.
+    """
+    data = _data({**row, "lane": name_lane(row["lane"])} for row in intervals if row["entries"])
+    lanes = _names([{"lane": name_lane(row["lane"])} for row in intervals], "lane")
+    marks = (
+        alt.Chart(data)
+        .mark_point(filled=True, size=42, stroke=MUTED, strokeWidth=0.5, opacity=1)
+        .encode(
+            x=alt.X("density_veh_per_km:Q", title="density (veh/km)", axis=alt.Axis(tickCount=4)),
+            y=alt.Y("flow_veh_per_h:Q", title="flow (veh/h)", axis=alt.Axis(tickCount=4)),
+            color=alt.Color(
+                "speed_mps:Q",
+                title="speed (m/s)",
+                scale=alt.Scale(range=[f"#{colour}" for colour in VIRIDIS], zero=True),
+                legend=alt.Legend(gradientLength=260, gradientThickness=10),
+            ),
+        )
+        .properties(width=205, height=150)
+        .facet(facet=alt.Facet("lane:N", title=None, sort=lanes, header=alt.Header(labelColor=INK)), columns=4)
+    )
+    return _svg(marks)
+
+
+def name_lane(lane: int | None) -> str:
+    """What a lane is called on plots."""
+    return "no lane" if lane is None else f"lane {lane}"
+
+
 def _names(rows: Sequence[Row], column: str) -> list[str]:
     """The distinct values of a column, in order of appearance."""
     return list(dict.fromkeys(row[column] for row in rows))
@@ -221,6 +262,6 @@ def _svg(chart: Any) -> str:  # noqa: ANN401 - Altair's chart kinds share no pub
     )
     # Rows are aggregates: a few thousand at most, but more than Altair's limit for unaggregated data.
     with alt.data_transformers.enable("default", max_rows=None):
-        svg: str = vl_convert.vegalite_to_svg(styled.to_dict())
+        svg: str = vl_convert.vegalite_to_svg(styled.to_dict(validate=False))
     # Sizes are the style sheet's business; without a viewBox's own width and height the drawing fills its figure.
     return re.sub(r"^<svg ", '<svg role="img" ', svg, count=1)

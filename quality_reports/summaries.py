@@ -7,6 +7,9 @@ from importlib.resources import files
 from pathlib import PurePath
 from typing import Any, Protocol
 
+import polars as pl
+
+from quality_reports.published import SOURCE, list_published
 from quality_reports.rules import RULES, Rule, describe
 from schemas.columns import PARTS
 
@@ -21,7 +24,7 @@ class Connection(Protocol):
     """What the report needs of a lake's connection: DuckDB's own has it, and the read-only one of the lake."""
 
     def execute(self, statement: str, parameters: Any = ..., /) -> Any:  # noqa: ANN401 - DuckDB's own types
-        """Run a statement; the result has `description` and `fetchall()`."""
+        """Run a statement; the result has `description`, `fetchall()` and `pl()`."""
         ...
 
 
@@ -46,6 +49,18 @@ def query(connection: Connection, name: str, parameters: Parameters | None = Non
     result = connection.execute(statement(name), dict(parameters or {}))
     names = [column[0] for column in result.description or ()]
     return [dict(zip(names, plain(row), strict=True)) for row in result.fetchall()]
+
+
+def query_frame(connection: Connection, name: str, parameters: Parameters | None = None) -> pl.DataFrame:
+    """Run `sql/<name>.sql` and return its rows as a frame: for what is drawn, not printed.
+
+    Args:
+        connection: with the catalog's views.
+        name: the file's name without its suffix.
+        parameters: values of its $names.
+    """
+    frame: pl.DataFrame = connection.execute(statement(name), dict(parameters or {})).pl()
+    return frame
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a setting may hold
@@ -95,17 +110,22 @@ def collect(
         rules: [{name, severity, unit, thresholds: [{name, value, default, unit}], meaning, source, columns,
             total, datasets: [..], subsets: [..]}]; the last three are rows of findings.sql: runs, vehicles,
             vehicle_share, entries, entry_share, worst, subsets_checked, subsets_all.
-        speeds: {summary: rows of speeds.sql, histogram: rows of speed_histogram.sql}.
+        speeds: {summary: rows of speeds.sql, per_second: rows of speeds_per_second.sql, histogram: rows of
+            speed_histogram.sql}.
+        recordings: rows of recordings.sql.
+        feasibility: rows of scores.sql.
+        published: {source, figures: fields of quality_reports.published.Published}.
         starts: {subsets: rows of starts.sql, positions: rows of start_positions.sql}.
         samples: {subsets: rows of samples.sql, drops: rows of sample_drops.sql}.
         splits: {balance: rows of split_balance.sql, members: rows of split_members.sql}.
+        completeness: rows of completeness.sql.
         ingestion: {files: rows of ingested_files.sql, rejects: rows of rejects.sql}.
         scores: [{model, part, rows: [{seconds, rmse_m, n}]}], empty unless given.
         provenance: as given, and source_files: rows of source_files.sql.
 
     Args:
         connection: with the views tracks, vehicles, subsets, findings, start_cutoffs, missing_starts, samples,
-            sample_drops, neighbors, splits, split_balance, ingest_log and rejects; they may be empty.
+            sample_drops, neighbors, splits, split_balance, completeness, ingest_log and rejects; they may be empty.
         provenance: anything worth citing: lake, tracklake, versions, settings...; `thresholds`, where given, are the
             overrides that validation ran with.
         rules: what validation judged by.
@@ -121,13 +141,21 @@ def collect(
         "left_out": query(connection, "left_out"),
         "subsets": query(connection, "subsets"),
         "rules": _rules(connection, rules, provenance.get("thresholds") or {}),
-        "speeds": {"summary": query(connection, "speeds"), "histogram": query(connection, "speed_histogram")},
+        "speeds": {
+            "summary": query(connection, "speeds"),
+            "per_second": query(connection, "speeds_per_second"),
+            "histogram": query(connection, "speed_histogram"),
+        },
+        "recordings": query(connection, "recordings"),
+        "feasibility": query(connection, "scores"),
+        "published": {"source": SOURCE, "figures": list_published()},
         "starts": {"subsets": query(connection, "starts"), "positions": query(connection, "start_positions")},
         "samples": {"subsets": query(connection, "samples"), "drops": query(connection, "sample_drops")},
         "splits": {
             "balance": query(connection, "split_balance", {"parts": list(PARTS)}),
             "members": query(connection, "split_members", {"parts": list(PARTS)}),
         },
+        "completeness": query(connection, "completeness"),
         "ingestion": {
             "files": query(connection, "ingested_files"),
             "rejects": query(

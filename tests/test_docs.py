@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from quality_reports.markdown import write_rules
+from quality_reports.rules import RULES
 from schemas import TABLES
 from schemas.markdown import write_tables
 
@@ -48,6 +50,14 @@ def test_the_readme_names_every_command():
 def test_the_page_of_tables_is_current():
     assert (ROOT / "docs" / "tables.md").read_text() == write_tables(), "run `make docs`"
     assert all(f"## {table.name}\n" in write_tables() for table in TABLES)
+
+
+def test_the_page_of_rules_is_current():
+    page = (ROOT / "docs" / "rules.md").read_text()
+    assert page == write_rules(), "run `make docs`"
+    for rule in RULES:
+        assert f"## {rule.name}\n" in page
+        assert all(f"`{threshold.name}` = " in page for threshold in rule.thresholds)
 
 
 def test_links_lead_somewhere():

@@ -9,9 +9,8 @@ import polars as pl
 import pytest
 
 from pipeline.lake import connect
+from quality_reports.rules import RULES
 from schemas import TABLES
-
-RULES = ("negative_headway", "high_acceleration", "low_constant_speed", "backward")
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +25,12 @@ def sql(lake):
 
 
 def test_every_rule_finds_exactly_what_the_slow_loop_over_the_files_found(sql, truth):
+    names = [rule.name for rule in RULES]
     found = sql(
-        """
+        f"""
         SELECT s.dataset, s.subset, r.rule AS name, coalesce(sum(f.entries), 0)::BIGINT AS entries,
                count(DISTINCT f.vehicle_id) AS vehicles, count(f.vehicle_id) AS runs
-        FROM subsets AS s CROSS JOIN (SELECT unnest(['negative_headway', 'high_acceleration', 'low_constant_speed',
-            'backward']) AS rule) AS r
+        FROM subsets AS s CROSS JOIN (SELECT unnest({names}) AS rule) AS r
         LEFT JOIN findings AS f ON f.dataset = s.dataset AND f.subset = s.subset AND f.rule = r.rule
         GROUP BY ALL
         """
@@ -41,7 +40,7 @@ def test_every_rule_finds_exactly_what_the_slow_loop_over_the_files_found(sql, t
     )
     key = ["dataset", "subset", "name"]
     columns = [*key, "entries", "vehicles", "runs"]
-    assert set(expected["name"]) == set(RULES)
+    assert set(expected["name"]) == set(names)
     assert expected.group_by("name").agg(pl.col("entries").sum())["entries"].min() > 0, "every rule fires"
     assert found.select(columns).sort(key).rows() == expected.select(columns).sort(key).rows()
 
@@ -49,6 +48,10 @@ def test_every_rule_finds_exactly_what_the_slow_loop_over_the_files_found(sql, t
 def test_injected_defects_are_found_where_they_were_injected(sql, truth):
     kinds = {
         "overlap": "negative_headway",
+        "wrong_leader": "leader_mismatch",
+        "wrong_headway": "headway_mismatch",
+        "lane_flicker": "lane_flicker",
+        "position_jump": "position_jump",
         "acceleration_spike": "high_acceleration",
         "frozen_slow_speed": "low_constant_speed",
         "backward": "backward",
@@ -66,6 +69,37 @@ def test_injected_defects_are_found_where_they_were_injected(sql, truth):
     assert missed.filter(~pl.col("found").fill_null(value=False)).rows() == []
 
 
+def test_scores_are_the_shares_that_sql_makes_of_the_findings(sql):
+    # Every entry of every run of an error or a warning, then each entry once.
+    shares = sql(
+        """
+        WITH runs AS (
+            SELECT dataset, subset, vehicle_id, severity = 'error' AS error,
+                   unnest(generate_series(first_frame, last_frame)) AS frame
+            FROM findings WHERE severity IN ('error', 'warning')
+        ),
+        wrong AS (SELECT dataset, subset, vehicle_id, frame, bool_or(error) AS error FROM runs GROUP BY ALL)
+        SELECT dataset, subset, vehicle_id, count(*) AS entries,
+               avg(CASE WHEN error THEN 0 ELSE 1 END) AS without_error,
+               avg(CASE WHEN error IS NULL THEN 1 ELSE 0 END) AS without_warning
+        FROM tracks LEFT JOIN wrong USING (dataset, subset, vehicle_id, frame)
+        GROUP BY ALL ORDER BY dataset, subset, vehicle_id
+        """
+    )
+    scores = sql("SELECT * FROM vehicle_scores ORDER BY dataset, subset, vehicle_id")
+    assert scores.select("dataset", "subset", "vehicle_id", "entries").rows() == shares[:, :4].rows()
+    for name in ("without_error", "without_warning"):
+        assert scores[f"share_{name}"].to_list() == pytest.approx(shares[name].to_list()), name
+        assert 0 < (scores[f"share_{name}"] < 1).sum() < scores.height
+    subsets = sql("SELECT * FROM subset_scores")
+    assert subsets["share_without_error"].dot(subsets["entries"]) == pytest.approx(
+        (shares["without_error"] * shares["entries"]).sum()
+    )
+    # The sample's headways are exact but where they were made wrong; NGSIM's files have no lane markings.
+    assert (subsets["spacing_rms_m"] > 0.05).sum() == 5
+    assert subsets.filter(pl.col("rules_unchecked").list.len() > 0)["dataset"].unique().to_list() == ["ngsim"]
+
+
 def test_every_row_of_every_file_is_accounted_for(sql, truth):
     log = sql("SELECT file, sum(rows_read) AS read, sum(rows_kept) AS kept, sum(rows_dropped) AS dropped "
               "FROM ingest_log GROUP BY file")  # fmt: skip
@@ -80,6 +114,25 @@ def test_every_row_of_every_file_is_accounted_for(sql, truth):
         assert row["duplicate"] == row["duplicates"], row
         assert row["duplicate"] + row["malformed"] == row["dropped"] == row["rejects"], row
     assert log["kept"].sum() > 50_000
+
+
+def test_what_metadata_and_rows_announce_is_there(sql, truth, lake):
+    """Gaps, duplicates and malformed lines were injected, but the metadata describe the rows that can be kept."""
+    table = sql("SELECT * FROM completeness")
+    assert table.filter(pl.col("agrees").ne_missing(pl.lit(value=True))).rows() == []
+    kept = truth.filter((pl.col("kind") == "rows") & (pl.col("name") == "kept"))
+    per_file = dict(kept.select("file", "entries").rows())
+    highd = table.filter(pl.col("dataset") == "highd")
+    assert highd.height == 8 * 4, "eight figures of each recording"
+    for recording, measure, found in highd.select("recording", "measure", "found").rows():
+        expected = {"entries": per_file[f"{recording}_tracks.csv"], "vehicles": per_file[f"{recording}_tracksMeta.csv"]}
+        if measure in expected:
+            assert found == expected[measure], (recording, measure)
+    ngsim = table.filter((pl.col("dataset") == "ngsim") & (pl.col("measure") == "entries"))
+    assert set(ngsim["authority"]) == {"Total_Frames"}, "the sample's times of day were never recorded, nor published"
+    files = kept.filter(pl.col("dataset") == "ngsim")
+    assert ngsim["expected"].sum() == ngsim["found"].sum() == files["entries"].sum() > 0
+    assert not [note for note in lake.said["notes"] if "announce" in note or "published" in note]
 
 
 def test_tracks_of_the_raw_files_stand_in_the_lake(sql, truth):

@@ -4,18 +4,15 @@ A vehicle carries one defect at most, and neither does the leader into which a v
 is that of an NGSIM overlap whose leader also misses frames, declared as both.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
+from pipeline.sample.damaging import Defect, Inflict, Work, pick_run
+from pipeline.sample.misreadings import change_lane_and_back, jump, misread_headway, skip_leader
 from pipeline.sample.neighbors import find_surroundings
 from pipeline.sample.scenarios import Plan
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 DEEPEST_START_M = 200.0
 SHALLOWEST_START_M = 20.0
@@ -31,80 +28,13 @@ ROLLING_MPS = 1.6
 
 
 @dataclass(frozen=True)
-class Defect:
-    """One injected defect.
-
-    Args:
-        name: late_start, overlap, backward, acceleration_spike, frozen_slow_speed, frame_gap, overlap_unseen.
-        vehicle: whose.
-        first_frame: of the damaged or missing entries.
-        last_frame: of them.
-        entries: how many.
-        value: late_start the x_m of the first entry kept; overlap and overlap_unseen the depth in m; backward the
-            lowest speed in m/s; acceleration_spike the acceleration in m/s2; frozen_slow_speed the speed in m/s.
-    """
-
-    name: str
-    vehicle: int
-    first_frame: int
-    last_frame: int
-    entries: int
-    value: float | None = None
-
-
-@dataclass
-class _Work:
-    """Columns being damaged, and who has been."""
-
-    rate_hz: float
-    random: np.random.Generator
-    vehicle: Integers
-    frame: Integers
-    lane: Integers
-    x: Floats
-    length: Floats
-    speed: Floats
-    accel: Floats
-    leader: Integers
-    begins: Integers
-    ends: Integers
-    never_written: npt.NDArray[np.bool_]
-    lost_later: npt.NDArray[np.bool_]
-    used: set[int] = field(default_factory=set)
-    defects: list[Defect] = field(default_factory=list)
-
-    def seconds(self, least: float, most: float) -> int:
-        """A random number of frames, at least one."""
-        return max(1, round(self.random.uniform(least, most) * self.rate_hz))
-
-    def free(self) -> list[int]:
-        """Vehicles (their places) without a defect, shuffled."""
-        return [int(place) for place in self.random.permutation(len(self.begins)) if int(place) not in self.used]
-
-    def rows(self, place: int) -> slice:
-        return slice(int(self.begins[place]), int(self.ends[place]))
-
-    def note(self, name: str, first: int, last: int, value: float | None = None) -> None:
-        """Declare the entries from row `first` to row `last` of one vehicle damaged."""
-        self.defects.append(
-            Defect(
-                name,
-                int(self.vehicle[first]),
-                int(self.frame[first]),
-                int(self.frame[last]),
-                last - first + 1,
-                None if value is None else float(value),
-            )
-        )
-
-
-@dataclass(frozen=True)
 class Injected:
     """Damaged tracks.
 
     Args:
-        tracks: as before, with a column `lost` (Boolean): entries that are seen, so that others name them as their
-            leader, but are missing from the file.
+        tracks: as before, with the columns `lost` (Boolean): entries that are seen, so that others name them as their
+            leader, but are missing from the file; `leader_skipped` (Boolean): the leader's leader is recorded as the
+            own; `headway_error` (Float64): metres by which the recorded headway is wrong.
         defects: all of them.
     """
 
@@ -133,12 +63,12 @@ def inject(
     """
     vehicle = tracks["vehicle"].to_numpy().astype(np.int64)
     begins = np.flatnonzero(np.diff(vehicle, prepend=-1))
-    work = _Work(
+    work = Work(
         rate_hz=rate_hz,
         random=random,
         vehicle=vehicle,
         frame=tracks["frame"].to_numpy().astype(np.int64),
-        lane=tracks["lane"].to_numpy().astype(np.int64),
+        lane=tracks["lane"].to_numpy().astype(np.int64, copy=True),
         x=tracks["x"].to_numpy().copy(),
         length=tracks["length"].to_numpy(),
         speed=tracks["speed"].to_numpy().copy(),
@@ -148,6 +78,8 @@ def inject(
         ends=np.append(begins[1:], len(vehicle)),
         never_written=np.zeros(len(vehicle), bool),
         lost_later=np.zeros(len(vehicle), bool),
+        leader_skipped=np.zeros(len(vehicle), bool),
+        headway_error=np.zeros(len(vehicle)),
     )
     backward = int(plan.backward_share * len(begins))
     for each, count in (
@@ -157,21 +89,25 @@ def inject(
         (_frozen, plan.frozen),
         (_spike, plan.spikes),
         (_gap, plan.gaps),
+        (jump, plan.jumps),
+        (skip_leader, plan.wrong_leaders),
+        (misread_headway, plan.wrong_headways),
+        (change_lane_and_back(on_ramp_lane), plan.lane_flickers),
     ):
         _spread(work, each, count)
     damaged = tracks.with_columns(
         pl.Series("x", work.x),
         pl.Series("speed", work.speed),
         pl.Series("accel", work.accel),
+        pl.Series("lane", work.lane).cast(tracks.schema["lane"]),
         pl.Series("lost", work.lost_later),
+        pl.Series("leader_skipped", work.leader_skipped),
+        pl.Series("headway_error", work.headway_error),
     ).filter(~pl.Series(work.never_written))
     return Injected(damaged, work.defects)
 
 
-Inflict = Callable[[_Work, int], bool]
-
-
-def _spread(work: _Work, inflict: Inflict, count: int) -> None:
+def _spread(work: Work, inflict: Inflict, count: int) -> None:
     """Damage up to `count` vehicles; those on which the defect makes no sense are passed by."""
     for place in work.free():
         if count == 0:
@@ -181,17 +117,7 @@ def _spread(work: _Work, inflict: Inflict, count: int) -> None:
             count -= 1
 
 
-def _run(work: _Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
-    """A random run of `wanted` rows at least `margin` rows from both ends of the track: first and last row."""
-    rows = work.rows(place)
-    room = rows.stop - rows.start - 2 * margin - wanted
-    if room < 0:
-        return None
-    first = rows.start + margin + int(work.random.integers(room + 1))
-    return first, first + wanted - 1
-
-
-def _slowest(work: _Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
+def _slowest(work: Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
     """The run of `wanted` rows around the slowest row that is not near an end."""
     rows = work.rows(place)
     inner = work.speed[rows][margin : max(margin, rows.stop - rows.start - margin - wanted)]
@@ -202,7 +128,7 @@ def _slowest(work: _Work, place: int, wanted: int, margin: int) -> tuple[int, in
 
 
 def _late_start(on_ramp_lane: int | None) -> Inflict:
-    def inflict(work: _Work, place: int) -> bool:
+    def inflict(work: Work, place: int) -> bool:
         """The first part of the track was never seen."""
         rows = work.rows(place)
         start = work.random.uniform(SHALLOWEST_START_M, DEEPEST_START_M)
@@ -222,7 +148,7 @@ def _late_start(on_ramp_lane: int | None) -> Inflict:
 def _overlap(unseen_leaders: bool) -> Inflict:
     unseen = [unseen_leaders]
 
-    def inflict(work: _Work, place: int) -> bool:
+    def inflict(work: Work, place: int) -> bool:
         """For a while the vehicle drifts into its leader, where it is nearest to it, and back out again."""
         ramp, deep = round(DRIFT_S * work.rate_hz), work.seconds(0.4, 1.6)
         run = _nearest_to_leader(work, place, 2 * ramp + deep)
@@ -256,7 +182,7 @@ def _overlap(unseen_leaders: bool) -> Inflict:
     return inflict
 
 
-def _nearest_to_leader(work: _Work, place: int, wanted: int) -> tuple[int, int] | None:
+def _nearest_to_leader(work: Work, place: int, wanted: int) -> tuple[int, int] | None:
     """The run of `wanted` rows behind one leader around the smallest gap that is at most NEAREST_LEADER_M."""
     rows = work.rows(place)
     leader = work.leader[rows]
@@ -272,7 +198,7 @@ def _nearest_to_leader(work: _Work, place: int, wanted: int) -> tuple[int, int] 
     return rows.start + first, rows.start + first + wanted - 1
 
 
-def _backward(work: _Work, place: int) -> bool:
+def _backward(work: Work, place: int) -> bool:
     """The vehicle rolls back: a smooth swing where it is slow, wrong signs in its recorded speed where it is not."""
     wanted = work.seconds(4.0, 5.0)
     run = _slowest(work, place, wanted, margin=round(work.rate_hz / 2))
@@ -299,7 +225,7 @@ def _backward(work: _Work, place: int) -> bool:
     return True
 
 
-def _frozen(work: _Work, place: int) -> bool:
+def _frozen(work: Work, place: int) -> bool:
     """A slow speed stays the same for a while, with exactly no acceleration."""
     run = _slowest(work, place, work.seconds(0.4, 1.2), margin=round(work.rate_hz / 2))
     if run is None:
@@ -311,9 +237,9 @@ def _frozen(work: _Work, place: int) -> bool:
     return True
 
 
-def _spike(work: _Work, place: int) -> bool:
+def _spike(work: Work, place: int) -> bool:
     """The recorded acceleration is beyond what cars do."""
-    run = _run(work, place, work.seconds(0.05, 0.5), margin=2)
+    run = pick_run(work, place, work.seconds(0.05, 0.5), margin=2)
     if run is None:
         return False
     work.accel[run[0] : run[1] + 1] = work.random.uniform(3.2, 9.0)
@@ -321,9 +247,9 @@ def _spike(work: _Work, place: int) -> bool:
     return True
 
 
-def _gap(work: _Work, place: int) -> bool:
+def _gap(work: Work, place: int) -> bool:
     """Some frames in the middle of the track are missing."""
-    run = _run(work, place, work.seconds(0.1, 1.0), margin=round(work.rate_hz))
+    run = pick_run(work, place, work.seconds(0.1, 1.0), margin=round(work.rate_hz))
     if run is None:
         return False
     work.lost_later[run[0] : run[1] + 1] = True

@@ -7,12 +7,13 @@ frame is not counted; minima of nothing are -1. Sight distances run from the veh
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.sample.misreadings import headway_errors, recorded_leaders
 from pipeline.sample.neighbors import find_surroundings, pick
 from pipeline.sample.scenarios import HighdScenario
 
@@ -80,8 +81,9 @@ def image_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_
     middle_y = markings.upper[-1] - y if upper else markings.lower[0] + y
     front = window_m - corner_x if upper else corner_x + length
     around = find_surroundings(tracks.with_columns(pl.Series("x", front)))
+    around = replace(around, leader=recorded_leaders(around.leader, tracks))
     led = around.leader >= 0
-    gap: Floats = np.where(led, pick(front - length, around.leader) - front, 0.0)
+    gap: Floats = np.where(led, pick(front - length, around.leader) - front + headway_errors(tracks), 0.0)
     leader_speed = pick(speed, around.leader)
     x_speed, y_speed = np.round(sign * speed, 2), sign * lateral
     rate_of = _central_acceleration(tracks, y_speed)

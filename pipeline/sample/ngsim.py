@@ -11,6 +11,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import polars as pl
 
+from pipeline.sample.misreadings import headway_errors, recorded_leaders
 from pipeline.sample.neighbors import find_surroundings, pick
 
 FOOT_M = 0.3048
@@ -68,8 +69,9 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
     x_ft, y_ft, speed = np.round(x_ft, 3), np.round(y_ft, 3), np.round(speed, 2) + 0.0
     vehicle, frame = tracks["vehicle"].to_numpy(), tracks["frame"].to_numpy().astype(np.int64)
     around = find_surroundings(tracks.with_columns(pl.Series("x", x_ft), pl.Series("length", length_ft)))
-    led = around.leader >= 0
-    headway = np.where(led, np.round(pick(x_ft, around.leader) - x_ft, 2), 0.0)
+    leader = recorded_leaders(around.leader, tracks)
+    led = leader >= 0
+    headway = np.where(led, np.round(pick(x_ft, leader) - x_ft + headway_errors(tracks) / FOOT_M, 2), 0.0)
     moving = speed > 0
     seconds = np.divide(headway, speed, out=np.full_like(headway, STANDING_HEADWAY), where=moving)
     east, north = np.cos(HEADING_RAD), np.sin(HEADING_RAD)
@@ -89,7 +91,7 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
             "v_Vel": speed,
             "v_Acc": accel,
             "Lane_ID": tracks["lane"],
-            "Preceding": pick(vehicle, around.leader),
+            "Preceding": pick(vehicle, leader),
             "Following": pick(vehicle, around.follower),
             "Space_Headway": headway,
             "Time_Headway": np.where(led, np.minimum(seconds, STANDING_HEADWAY), 0.0),

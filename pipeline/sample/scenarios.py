@@ -45,6 +45,10 @@ class Plan:
         spikes: vehicles with some recorded accelerations beyond 3.05 m/s2.
         frozen: vehicles with some recorded slow speeds of exactly no acceleration.
         gaps: vehicles that lose frames in the middle of their track.
+        jumps: vehicles located too far ahead for some frames.
+        wrong_leaders: vehicles whose leader's leader is recorded as theirs for a while.
+        wrong_headways: vehicles whose recorded headway is wrong for a while.
+        lane_flickers: vehicles recorded in the lane beside theirs for less than two seconds.
     """
 
     late_starts: int = 3
@@ -53,6 +57,10 @@ class Plan:
     spikes: int = 3
     frozen: int = 2
     gaps: int = 2
+    jumps: int = 0
+    wrong_leaders: int = 0
+    wrong_headways: int = 0
+    lane_flickers: int = 0
 
 
 @dataclass(frozen=True)
@@ -138,8 +146,13 @@ WEAVE_BEGINS_M = 180.0
 WEAVE_ENDS_M = 430.0
 """Where the on-ramp comes into view, where it becomes the auxiliary lane, and where that ends."""
 
+_MISREAD = Plan(jumps=1, wrong_leaders=1, wrong_headways=2, lane_flickers=2)
+
 HIGHD = (
-    HighdScenario("01", 1, TWO_LANES, 1.9, "09.2017", "Tue", "08:38", Traffic(0.25), Traffic(0.36, trucks=0.2)),
+    HighdScenario(
+        "01", 1, TWO_LANES, 1.9, "09.2017", "Tue", "08:38",
+        Traffic(0.25, plan=_MISREAD), Traffic(0.36, trucks=0.2, plan=_MISREAD),
+    ),
     HighdScenario(
         "02", 2, THREE_LANES, 1.1, "10.2017", "Wed", "11:10",
         Traffic(0.30),
@@ -154,7 +167,10 @@ HIGHD = (
     HighdScenario("04", 2, THREE_LANES, 0.35, "11.2017", "Fri", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
 )  # fmt: skip
 
-_NGSIM_PLAN = Plan(late_starts=4, overlaps=3, backward_share=0.01, spikes=5, frozen=4, gaps=4)
+_NGSIM_PLAN = Plan(
+    late_starts=4, overlaps=3, backward_share=0.01, spikes=5, frozen=4, gaps=4, jumps=2, wrong_leaders=2,
+    wrong_headways=2, lane_flickers=2,
+)  # fmt: skip
 _MORNING = Traffic(0.30, trucks=0.1, bottleneck_mps=9.0, ramp_arrivals=0.12, plan=_NGSIM_PLAN)
 _QUEUE = Traffic(0.32, trucks=0.12, bottleneck_mps=5.0, pulsing=True, ramp_arrivals=0.10, plan=_NGSIM_PLAN)
 _LATER = Traffic(0.30, trucks=0.1, ramp_arrivals=0.15, plan=_NGSIM_PLAN)

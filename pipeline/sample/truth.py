@@ -1,7 +1,7 @@
-"""What a slow, obvious loop finds in the written files, and the table that says so.
+"""The written files read back, and the table of what stands in them.
 
-This is the one place of the project that loops over entries in Python, on purpose: it shares no code with the
-pipeline, its sources or its rules, so that equal counts mean something.
+This and `judging` are the places of the project that loop over entries in Python, on purpose: they share no code with
+the pipeline, its sources or its rules, so that equal counts mean something.
 """
 
 import csv
@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import polars as pl
+
+from pipeline.sample.judging import Entry, Surface, count_rules
 
 TRUTH_SCHEMA = {
     "kind": pl.String(),
@@ -34,22 +36,8 @@ its true x_m at the first, from the window's entrance along the direction of tra
 runs of consecutive frames. `rows`: lines of a file that are `read` (the header apart), `kept`, `malformed`,
 `duplicate`. Null where a column does not apply."""
 
-RULES = ("negative_headway", "high_acceleration", "low_constant_speed", "backward")
-HIGH_ACCELERATION_MPS2 = 3.05
-LOW_SPEED_MPS = 1.52
 METRES_PER_FOOT = 0.3048
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One row of a file in SI units along the direction of travel."""
-
-    front: float
-    length: float
-    speed: float
-    accel: float
-    leader: int
-    headway: float | None
+NGSIM_CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
 
 
 @dataclass
@@ -70,6 +58,7 @@ class Found:
     """Everything read back: entries by subset and (vehicle, frame), and what became of the lines."""
 
     entries: dict[tuple[str, str, str], dict[tuple[int, int], Entry]] = field(default_factory=dict)
+    surfaces: dict[str, Surface] = field(default_factory=dict)
     files: list[FileCount] = field(default_factory=list)
 
 
@@ -110,10 +99,16 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
             else:
                 count.kept += 1
         found.files.append(count)
-    direction = {}
+    direction, kinds = {}, {}
     for line in _lines(folder / f"{recording}_tracksMeta.csv")[1:]:
         meta = line.split(",")
         direction[int(meta[0])] = int(meta[7])
+        kinds[int(meta[0])] = meta[6].lower()
+    facts = _lines(folder / f"{recording}_recordingMeta.csv")[1].split(",")
+    upper, lower = ([float(y) for y in field.split(";")] for field in facts[13:15])
+    markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
+    for side, places in markings.items():
+        found.surfaces[f"{recording}-{side}"] = Surface(float(facts[1]), tuple(places), headway_stands_in=False)
     name = f"{recording}_tracks.csv"
     count = FileCount(name, "highd", recording)
     seen = set()
@@ -135,13 +130,18 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         vehicle, frame = int(numbers[1]), int(numbers[0])
         left = direction[vehicle] == 1
         along = -1 if left else 1
+        middle, lanes, lane = numbers[3] + numbers[5] / 2, len(upper) - 1, int(numbers[24])
         entry = Entry(
             front=-numbers[2] if left else numbers[2] + numbers[4],
             length=numbers[4],
             speed=along * numbers[6],
             accel=along * numbers[8],
             leader=int(numbers[16]),
-            headway=None,
+            headway=numbers[12],
+            y=upper[-1] - middle if left else middle - lower[0],
+            width=numbers[5],
+            lane=lanes + 2 - lane if left else lane - lanes - 2,
+            kind=kinds[vehicle],
         )
         subset = f"{recording}-{'upper' if left else 'lower'}"
         found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry
@@ -186,57 +186,19 @@ def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
             accel=numbers[12] * METRES_PER_FOOT,
             leader=int(numbers[14]),
             headway=numbers[16] * METRES_PER_FOOT,
+            y=numbers[4] * METRES_PER_FOOT,
+            width=numbers[9] * METRES_PER_FOOT,
+            lane=int(numbers[13]),
+            kind=NGSIM_CLASSES[int(numbers[10])],
         )
     found.files.append(count)
-
-
-def _gap(entries: dict[tuple[int, int], Entry], lengths: dict[int, float], key: tuple[int, int]) -> float | None:
-    """Bumper to bumper, m; None where it cannot be known."""
-    own = entries[key]
-    if own.leader == 0:
-        return None
-    leader = entries.get((own.leader, key[1]))
-    if leader is not None:
-        return round(leader.front - leader.length - own.front, 3)
-    if own.headway is not None and own.headway > 0 and own.leader in lengths:
-        return round(own.headway - lengths[own.leader], 3)
-    return None
-
-
-def count_rules(entries: dict[tuple[int, int], Entry]) -> dict[str, tuple[int, int, int]]:
-    """Per rule: entries, vehicles and runs of consecutive frames that break it.
-
-    Args:
-        entries: of one subset, by (vehicle, frame).
-    """
-    lengths = {vehicle: entry.length for (vehicle, _), entry in entries.items()}
-    broken: dict[str, list[tuple[int, int]]] = {rule: [] for rule in RULES}
-    for key in sorted(entries):
-        entry = entries[key]
-        gap = _gap(entries, lengths, key)
-        if gap is not None and gap < 0:
-            broken["negative_headway"].append(key)
-        if entry.accel > HIGH_ACCELERATION_MPS2:
-            broken["high_acceleration"].append(key)
-        if 0 < entry.speed <= LOW_SPEED_MPS and entry.accel == 0:
-            broken["low_constant_speed"].append(key)
-        if entry.speed < 0:
-            broken["backward"].append(key)
-    counts = {}
-    for rule, keys in broken.items():
-        runs = 0
-        for i, (vehicle, frame) in enumerate(keys):
-            if i == 0 or keys[i - 1] != (vehicle, frame - 1):
-                runs += 1
-        counts[rule] = (len(keys), len({vehicle for vehicle, _ in keys}), runs)
-    return counts
 
 
 def rows_of(found: Found) -> list[dict[str, object]]:
     """The `rule` and `rows` rows of the truth table."""
     rows: list[dict[str, object]] = []
     for (dataset, recording, subset), entries in sorted(found.entries.items()):
-        for rule, (hits, vehicles, runs) in count_rules(entries).items():
+        for rule, (hits, vehicles, runs) in count_rules(entries, found.surfaces.get(subset, Surface())).items():
             rows.append(
                 {
                     "kind": "rule", "dataset": dataset, "recording": recording, "subset": subset, "name": rule,

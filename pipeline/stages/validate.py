@@ -1,4 +1,4 @@
-"""Validate: findings of every rule, and which subsets are excluded."""
+"""Validate: findings of every rule, scores, and which subsets are excluded."""
 
 from pathlib import Path
 
@@ -7,11 +7,13 @@ import polars as pl
 from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
 from pipeline.settings import Settings
 from pipeline.stages.base import Job, make_entry, make_job, recordings
-from quality_reports.findings import find, judge_subset
-from quality_reports.rules import RULES, resolve, select_broken
-from schemas import FINDINGS, SUBSET_STATUS, TRACKS
+from quality_reports.findings import judge_subset
+from quality_reports.judging import judge, tracks_needed
+from quality_reports.rules import RULES, resolve
+from quality_reports.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, find_lacking
+from schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
 
-VERSION = 1
+VERSION = 2
 
 
 def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
@@ -34,20 +36,37 @@ def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
-    """Find what breaks rules in each subset of a recording, and judge the subset."""
+    """Find what breaks rules in each subset of a recording, score it, and judge the subset."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
     notes = []
     for subset in job.inputs["subsets"]:
-        tracks = scan(root, manifest, TRACKS, dataset=dataset, subset=subset).collect()
-        rules = select_broken(tracks, RULES, settings.thresholds)
-        limits = {name: value for name, value in settings.thresholds.items() if any(name in r.defaults for r in rules)}
-        findings = find(tracks, rules, limits)
-        status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
         values = {"dataset": dataset, "subset": subset}
-        for table, frame in ((FINDINGS, findings), (SUBSET_STATUS, status)):
+        tracks, vehicles, facts = (
+            scan(root, manifest, table, **values).select(columns).collect()
+            for table, columns in (
+                (TRACKS, tracks_needed()),
+                (VEHICLES, ("vehicle_id", *VEHICLE_COLUMNS)),
+                (SUBSETS, (*SUBSET_COLUMNS, "columns_missing")),
+            )
+        )
+        frame_rate_hz, lane_markings_m = facts.select(SUBSET_COLUMNS).row(0)
+        scene = Scene(tracks, vehicles, frame_rate_hz, lane_markings_m)
+        judged = judge(scene, find_lacking(vehicles, facts), settings.thresholds)
+        status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
+        tables = (
+            (FINDINGS, judged.findings),
+            (VEHICLE_SCORES, judged.vehicle_scores),
+            (SUBSET_SCORES, judged.subset_scores),
+            (SUBSET_STATUS, status),
+        )
+        for table, frame in tables:
             written = write_table(root, table, frame, values, job.fingerprint, where=subset)
             files.setdefault(table.name, []).extend(written)
+        # That no NGSIM recording has lane markings is nothing to tell about each of them.
+        lacking = [rule.name for rule in judged.unchecked if "lane_markings_m" not in rule.columns]
+        if lacking:
+            notes.append(f"{subset}: rules not checked, since the files lack what they read: {', '.join(lacking)}")
         reasons = status.filter(pl.col("excluded"))["excluded_reason"].to_list()
         notes += [f"{subset} is excluded from samples and splits: {reason}" for reason in reasons]
     return make_entry(job, files, {"notes": notes})

@@ -3,18 +3,20 @@
 import json
 import os
 import shutil
+import sqlite3
 import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 from prefect.testing.utilities import prefect_test_harness
 
 from pipeline import flows
-from pipeline.lake import load
+from pipeline.lake import connect, load
 from pipeline.lake.manifest import Manifest, store
 from pipeline.sources import SourceError
 from pipeline.stages import ingest
@@ -128,6 +130,98 @@ def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, c
         file.write("\n")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 4}
+
+
+def artifacts_of(root: Path) -> dict[str, list]:
+    """The artifacts of a lake's runs by key, without the lake's name and id at its end, oldest first."""
+    ending = f"-lake-{load(root).lake_id[:8]}"
+    with get_client(sync_client=True) as client:
+        found = sorted(client.read_artifacts(), key=lambda artifact: artifact.created)
+    made: dict[str, list] = {}
+    for artifact in found:
+        if artifact.key.endswith(ending):
+            made.setdefault(artifact.key.removesuffix(ending), []).append(artifact)
+    return made
+
+
+@pytest.mark.usefixtures("server")
+def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
+    root = tmp_path / "odd [x](y) \u00e9" / "Lake"
+    outcome = flows.run(str(root), str(raw))
+    assert outcome["failed"] == []
+    assert not any("artifacts" in note for note in outcome["notes"])
+    found = artifacts_of(root)
+    assert {key: len(made) for key, made in found.items()} == dict.fromkeys(
+        [f"tracklake-{what}" for what in ("findings", "subsets", "ingestion", "completeness", "report")], 1
+    )
+    quality = json.loads((root / "reports" / "quality.json").read_text())
+    tables = {key: json.loads(made[0].data) for key, made in found.items() if made[0].type == "table"}
+    rules = {row["rule"]: row for row in tables["tracklake-findings"]}
+    assert list(rules) == [rule["name"] for rule in quality["rules"]]
+    with connect(root) as lake:
+        in_lake = lake.sql("SELECT rule, count(*), sum(entries)::BIGINT FROM findings GROUP BY rule").fetchall()
+        subsets = lake.sql("SELECT subset, vehicles, entries FROM subsets ORDER BY subset").fetchall()
+        files = lake.sql("SELECT file, rows_read, rows_dropped FROM ingest_log ORDER BY file").fetchall()
+        announced = lake.sql("SELECT measure, expected, found FROM completeness ORDER BY authority, measure").fetchall()
+    assert len(in_lake) > 3
+    assert {name: (row["findings"], row["entries"]) for name, row in rules.items() if row["findings"]} == {
+        rule: (runs, entries) for rule, runs, entries in in_lake
+    }
+    shown = tables["tracklake-subsets"]
+    assert [(row["subset"], row["vehicles"], row["entries"]) for row in shown] == subsets
+    per_rule = {rule: sum(row[rule] or 0 for row in shown) for rule in rules}
+    assert {rule: entries for rule, entries in per_rule.items() if entries} == {r: n for r, _, n in in_lake}
+    assert [(row["file"], row["rows_read"], row["rows_dropped"]) for row in tables["tracklake-ingestion"]] == files
+    assert [(row["measure"], row["expected"], row["found"]) for row in tables["tracklake-completeness"]] == announced
+    (link,) = found["tracklake-report"]
+    assert link.data == f"[quality report of Lake]({(root / 'reports' / 'index.html').as_uri()})"
+    assert link.data.count("(") == 1, "what a path's brackets would end is the link"
+    with get_client(sync_client=True) as client:
+        assert client.read_flow_run(link.flow_run_id).state.is_completed()
+    # A run that finds the report up to date shows it again, as that run's; one of another stage does not.
+    flows.quality(str(root))
+    flows.run_stage("validate", str(root))
+    assert {len(made) for made in artifacts_of(root).values()} == {2}
+
+
+@pytest.mark.usefixtures("server")
+@pytest.mark.parametrize(
+    ("failure", "is_ours"),
+    [
+        (httpx.ConnectError("nobody there"), False),
+        (httpx.ReadTimeout(""), False),
+        (503, False),
+        (403, False),
+        (422, True),
+        (TypeError("table is no list"), True),
+    ],
+)
+def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lake, monkeypatch, failure, is_ours):
+    def refuse(**_table):
+        if isinstance(failure, int):
+            request = httpx.Request("POST", "http://prefect/api/artifacts/")
+            raise httpx.HTTPStatusError(f"answered {failure}", request=request, response=httpx.Response(failure))
+        raise failure
+
+    monkeypatch.setattr(flows, "create_table_artifact", refuse)
+    if is_ours:
+        with pytest.raises((httpx.HTTPStatusError, TypeError)):
+            flows._publish(lake.root)
+    else:
+        (note,) = flows._publish(lake.root)
+        says = {503: "answered 503", 403: "answered 403"}.get(failure, str(failure) or "ReadTimeout")
+        assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
+
+
+def test_the_embedded_server_takes_the_artifacts_too(command, raw, tmp_path):
+    home = tmp_path / "prefect"
+    done = command("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(home))
+    assert done.code == 0, done.err
+    assert "artifacts" not in done.out
+    with sqlite3.connect(f"file:{home / 'prefect.db'}?mode=ro", uri=True) as database:
+        keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
+    database.close()
+    assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
 
 
 def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):

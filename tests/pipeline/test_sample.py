@@ -73,12 +73,12 @@ def test_text_is_aligned_and_has_no_header(written):
 
 
 def test_rules_find_exactly_the_injected_defects(truth):
-    """SUMO brakes, accelerates and queues as vehicles can, so that the rules count nothing but what was injected."""
+    """SUMO brakes, accelerates and queues as vehicles can, so that these rules count nothing but what was injected."""
     found = {
         (subset, name): entries
         for subset, name, entries in truth.filter(kind="rule").select("subset", "name", "entries").iter_rows()
     }
-    assert len(found) == (8 + 4) * 4
+    assert len(found) == (8 + 4) * 16
     injected = truth.filter((pl.col("kind") == "defect") & pl.col("line").is_null())
     counts = {
         (subset, name): entries
@@ -91,8 +91,14 @@ def test_rules_find_exactly_the_injected_defects(truth):
         "backward": "backward",
     }
     for (subset, rule), entries in found.items():
-        assert entries == counts.get((subset, names[rule]), 0), (subset, rule)
-    assert {name for _, name in counts} == {*names.values(), "late_start", "frame_gap", "overlap_unseen"}
+        assert rule not in names or entries == counts.get((subset, names[rule]), 0), (subset, rule)
+    misread = {"wrong_leader", "wrong_headway", "lane_flicker", "position_jump"}
+    assert {name for _, name in counts} == {*names.values(), *misread, "late_start", "frame_gap", "overlap_unseen"}
+    # Whoever leads a vehicle that is recorded in a lane not its own has, by the files, lost its follower; a headway is
+    # also wrong where somebody has jumped. Nothing less than what was injected is found.
+    rules = {"wrong_headway": "headway_mismatch", "lane_flicker": "lane_flicker"}
+    for (subset, name), entries in counts.items():
+        assert name not in rules or found[subset, rules[name]] >= entries, (subset, name)
 
 
 def test_one_subset_drives_backwards_and_no_other_does_so_beyond_one_percent(truth):

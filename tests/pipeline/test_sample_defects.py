@@ -5,6 +5,8 @@ import polars as pl
 import pytest
 
 from pipeline.sample.defects import inject
+from pipeline.sample.misreadings import recorded_leaders
+from pipeline.sample.neighbors import find_surroundings
 from pipeline.sample.noise import DRONE, add_noise
 from pipeline.sample.scenarios import FREEWAY, TWO_LANES, Plan
 
@@ -49,7 +51,8 @@ def rows_of(frame, defect):
 def test_nothing_is_injected_where_nothing_is_planned():
     before, done = damage(NOTHING)
     assert done.defects == []
-    assert done.tracks.drop("lost").equals(before)
+    assert done.tracks.drop("lost", "leader_skipped", "headway_error").equals(before)
+    assert done.tracks["headway_error"].abs().sum() == done.tracks["leader_skipped"].sum() == 0
     assert not done.tracks["lost"].any()
 
 
@@ -147,6 +150,66 @@ def test_a_slow_vehicle_rolls_back_in_its_positions_as_well():
     for defect in done.defects:
         x = rows_of(done.tracks, defect)["x"].to_numpy()
         assert x[-1] < x[0]
+
+
+NONE = {"late_starts": 0, "overlaps": 0, "spikes": 0, "frozen": 0, "gaps": 0}
+
+
+def only(**planned):
+    return Plan(**{**NONE, **planned})
+
+
+def test_skipped_leaders_and_wrong_headways_stand_where_declared():
+    before, done = damage(only(wrong_leaders=2, wrong_headways=2))
+    leaders, headways = ([d for d in done.defects if d.name == name] for name in ("wrong_leader", "wrong_headway"))
+    assert (len(leaders), len(headways)) == (2, 2)
+    assert done.tracks["leader_skipped"].sum() == sum(defect.entries for defect in leaders)
+    assert (done.tracks["headway_error"] != 0).sum() == sum(defect.entries for defect in headways)
+    assert all(rows_of(done.tracks, defect)["leader_skipped"].all() for defect in leaders)
+    for defect in headways:
+        assert set(rows_of(done.tracks, defect)["headway_error"]) == {defect.value}
+        assert 1.5 <= defect.value <= 4.0
+    assert done.tracks.select(before.columns).equals(before)
+    # Vehicle v follows v - 1 in the lane: recorded is v - 2, wherever the two are there.
+    around = find_surroundings(done.tracks)
+    recorded = recorded_leaders(around.leader, done.tracks)
+    vehicle = done.tracks["vehicle"].to_numpy()
+    for defect in leaders:
+        rows = (vehicle == defect.vehicle) & done.tracks["leader_skipped"].to_numpy()
+        assert set(vehicle[recorded[rows]]) == {defect.vehicle - 2}
+    untouched = ~done.tracks["leader_skipped"].to_numpy()
+    assert (recorded[untouched] == around.leader[untouched]).all()
+
+
+def test_positions_jump_where_declared():
+    before, done = damage(only(jumps=2), tracks=platoon(spacing=60.0))
+    assert [defect.name for defect in done.defects] == ["position_jump"] * 2
+    moved = done.tracks["x"] - before["x"]
+    assert (moved != 0).sum() == sum(defect.entries for defect in done.defects)
+    for defect in done.defects:
+        steps = (rows_of(done.tracks, defect)["x"] - rows_of(before, defect)["x"]).to_numpy()
+        assert steps == pytest.approx(np.full(defect.entries, defect.value))
+        assert 2.5 <= defect.value <= 4.0
+    # Where vehicles follow each other at 20 m, only those without a leader have room.
+    before, done = damage(only(jumps=2))
+    assert len(done.defects) == 2
+    for defect in done.defects:
+        for frame, x in rows_of(before, defect).select("frame", "x").iter_rows():
+            assert before.filter((pl.col("frame") == frame) & (pl.col("x") > x)).is_empty()
+
+
+def test_lanes_flicker_where_declared_and_nobody_is_beside():
+    before, done = damage(only(lane_flickers=2))
+    assert [(defect.name, defect.value) for defect in done.defects] == [("lane_flicker", 2.0)] * 2
+    assert (done.tracks["lane"] == 2).sum() == sum(defect.entries for defect in done.defects)
+    for defect in done.defects:
+        assert (rows_of(done.tracks, defect)["lane"] == 2).all()
+        assert defect.entries <= 2 * RATE
+    assert done.tracks["y"].equals(before["y"])
+    # Where the other lane is as full, there is no room.
+    beside = before.with_columns(vehicle=pl.col("vehicle") + 1000, lane=pl.lit(2, pl.Int16))
+    full = pl.concat([before, beside]).sort("vehicle", "frame")
+    assert damage(only(lane_flickers=2), tracks=full)[1].defects == []
 
 
 def test_too_short_tracks_are_passed_by():

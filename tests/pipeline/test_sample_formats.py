@@ -5,9 +5,9 @@ import polars as pl
 import pytest
 
 from pipeline.sample import damage, highd, ngsim
+from pipeline.sample.judging import Entry, Surface, count_rules
 from pipeline.sample.neighbors import find_surroundings
 from pipeline.sample.scenarios import TWO_LANES, HighdScenario, Traffic
-from pipeline.sample.truth import Entry, count_rules
 
 
 def tracks(*rows):
@@ -249,9 +249,22 @@ def test_the_slow_loop_counts_by_hand():
         (3, 4): entry(0, speed=1.53, accel=0.0), (3, 5): entry(0, speed=0.01, accel=0.0),
     }  # fmt: skip
     # Gaps of vehicle 2: -0.001, 0.0, 3.0, then the leader is unseen: -0.1 and 0.0 by headway, unknown.
-    assert count_rules(entries) == {
+    assert {rule: count for rule, count in count_rules(entries, Surface()).items() if count[0]} == {
         "negative_headway": (2, 1, 2),
+        "negative_headway_recorded": (1, 1, 1),
         "high_acceleration": (2, 1, 2),
         "low_constant_speed": (2, 1, 2),
         "backward": (1, 1, 1),
+        # From 97 to 95 m at 10 m/s: 3 m short. Frames 4 to 8 of 2 are missing.
+        "position_jump": (1, 1, 1),
+        "frame_gap": (1, 1, 1),
+        # By positions -5 and 0 m/s where 10 m/s are recorded, and 0 where 1.53 are.
+        "speed_mismatch": (3, 2, 3),
+        # 3 has no leader, though 2 is 96, 97, 95 m ahead; then 1 at 103 m.
+        "leader_mismatch": (3, 1, 1),
+        # Accelerations of 1: 0.5, 3.06, 3.05, 9 (+, -, +); of 3: 0, 0, 0.5, 0, 0 (+, -).
+        "high_jerk": (2, 1, 2),
+        "jerk_flicker": (1, 1, 1),
+        # All lengths are 4 m, no width is known: too narrow for a car.
+        "implausible_size": (15, 3, 4),
     }

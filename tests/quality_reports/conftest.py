@@ -6,6 +6,7 @@ import duckdb
 import polars as pl
 import pytest
 
+from pipeline.lake.macros import MACROS
 from quality_reports.report import Report, build_report
 from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES
 
@@ -32,6 +33,8 @@ def open_lake() -> Iterator[Callable[..., duckdb.DuckDBPyConnection]]:
             later, key = JOINED.get(table.name, (None, ()))
             join = f" LEFT JOIN {later}_rows USING ({', '.join(key)})" if later else ""
             connection.execute(f"CREATE VIEW {table.name} AS SELECT * FROM {table.name}_rows{join}")
+        for macro in MACROS:
+            connection.execute(macro.statement)
         return connection
 
     yield open_
@@ -60,6 +63,12 @@ def a_subset(dataset: str, subset: str, **values) -> dict:
         "source_files": [{"file": f"{subset[:2]}_tracks.csv", "sha256": SHA}],
     }
     return at(dataset, subset, **{**usual, **values})
+
+
+def counted(dataset: str, recording: str, authority: str, measure: str, expected, found, **values) -> dict:
+    agrees = None if expected is None else expected == found
+    figures = {"authority": authority, "measure": measure, "expected": expected, "found": found, "agrees": agrees}
+    return {"dataset": dataset, "recording": recording, **figures, **values}
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +187,13 @@ def small_lake() -> dict[str, list[dict]]:
                 "relaxed": True,
                 "relaxed_reason": "one subset only",
             }
+        ],
+        "completeness": [
+            counted("highd", "01", "recordingMeta", "vehicles", 3, 3),
+            counted("highd", "01", "recordingMeta", "trucks", 1, 1),
+            counted("highd", "01", "tracksMeta", "entries", 8, 6, rows_dropped=1),
+            counted("highd", "01", "tracksMeta", "vehicles_incomplete", 0, 2),
+            counted("ngsim", "peachtree", "Total_Frames", "entries", None, None, rows_dropped=2),
         ],
         "ingest_log": [
             {

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 
@@ -67,6 +68,28 @@ def test_findings_per_rule(report):
     # A rule that nothing breaks is a row of zeros, not an absent row.
     assert rules["high_acceleration"]["total"]["vehicles"] == 0
     assert rules["high_acceleration"]["total"]["entry_share"] == 0.0
+    # Nor is one that could be checked nowhere a row of zeros: no vehicle has a size, no subset lane markings.
+    for name in ("overlap", "implausible_size", "negative_headway_recorded", "outside_lane"):
+        assert rules[name]["total"]["vehicles"] is None
+        assert rules[name]["total"]["subsets_checked"] == 0
+
+
+def test_a_rule_is_checked_where_sizes_and_markings_are_known(open_lake, small_lake):
+    sized = [{**each, "length_m": 4.5, "width_m": 1.8, "class": "car"} for each in small_lake["vehicles"][:2]]
+    marked = [{**each, "lane_markings_m": [0.0, 3.5]} for each in small_lake["subsets"][:2]]
+    tables = {
+        **small_lake,
+        "vehicles": sized + small_lake["vehicles"][2:],
+        "subsets": marked + small_lake["subsets"][2:],
+    }
+    rules = {rule["name"]: rule for rule in build_report(open_lake(**tables), {}).quality["rules"]}
+    # Sizes are known in 01-lower, markings in 01-lower and 01-upper; none of the three is of the arterial.
+    checked = {name: [each["subsets_checked"] for each in rule["subsets"]] for name, rule in rules.items()}
+    assert checked["overlap"] == checked["implausible_size"] == [1, 0, 0]
+    assert checked["outside_lane"] == [1, 1, 0]
+    assert checked["negative_headway"] == [1, 1, 0]
+    assert checked["backward"] == [1, 1, 1]
+    assert rules["overlap"]["total"]["vehicles"] == 0
 
 
 def test_speed_distribution(report):
@@ -138,6 +161,23 @@ def test_ingestion(report):
     assert {each["rejects_in_file"] for each in rejects} == {13}
 
 
+def test_completeness_stands_beside_what_was_announced(report):
+    rows = report.quality["completeness"]
+    assert len(rows) == 5
+    entries = row(rows, recording="01", measure="entries")
+    assert (entries["expected"], entries["found"], entries["difference"], entries["rows_dropped"]) == (8, 6, -2, 1)
+    assert (entries["found_share"], entries["agrees"]) == (0.75, False)
+    assert row(rows, measure="vehicles_incomplete")["found_share"] is None, "0 are expected"
+    unknown = row(rows, recording="peachtree")
+    assert (unknown["expected"], unknown["found"], unknown["difference"], unknown["agrees"]) == (None,) * 4
+    section = re.search(r'<section id="completeness">.*?</section>', report.html, flags=re.DOTALL).group()
+    assert re.sub(r"\s+", " ", section).count("2 of 4 figures agree") == 1
+    shown = re.findall(r'<th scope="row" class="text">(.*?)</th>\s*<td class="text">(.*?)</td>', section)
+    # The trucks agree and are only counted.
+    assert shown == [("01", "vehicles"), ("01", "entries"), ("01", "vehicles_incomplete"), ("peachtree", "entries")]
+    assert "75.00 %" in section
+
+
 def test_a_long_reject_is_cut(open_lake):
     reject = {"dataset": "ngsim", "file": "f", "line": 1, "reason": "r", "text": "x" * 5000}
     (shown,) = build_report(open_lake(rejects=[reject]), {}).quality["ingestion"]["rejects"]
@@ -194,7 +234,7 @@ def test_an_empty_lake_renders(open_lake):
     assert report.quality["headline"]["samples"] is None
     assert "The lake holds no recordings." in report.html
     assert "<svg" not in report.html
-    assert [rule["total"]["vehicles"] for rule in report.quality["rules"]] == [None] * 4
+    assert [rule["total"]["vehicles"] for rule in report.quality["rules"]] == [None] * 16
 
 
 def test_stages_that_have_not_run_are_said_to(open_lake, small_lake):
@@ -204,7 +244,7 @@ def test_stages_that_have_not_run_are_said_to(open_lake, small_lake):
     for command, subsets in (("validate", 3), ("repair", 2), ("samples", 2), ("split", 2)):
         assert f"<code>tracklake {command}</code> has not worked on any of the {subsets} subsets" in report.html
     assert report.quality["headline"]["excluded_subsets"] is None
-    assert report.quality["rules"][3]["total"]["vehicles"] is None
+    assert {rule["total"]["vehicles"] for rule in report.quality["rules"]} == {None}
 
 
 def test_an_arterial_alone_renders_without_the_freeway_stages(open_lake, small_lake):

@@ -10,7 +10,8 @@ import duckdb
 import pytest
 
 from quality_reports import plots
-from quality_reports.report import DASH, build_report, flatten, format_cell, format_duration, visible
+from quality_reports.rendering import DASH, flatten, format_cell, format_duration, visible
+from quality_reports.report import build_report
 from quality_reports.summaries import plain, statement
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;\u202e"
@@ -86,15 +87,17 @@ def test_the_page_is_well_formed_and_fetches_nothing(report):
         for name in ("src", "srcset", "xlink:href", "action", "poster"):
             assert name not in attributes, (tag, attributes)
         if "href" in attributes:
-            assert attributes["href"].startswith("#")
+            assert attributes["href"].startswith(("#", "subsets/"))
     namespaces = {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
     assert set(re.findall(r"https?://[^\s\"'<>)]+", report.html)) <= namespaces
     assert "url(" not in report.html
     assert "@import" not in report.html
     ids = [attributes["id"] for _, attributes in elements if "id" in attributes]
     assert len(ids) == len(set(ids))
-    links = {attributes["href"][1:] for tag, attributes in elements if tag == "a"}
-    assert links <= set(ids)
+    links = {attributes["href"] for tag, attributes in elements if tag == "a"}
+    pages = {"subsets/01-lower.html", "subsets/01-upper.html", "subsets/peachtree-north.html"}
+    assert {link for link in links if not link.startswith("#")} == pages
+    assert {link[1:] for link in links - pages} <= set(ids)
 
 
 def test_every_colour_of_a_plot_follows_the_theme(report):

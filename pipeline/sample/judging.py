@@ -1,0 +1,324 @@
+"""What every rule of DESIGN section 5 finds in the written files, by a slow, obvious loop.
+
+It shares no code with the pipeline, its sources or its rules, so that equal counts mean something.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import median
+
+Key = tuple[int, int]
+"""(vehicle, frame)."""
+
+HIGH_ACCELERATION_MPS2 = 3.05
+LOW_SPEED_MPS = 1.52
+JUMP_M = 2.0
+SPEED_DIFFERENCE_MPS = 1.0
+HIGH_JERK_MPS3 = 15.0
+FLICKER_S = 2.0
+LEADER_WITHIN_M = 100.0
+HEADWAY_DIFFERENCE_M = 1.0
+NO_CHANGE_MPS2 = 0.00005
+LONGEST_M = 40.0
+"""No vehicle of the sample is longer."""
+SIZES_M = {
+    "car": (2.4, 8.0, 1.2, 2.7),
+    "truck": (4.0, 26.0, 1.4, 3.2),
+    "motorcycle": (1.0, 3.2, 0.3, 1.6),
+}
+"""Least and greatest length, least and greatest width."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row of a file in SI units along the direction of travel; `y` counts from the leftmost marking."""
+
+    front: float
+    length: float
+    speed: float
+    accel: float
+    leader: int
+    headway: float | None
+    y: float = 0.0
+    width: float = 0.0
+    lane: int = 1
+    kind: str = "car"
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is known of a subset's road and camera.
+
+    Args:
+        rate_hz: frames per second, 10 or 25.
+        markings: y of the lane markings, leftmost first; empty where unknown.
+        headway_stands_in: whether a recorded headway makes a gap to a leader without an entry in the frame.
+    """
+
+    rate_hz: float = 10.0
+    markings: tuple[float, ...] = ()
+    headway_stands_in: bool = True
+
+
+@dataclass
+class Scenery:
+    """A subset's entries, and where to find them."""
+
+    entries: dict[Key, Entry]
+    surface: Surface
+
+    def __post_init__(self) -> None:
+        """Put frames and lanes in order, and look at every track once."""
+        self.lengths = {vehicle: entry.length for (vehicle, _), entry in self.entries.items()}
+        self.in_frame: dict[int, list[Key]] = {}
+        self.in_lane: dict[tuple[int, int], list[Key]] = {}
+        for key in sorted(self.entries, key=lambda key: self.entries[key].front):
+            self.in_frame.setdefault(key[1], []).append(key)
+            self.in_lane.setdefault((key[1], self.entries[key].lane), []).append(key)
+        self.frame_place = {key: place for keys in self.in_frame.values() for place, key in enumerate(keys)}
+        self.lane_place = {key: place for keys in self.in_lane.values() for place, key in enumerate(keys)}
+        self.first_frames: dict[int, int] = {}
+        self.lane_changes: dict[int, int] = {}
+        self.unbroken: dict[Key, int] = {}
+        for key in sorted(self.entries):
+            before = self.near(key, -1)
+            self.first_frames.setdefault(*key)
+            self.unbroken[key] = 0 if before is None else self.unbroken[key[0], key[1] - 1] + 1
+            if before is not None and before.lane != self.entries[key].lane:
+                self.lane_changes[key[0]] = self.lane_changes.get(key[0], 0) + 1
+        self.from_fronts = self._counts_from_fronts()
+
+    def near(self, key: Key, frames: int) -> Entry | None:
+        """The vehicle's entry so many frames later (before: negative)."""
+        return self.entries.get((key[0], key[1] + frames))
+
+    def gap(self, key: Key) -> float | None:
+        """Bumper to bumper, m; None where it cannot be known."""
+        own = self.entries[key]
+        if own.leader == 0:
+            return None
+        leader = self.entries.get((own.leader, key[1]))
+        if leader is not None:
+            return round(leader.front - leader.length - own.front, 3)
+        known = self.surface.headway_stands_in and own.headway is not None and own.leader in self.lengths
+        if known and own.headway is not None and own.headway > 0:
+            return round(own.headway - self.lengths[own.leader], 3)
+        return None
+
+    def recorded_gap(self, key: Key) -> float | None:
+        """The recorded headway from bumper to bumper, m."""
+        own = self.entries[key]
+        if own.leader == 0 or own.headway is None or own.leader not in self.lengths:
+            return None
+        return round(own.headway - (self.lengths[own.leader] if self.from_fronts else 0), 3)
+
+    def _counts_from_fronts(self) -> bool:
+        self.from_fronts = True
+        known = [
+            (front, self.lengths[self.entries[key].leader], gap)
+            for key in self.entries
+            if (front := self.recorded_gap(key)) is not None and (gap := self.gap(key)) is not None
+        ]
+        if not known:
+            return True
+        as_fronts = median(abs(front - gap) for front, _, gap in known)
+        return as_fronts <= median(abs(front + length - gap) for front, length, gap in known)
+
+    def past_accel(self, key: Key, tenths: int) -> float | None:
+        """The acceleration so many tenths of a second before, between two frames the mean of theirs."""
+        frames = tenths * self.surface.rate_hz / 10
+        if self.unbroken[key] < frames:
+            return None
+        low, high = math.floor(frames), math.ceil(frames)
+        return (self.entries[key[0], key[1] - low].accel + self.entries[key[0], key[1] - high].accel) / 2
+
+
+def judge_gap(scene: Scenery, key: Key) -> bool:
+    """negative_headway."""
+    gap = scene.gap(key)
+    return gap is not None and gap < 0
+
+
+def judge_recorded_gap(scene: Scenery, key: Key) -> bool:
+    """negative_headway_recorded."""
+    gap = scene.recorded_gap(key)
+    return gap is not None and gap < 0
+
+
+def judge_acceleration(scene: Scenery, key: Key) -> bool:
+    """high_acceleration."""
+    return scene.entries[key].accel > HIGH_ACCELERATION_MPS2
+
+
+def judge_constant_speed(scene: Scenery, key: Key) -> bool:
+    """low_constant_speed."""
+    entry = scene.entries[key]
+    return 0 < entry.speed <= LOW_SPEED_MPS and entry.accel == 0
+
+
+def judge_direction(scene: Scenery, key: Key) -> bool:
+    """Rule backward."""
+    return scene.entries[key].speed < 0
+
+
+def judge_jump(scene: Scenery, key: Key) -> bool:
+    """position_jump."""
+    before, now = scene.near(key, -1), scene.entries[key]
+    if before is None:
+        return False
+    way = (before.speed + now.speed) / 2 / scene.surface.rate_hz
+    return round(abs(now.front - before.front - way), 6) > JUMP_M
+
+
+def judge_frames(scene: Scenery, key: Key) -> bool:
+    """frame_gap: the frame before is missing, and there are earlier ones."""
+    return scene.near(key, -1) is None and scene.first_frames[key[0]] < key[1]
+
+
+def judge_overlap(scene: Scenery, key: Key) -> bool:
+    """overlap: the boxes meet along and across the road, by half a millimetre or more."""
+    own, keys = scene.entries[key], scene.in_frame[key[1]]
+    for step in (-1, 1):
+        place = scene.frame_place[key] + step
+        while 0 <= place < len(keys):
+            other = scene.entries[keys[place]]
+            if abs(other.front - own.front) > LONGEST_M:
+                break
+            along = min(own.front - (other.front - other.length), other.front - (own.front - own.length))
+            across = (own.width + other.width) / 2 - abs(own.y - other.y)
+            if round(min(along, across), 3) > 0:
+                return True
+            place += step
+    return False
+
+
+def judge_speed(scene: Scenery, key: Key) -> bool:
+    """speed_mismatch: against the positions 0.1 s before and after."""
+    steps = (1,) if scene.surface.rate_hz == 10 else (2, 3)
+    if any(scene.near(key, step) is None for step in range(-steps[-1], steps[-1] + 1)):
+        return False
+    ahead = sum(scene.entries[key[0], key[1] + step].front for step in steps) / len(steps)
+    behind = sum(scene.entries[key[0], key[1] - step].front for step in steps) / len(steps)
+    return round(abs(scene.entries[key].speed - (ahead - behind) / 0.2), 4) > SPEED_DIFFERENCE_MPS
+
+
+def judge_jerk(scene: Scenery, key: Key) -> bool:
+    """high_jerk."""
+    before = scene.past_accel(key, 1)
+    return before is not None and round(abs(scene.entries[key].accel - before) / 0.1, 3) > HIGH_JERK_MPS3
+
+
+def judge_jerk_signs(scene: Scenery, key: Key) -> bool:
+    """jerk_flicker: more than one change of sign among the jerks of the last second."""
+    accels = [scene.past_accel(key, tenths) for tenths in range(10, -1, -1)]
+    signs = []
+    for before, now in pairwise(accels):
+        if before is not None and now is not None and abs(now - before) > NO_CHANGE_MPS2:
+            signs.append(now > before)
+    return sum(before != now for before, now in pairwise(signs)) > 1
+
+
+def judge_lane_stay(scene: Scenery, key: Key) -> bool:
+    """lane_flicker: walk back and forth to where the lane changes; it must be the same lane on either side."""
+    if scene.lane_changes.get(key[0], 0) < 2:
+        return False
+    lane = scene.entries[key].lane
+    around, stay = [], 1
+    for direction in (-1, 1):
+        step = direction
+        while (other := scene.near(key, step)) is not None and other.lane == lane:
+            step += direction
+            stay += 1
+        around.append(None if other is None else other.lane)
+    return None not in around and around[0] == around[1] and stay / scene.surface.rate_hz <= FLICKER_S
+
+
+def judge_leader(scene: Scenery, key: Key) -> bool:
+    """leader_mismatch, with positions in tenths of a millimetre."""
+    own = scene.entries[key]
+    place = round(own.front * 10000)
+    ahead_of = scene.in_lane[key[1], own.lane][scene.lane_place[key] + 1 :]
+    places = (round(scene.entries[other].front * 10000) for other in ahead_of)
+    nearest = next((other - place for other in places if other > place), None)
+    if own.leader == 0 or own.leader not in scene.lengths:
+        return own.leader == 0 and nearest is not None and nearest / 10000 <= LEADER_WITHIN_M
+    leader = scene.entries.get((own.leader, key[1]))
+    if leader is None:
+        return False
+    ahead = round(leader.front * 10000) - place
+    return leader.lane != own.lane or ahead < 0 or (nearest is not None and ahead > nearest)
+
+
+def judge_headway(scene: Scenery, key: Key) -> bool:
+    """headway_mismatch."""
+    gap, recorded = scene.gap(key), scene.recorded_gap(key)
+    return gap is not None and recorded is not None and round(abs(recorded - gap), 3) > HEADWAY_DIFFERENCE_M
+
+
+def judge_size(scene: Scenery, key: Key) -> bool:
+    """implausible_size."""
+    entry = scene.entries[key]
+    shortest, longest, narrowest, widest = SIZES_M[entry.kind]
+    inside = shortest <= round(entry.length, 4) <= longest and narrowest <= round(entry.width, 4) <= widest
+    return not inside
+
+
+def judge_lane(scene: Scenery, key: Key) -> bool:
+    """outside_lane, where markings are known."""
+    entry, markings = scene.entries[key], scene.surface.markings
+    if not 1 <= entry.lane < len(markings):
+        return False
+    left, right = markings[entry.lane - 1], markings[entry.lane]
+    return round(left - entry.y, 3) > 0 or round(entry.y - right, 3) > 0
+
+
+JUDGES: dict[str, Callable[[Scenery, Key], bool]] = {
+    "negative_headway": judge_gap,
+    "negative_headway_recorded": judge_recorded_gap,
+    "high_acceleration": judge_acceleration,
+    "low_constant_speed": judge_constant_speed,
+    "backward": judge_direction,
+    "position_jump": judge_jump,
+    "frame_gap": judge_frames,
+    "overlap": judge_overlap,
+    "speed_mismatch": judge_speed,
+    "high_jerk": judge_jerk,
+    "jerk_flicker": judge_jerk_signs,
+    "lane_flicker": judge_lane_stay,
+    "leader_mismatch": judge_leader,
+    "headway_mismatch": judge_headway,
+    "implausible_size": judge_size,
+    "outside_lane": judge_lane,
+}
+"""Whether an entry breaks a rule, by the rule's name."""
+
+
+def find_broken(entries: dict[Key, Entry], surface: Surface) -> Iterator[tuple[str, list[Key]]]:
+    """Per rule: the entries that break it, sorted.
+
+    Args:
+        entries: of one subset.
+        surface: of that subset.
+    """
+    scene = Scenery(entries, surface)
+    for rule, judge in JUDGES.items():
+        yield rule, [key for key in sorted(entries) if judge(scene, key)]
+
+
+def count_rules(entries: dict[Key, Entry], surface: Surface) -> dict[str, tuple[int, int, int]]:
+    """Per rule: entries, vehicles and runs of consecutive frames that break it.
+
+    Args:
+        entries: of one subset.
+        surface: of that subset.
+    """
+    counts = {}
+    for rule, keys in find_broken(entries, surface):
+        runs = 0
+        for i, (vehicle, frame) in enumerate(keys):
+            if i == 0 or keys[i - 1] != (vehicle, frame - 1):
+                runs += 1
+        counts[rule] = (len(keys), len({vehicle for vehicle, _ in keys}), runs)
+    return counts

@@ -1,0 +1,21 @@
+-- The worst findings of every rule in a subset, one per vehicle and at most $examples per rule; place 1 is the worst.
+-- $rules: the rules' names; $extremes: for each of them which end of its value is the worst, min or max.
+WITH rules AS (
+    SELECT unnest($rules::VARCHAR[]) AS rule, unnest($extremes::VARCHAR[]) AS extreme
+),
+ranked AS (
+    SELECT rule, severity, vehicle_id, first_frame, last_frame, entries, worst,
+        CASE WHEN extreme = 'min' THEN worst ELSE -worst END AS rank
+    FROM findings JOIN rules USING (rule)
+    WHERE dataset = $dataset AND subset = $subset
+),
+of_vehicles AS (
+    SELECT * FROM ranked
+    QUALIFY row_number() OVER (PARTITION BY rule, vehicle_id ORDER BY rank, first_frame) = 1
+)
+SELECT
+    rule, severity, vehicle_id, first_frame, last_frame, entries, worst,
+    row_number() OVER (PARTITION BY rule ORDER BY rank, vehicle_id) AS place
+FROM of_vehicles
+QUALIFY place <= $examples
+ORDER BY list_position($rules::VARCHAR[], rule), place

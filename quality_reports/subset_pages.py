@@ -1,0 +1,167 @@
+"""One page per subset beside the overview: its facts, findings, time-space diagrams, flow, worst examples, scores."""
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from quality_reports import plots
+from quality_reports.examples import find_examples
+from quality_reports.flow import draw_flow
+from quality_reports.rendering import make_environment, read_style
+from quality_reports.rules import RULES, Rule
+from quality_reports.summaries import Connection, Row, query, query_frame
+from quality_reports.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
+
+FOLDER = "subsets"
+"""Of the pages, beside the overview."""
+INTERVALS_S = (5.0, 10.0, 30.0, 60.0)
+"""Lengths of the intervals of flow, density and speed: the longest of which a recording has at least FEWEST."""
+FEWEST = 15
+MOST_ROWS = 10
+"""Rows of a table of single vehicles."""
+LONGEST_NAME = 80
+
+MAIN_KEYS = ("dataset", "subset")
+
+
+def name_pages(subsets: Sequence[Row]) -> dict[tuple[str, str], str]:
+    """The file name of every subset's page by (dataset, subset): the subset's name where that may be a file's name.
+
+    Other characters than ASCII letters, digits, dots, hyphens and underscores are written as ~ and two digits a byte;
+    long names are cut. Names that would be the same file, also where letters' case is ignored, get a suffix.
+
+    Args:
+        subsets: dataset and subset of each.
+    """
+    names = {(row["dataset"], row["subset"]): _name_file(row["subset"]) for row in subsets}
+    taken = [name.lower() for name in names.values()]
+    return {
+        key: f"{name if taken.count(name.lower()) == 1 else f'{name}~{_hash(*key)}'}.html"
+        for key, name in names.items()
+    }
+
+
+def _name_file(subset: str) -> str:
+    safe = re.sub(
+        r"[^A-Za-z0-9._-]|^\.",
+        lambda found: "".join(f"~{byte:02x}" for byte in found[0].encode("utf-8", "surrogatepass")),
+        subset,
+    )
+    return safe if 0 < len(safe) <= LONGEST_NAME else f"{safe[:LONGEST_NAME]}~{_hash(subset)}"
+
+
+def _hash(*texts: str) -> str:
+    return hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
+
+
+def render_pages(connection: Connection, quality: Row, *, rules: Sequence[Rule] = RULES) -> Iterator[tuple[str, str]]:
+    """Render the subsets' pages one after another, as (file name, html): they are many, and large.
+
+    Args:
+        connection: with the catalog's views and its macros flow_density and lane_changes.
+        quality: the overview's numbers, as `quality_reports.summaries.collect` returns them.
+        rules: what validation judged by.
+    """
+    template = make_environment().get_template("subset.html.j2")
+    names = name_pages(quality["subsets"])
+    extremes = {rule.name: rule.extreme for rule in rules}
+    declared = [
+        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
+    ]
+    for subset in quality["subsets"]:
+        content = {**_select(quality, subset), **_ask(connection, subset, declared)}
+        yield (
+            names[subset["dataset"], subset["subset"]],
+            template.render(
+                style=Markup(read_style()),
+                subset=subset,
+                provenance=quality["provenance"],
+                **content,
+            ),
+        )
+
+
+def _select(quality: Row, subset: Row) -> Row:
+    """What the overview knows of a subset already."""
+
+    def of_subset(rows: Sequence[Row]) -> list[Row]:
+        return [row for row in rows if all(row[key] == subset[key] for key in MAIN_KEYS)]
+
+    positions = of_subset(quality["starts"]["positions"])
+    starts = of_subset(quality["starts"]["subsets"])
+    return {
+        "rules": [
+            {**{key: rule[key] for key in ("name", "severity", "unit", "meaning")}, **row}
+            for rule in quality["rules"]
+            for row in of_subset(rule["subsets"])
+        ],
+        "starts": starts[0] if starts else None,
+        "start_positions": Markup(plots.draw_start_positions(positions, starts)) if positions and starts else None,
+        "samples": of_subset(quality["samples"]["subsets"]),
+        "parts": of_subset(quality["splits"]["members"]),
+        "feasibility": next(iter(of_subset(quality["feasibility"])), None),
+        "per_second": next(iter(of_subset(quality["speeds"]["per_second"])), None),
+        "left_out": [
+            row
+            for row in quality["left_out"]
+            if row["dataset"] == subset["dataset"] and subset["subset"] in row["subsets"]
+        ],
+        "completeness": [
+            row
+            for row in quality["completeness"]
+            if row["dataset"] == subset["dataset"] and row["recording"] == subset["recording"]
+        ],
+    }
+
+
+def _ask(connection: Connection, subset: Row, rules: Sequence[Row]) -> Row:
+    """What only the lake knows, with the plots of it."""
+    where = {key: subset[key] for key in MAIN_KEYS}
+    extent = query(connection, "subset_extent", where)[0]
+    limited = {**where, "most": MOST_ROWS}
+    seconds = choose_interval(subset["seconds"])
+    return {
+        "extent": extent,
+        **_draw(connection, where, extent, seconds),
+        "seconds": seconds,
+        "speeds": query(connection, "subset_speeds", where),
+        "lane_changes": query(connection, "subset_lane_changes", where),
+        "windows": query(connection, "subset_windows", limited),
+        "vehicle_scores": query(connection, "subset_vehicle_scores", limited),
+        "drops": query(connection, "subset_sample_drops", where),
+        "examples": [
+            {**example, "plot": example["plot"] and Markup(example["plot"])}
+            for example in find_examples(connection, where, rules, subset["frame_rate_hz"])
+        ],
+    }
+
+
+def choose_interval(seconds: float) -> float:
+    """The length of the intervals, s, for a recording of so many seconds."""
+    return max((length for length in INTERVALS_S if seconds / length >= FEWEST), default=INTERVALS_S[0])
+
+
+def _draw(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
+    """The subset's plots, as markup; empty or None where it has no entries."""
+    if not extent["entries"]:
+        return {"diagrams": [], "legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
+    grid = lay_grid(extent)
+    cells = query_frame(connection, "subset_time_space", {**where, **grid.parameters()})
+    marks = query_frame(connection, "subset_errors", {**where, **grid.parameters(MARK_COLUMNS, MARK_ROWS)})
+    intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
+    histogram = query(connection, "subset_speed_histogram", where)
+    return {
+        "diagrams": [(lane, Markup(svg)) for lane, svg in draw_lanes(grid, cells, marks)],
+        "legend": Markup(draw_scale(grid)),
+        # Without a section of some length there is neither flow nor density.
+        "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
+        "fundamental": Markup(plots.draw_fundamental(intervals)) if _is_measured(intervals) else None,
+        "speed_histogram": Markup(plots.draw_speed_histogram(histogram, [])),
+    }
+
+
+def _is_measured(intervals: Sequence[Row]) -> bool:
+    return any(row["flow_veh_per_h"] is not None for row in intervals)
