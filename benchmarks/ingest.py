@@ -164,7 +164,7 @@ def ingest(source: Path, work: Path, environment: dict[str, str]) -> tuple[float
         "try:\n    pipeline.cli.main()\n"
         "finally:\n    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
-    command = [sys.executable, "-c", code, "ingest", str(source), "--lake", str(lake), "--workers", "3", "--quiet"]
+    command = [sys.executable, "-c", code, "ingest", str(source), "--lake", str(lake), "--workers", "2", "--quiet"]
     start = time.perf_counter()
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     seconds = time.perf_counter() - start

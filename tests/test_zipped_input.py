@@ -4,12 +4,13 @@ import json
 import zipfile
 
 from pipeline.lake import connect
+from schemas import REJECTS, TRACKS, VEHICLES
 
-TABLES = {
-    "tracks": "dataset, subset, vehicle_id, frame",
-    "vehicles": "dataset, subset, vehicle_id",
-    "rejects": "dataset, recording, line, reason",
-}
+ORDERS = (
+    (TRACKS, "dataset, subset, vehicle_id, frame"),
+    (VEHICLES, "dataset, subset, vehicle_id"),
+    (REJECTS, "dataset, recording, line, reason"),
+)
 
 
 def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, sample, lake, tmp_path):
@@ -22,10 +23,11 @@ def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, s
     done = command(*arguments)
     assert done.code == 0, done.err
     with connect(lake.root) as plain, connect(tmp_path / "lake") as zipped:
-        for table, order in TABLES.items():
-            columns = "* EXCLUDE (file)" if table == "rejects" else "*"
-            query = f"SELECT {columns} FROM {table} ORDER BY {order}"
-            assert zipped.sql(query).pl().equals(plain.sql(query).pl()), table
+        for table, order in ORDERS:
+            # Not what later stages found out, which ran on one of the two only; nor what the files are called.
+            columns = ", ".join(f'"{name}"' for name in table.dtypes if name != "file")
+            query = f"SELECT {columns} FROM {table.name} ORDER BY {order}"
+            assert zipped.sql(query).pl().equals(plain.sql(query).pl()), table.name
         hashes = "SELECT sha256, rows_read, rows_kept FROM ingest_log ORDER BY ALL"
         assert zipped.sql(hashes).fetchall() == plain.sql(hashes).fetchall()
         files = "SELECT DISTINCT file FROM ingest_log ORDER BY ALL"
