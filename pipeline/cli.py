@@ -4,7 +4,7 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +12,7 @@ from pipeline.allocation import keep_freed_memory
 from pipeline.session import DONE, FAILED, carry_out, command, conclude, failure, read_settings
 
 if TYPE_CHECKING:
+    from pipeline.sample import SampleSummary
     from pipeline.terminal import Terminal
 
 SAMPLE = "sample"
@@ -365,7 +366,7 @@ def _refuse_mixing(lake: Path, sample: str) -> None:
 
 def _write_sample(
     out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
-) -> Any:  # noqa: ANN401 - SampleSummary, whose module is imported late
+) -> "SampleSummary":
     from pipeline.sample import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
 
     if unknown := [name for name in formats or () if name not in ALL_FORMATS]:

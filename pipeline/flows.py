@@ -22,10 +22,11 @@ import httpx
 from prefect import flow, task
 from prefect.artifacts import create_link_artifact, create_table_artifact
 from prefect.cache_policies import NO_CACHE, CacheKeyFnPolicy
+from prefect.client.schemas.objects import State
 from prefect.futures import PrefectFuture, as_completed
 from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-from prefect.task_runners import ThreadPoolTaskRunner
+from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from pipeline.artifacts import summarise_report
 from pipeline.lake import Entry, LakeFile, Writer, is_intact, list_ingested, open_for_writing
@@ -58,12 +59,12 @@ OUR_FAULTS = (400, 422)
 Results = Iterable[tuple[str, dict[str, Any] | BaseException]]
 
 
-def _is_io_error(_task: Any, _run: Any, state: Any) -> bool:  # noqa: ANN401 - Prefect's own signature
+def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
     """Retry what a busy disk or a network share may cause; nothing else becomes right by being tried again."""
     return isinstance(state.result(raise_on_failure=False), OSError)
 
 
-def _content_key(_context: Any, parameters: dict[str, Any]) -> str:  # noqa: ANN401 - Prefect's own signature
+def _content_key(_context: object, parameters: dict[str, Any]) -> str:
     """The fingerprint covers the inputs' sha256, the settings and the code; the lake's id, where the files stand."""
     return f"tracklake-{parameters['lake_id']}-{parameters['job']['fingerprint']}"
 
@@ -297,7 +298,7 @@ def execute(order: Order) -> Outcome:
         return Outcome(**chosen.with_options(task_runner=_choose_runner(order.get_settings()))(**parameters))
 
 
-def _choose_runner(settings: Settings) -> Any:  # noqa: ANN401 - prefect-dask is an extra, and untyped
+def _choose_runner(settings: Settings) -> TaskRunner[Any]:
     """Threads (Polars and DuckDB release the interpreter), or Dask workers, which need the lake on a shared disk."""
     if settings.runner == "threads":
         return ThreadPoolTaskRunner(max_workers=settings.workers)

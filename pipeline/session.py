@@ -66,10 +66,11 @@ def failure(terminal: "Terminal", message: str, code: int = FAILED) -> typer.Exi
     return typer.Exit(code)
 
 
-def read_settings(**flags: Any) -> "Settings":  # noqa: ANN401 - any setting
+def read_settings(*, lake: Path | None = None, workers: int | None = None, protocol: str | None = None) -> "Settings":
     """The settings, with the flags that were given on top."""
     from pipeline.settings import Settings
 
+    flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
     return Settings(**{name: value for name, value in flags.items() if value is not None})
 
 

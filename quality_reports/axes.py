@@ -53,6 +53,12 @@ def make_ticks(low: float, high: float, most: int) -> list[float]:
     return [round(number * step, 9) + 0.0 for number in range(first, last + 1)]
 
 
+def span(values: pl.Series) -> tuple[float, float]:
+    """The least and the greatest of some numbers, of which there are any."""
+    numbers = values.cast(pl.Float64).to_numpy()
+    return float(np.nanmin(numbers)), float(np.nanmax(numbers))
+
+
 def widen(low: float, high: float, least: float) -> tuple[float, float]:
     """The range with a twentieth either side, at least `least` wide."""
     if high - low < least:

@@ -116,7 +116,7 @@ def compare(then: Side, now: Side) -> Row:
     return {"schema": COMPARISON_SCHEMA, "equal": not any(map(_differs, compared.values())), **facts, **compared}
 
 
-def _differs(part: Any) -> bool:  # noqa: ANN401 - any part of what `compare` returns
+def _differs(part: list[Row] | Row) -> bool:
     if isinstance(part, list):
         return any(not _is_same(row["then"], row["now"]) for row in part)
     return any(rows for name, rows in part.items() if name not in ("same", "totals"))
@@ -173,12 +173,14 @@ def _changes(key: Row, then: Row, now: Row, *, all_of_them: bool = False) -> lis
     ]
 
 
-def _pair(then: Any, now: Any) -> Row:  # noqa: ANN401 - any plain value
-    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (then, now))
-    return {"then": then, "now": now, "difference": plain(now - then) if numbers else None}
+def _pair(then: object, now: object) -> Row:
+    difference = None
+    if isinstance(then, int | float) and isinstance(now, int | float) and bool not in (type(then), type(now)):
+        difference = plain(now - then)
+    return {"then": then, "now": now, "difference": difference}
 
 
-def _is_same(then: Any, now: Any) -> bool:  # noqa: ANN401 - any plain value
+def _is_same(then: object, now: object) -> bool:
     if isinstance(then, float) and isinstance(now, float):
         return math.isclose(then, now, rel_tol=TOLERANCE)
     return bool(then == now)
@@ -248,7 +250,7 @@ def _horizons(side: Side) -> list[Row]:
     ]
 
 
-def _leaves(value: Any, prefix: str = "") -> Iterable[tuple[str, Any]]:  # noqa: ANN401 - any plain value
+def _leaves(value: object, prefix: str = "") -> list[tuple[str, object]]:
     """(dotted name, value) of what is no mapping."""
     if not isinstance(value, Mapping):
         return [(prefix, value)]

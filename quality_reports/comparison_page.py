@@ -1,7 +1,5 @@
 """What differs between two lakes as a page: self-contained, in the report's style."""
 
-from typing import Any
-
 from markupsafe import Markup
 
 from quality_reports.comparison import COUNTED
@@ -26,7 +24,7 @@ def render_comparison(compared: Row, report: str | None = None) -> str:
     )
 
 
-def format_value(value: Any) -> str:  # noqa: ANN401 - any plain value
+def format_value(value: object) -> str:
     """Put a figure of any kind into words: six digits of a fraction, all of a whole number, a dash for null."""
     if isinstance(value, bool):
         return format_cell(value, "bool")

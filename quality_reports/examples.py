@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from quality_reports.axes import Scale, draw_frame, draw_line, widen, wrap_svg
+from quality_reports.axes import Scale, draw_frame, draw_line, span, widen, wrap_svg
 from quality_reports.plots import BLUE, ORANGE
 from quality_reports.summaries import Connection, Row, query, query_frame
 
@@ -89,7 +89,7 @@ def draw_example(entries: pl.DataFrame, first_frame: int, last_frame: int) -> st
         last_frame: of the finding.
     """
     times = entries["time_s"]
-    low, high = widen(float(times.min()), float(times.max()), 1.0)  # type: ignore[arg-type]
+    low, high = widen(*span(times), 1.0)
     points = entries.with_columns(follows=(pl.col("frame").diff() == 1).fill_null(value=False))
     found = pl.col("frame").is_between(first_frame, last_frame)
     within = points.filter(found).with_columns(follows=pl.col("follows") & found.shift().fill_null(value=False))
@@ -101,7 +101,7 @@ def draw_example(entries: pl.DataFrame, first_frame: int, last_frame: int) -> st
         if values.is_empty():
             drawn.append(f'<text x="{left}" y="{TOP + 50}" fill="#59636e">no {title.split(" (")[0]} recorded</text>')
             continue
-        y = Scale(*widen(float(values.min()), float(values.max()), least), TOP + PANEL_HEIGHT, TOP)  # type: ignore[arg-type]
+        y = Scale(*widen(*span(values), least), TOP + PANEL_HEIGHT, TOP)
         drawn.append(draw_frame(x, y, "time (s)", title, x_ticks=5, y_ticks=4))
         if not within.is_empty():
             begin, end = (x.place(float(within["time_s"][place])) for place in (0, -1))

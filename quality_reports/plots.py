@@ -7,7 +7,7 @@ the only sign: marks differ in shape or place too. The page's style sheet maps t
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import altair as alt
@@ -218,7 +218,7 @@ def _names(rows: Sequence[Row], column: str) -> list[str]:
     return list(dict.fromkeys(row[column] for row in rows))
 
 
-def _data(rows: Any) -> alt.InlineData:  # noqa: ANN401 - any iterable of rows
+def _data(rows: Iterable[Row]) -> alt.InlineData:
     """Rows as a chart's inline data."""
     return alt.InlineData(values=list(rows))
 
@@ -233,7 +233,7 @@ def _height(rows: Sequence[Row]) -> int:
     return ROW_HEIGHT * max(2, len(_names(rows, "subset")))
 
 
-def _svg(chart: Any) -> str:  # noqa: ANN401 - Altair's chart kinds share no public base class with configure()
+def _svg(chart: alt.Chart | alt.LayerChart | alt.FacetChart | alt.HConcatChart | alt.VConcatChart) -> str:
     """Render a chart, transparent and in the report's ink."""
     styled = (
         chart.configure(font="sans-serif", background="transparent", aria=False, padding=4)

@@ -42,7 +42,7 @@ def label_sums(row: dict[str, Any]) -> dict[str, Any]:
     return {**row, "label": row["subset"] if row["subset"] is not None else f"all of {row['dataset']}"}
 
 
-def format_cell(value: Any, kind: str = "text") -> str:  # noqa: ANN401 - any plain value
+def format_cell(value: object, kind: str = "text") -> str:
     """Put one value of a table into words: a dash for null, thousands separated, shares as percentages.
 
     Args:
@@ -51,19 +51,23 @@ def format_cell(value: Any, kind: str = "text") -> str:  # noqa: ANN401 - any pl
     """
     if value is None:
         return DASH
+    if kind == "bool":
+        return "yes" if value else "no"
+    if isinstance(value, int | float) and kind != "text":
+        return _format_number(value, kind)
+    if isinstance(value, list):
+        return visible(", ".join(str(each) for each in value))
+    return visible(str(value))
+
+
+def _format_number(value: float, kind: str) -> str:
     if kind == "int":
         return _integer(value)
     if kind == "percent":
         return _percent(value)
-    if kind == "bool":
-        return "yes" if value else "no"
     if kind == "duration":
         return format_duration(value)
-    if kind[1:].isdigit():
-        return _fixed(value, int(kind[1:]))
-    if isinstance(value, list):
-        return visible(", ".join(str(each) for each in value))
-    return visible(str(value))
+    return _fixed(value, int(kind[1:]))
 
 
 def visible(text: str) -> str:
@@ -84,7 +88,7 @@ def format_duration(seconds: float | None) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def flatten(value: Any, prefix: str = "") -> list[tuple[str, str]]:  # noqa: ANN401 - any plain value
+def flatten(value: object, prefix: str = "") -> list[tuple[str, str]]:
     """A nested mapping as (dotted name, text) pairs, in its own order."""
     if isinstance(value, dict):
         return [pair for key, each in value.items() for pair in flatten(each, f"{prefix}.{key}" if prefix else key)]

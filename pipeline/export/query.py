@@ -3,11 +3,13 @@
 import errno
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, cast
 
 from pipeline.terminal import Terminal, show_relation
 
 if TYPE_CHECKING:
+    from io import IOBase
+
     import polars as pl
 
     from pipeline.lake import LakeResult
@@ -65,11 +67,12 @@ def _first_sentence(text: str) -> str:
     return text.split(". ")[0].removesuffix(".") + "."
 
 
-def _write(frame: "pl.DataFrame", form: str, target: Any) -> None:  # noqa: ANN401 - a path or a binary file
+def _write(frame: "pl.DataFrame", form: str, target: Path | IO[bytes]) -> None:
     if form == "csv":
         frame.write_csv(target)
     elif form == "json":
-        frame.write_json(target)
+        # Any binary file will do, though Polars declares it otherwise than for the other forms.
+        frame.write_json(cast("Path | IOBase", target))
     elif form == "parquet":
         frame.write_parquet(target)
     else:
