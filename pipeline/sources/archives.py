@@ -95,6 +95,16 @@ def open_member(file: RawFile) -> BufferedReader:
             ) from None
 
 
+def member_bytes(file: RawFile) -> int:
+    """How long a member is, unpacked.
+
+    Raises:
+        SourceError: the archive is damaged.
+    """
+    with _directory(file) as directory:
+        return directory.getinfo(file.member or "").file_size
+
+
 @contextmanager
 def _directory(file: RawFile) -> Iterator[ZipFile]:
     """The archive of a file, with whatever damage does to reading it said as a SourceError."""

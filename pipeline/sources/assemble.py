@@ -43,6 +43,7 @@ def assemble_subset(
         entries = entries.with_columns(lateral_speed_mps=central_difference("y_m", rate_hz))
     entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)
     tracks = entries.lazy().pipe(TRACKS.conform).collect()
+    del entries
     vehicles = _summarise(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
     vehicles = (
         vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()

@@ -130,7 +130,12 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             f"{meta_file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
             "Two recordings' files are mixed; restore the originals."
         )
+    rejected = [
+        Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
+    ]
+    parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
     entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
+    del tracks  # the largest recordings have two million rows: no frame of theirs is kept longer than it is used
     entries, conflicts = split_conflicts(entries)
     if entries.is_empty():
         raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
@@ -141,17 +146,15 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         LOWER: _markings(meta["lowerLaneMarkings"], meta_file),
     }
     entries, impossible = split_impossible(entries, known, *(len(marked) - 1 for marked in markings.values()))
-    rejected = [
-        Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
-    ]
-    parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
     dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
     dropped += [(strangers, STRANGER), *impossible]
     log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
     direction_of_entry = find_directions(entries, known)
+    carriageways = {direction: entries.filter(direction_of_entry == direction) for direction in CARRIAGEWAYS}
+    del entries
     subsets = [
-        _to_subset(entries.filter(direction_of_entry == direction), known, direction, recording, meta, markings, files)
+        _to_subset(carriageways.pop(direction), known, direction, recording, meta, markings, files)
         for direction in CARRIAGEWAYS
     ]
     found = tuple(subset for subset in subsets if subset is not None)
@@ -234,7 +237,7 @@ def _to_subset(
     upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)
-    canonical = orient_highd(entries, direction, upper_m, lower_m).select(
+    entries = orient_highd(entries, direction, upper_m, lower_m).select(
         "frame",
         "x_m",
         "y_m",
@@ -256,7 +259,7 @@ def _to_subset(
         entries_announced="numFrames",
     )
     return assemble_subset(
-        canonical,
+        entries,
         sizes,
         dataset="highd",
         name=f"{recording}-{CARRIAGEWAYS[direction]}",

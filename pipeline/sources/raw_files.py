@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from pipeline.sources.archives import open_member
+from pipeline.sources.archives import member_bytes, open_member
 from pipeline.sources.base import RawFile, SourceError
 
 CHUNK_BYTES = 12 << 20
@@ -23,6 +23,8 @@ CACHED_BYTES = 1 << 19
 LINE = "line"
 BOM = b"\xef\xbb\xbf"
 GZIP = b"\x1f\x8b"
+GZIP_RATIO = 6
+"""By which gzip makes trajectories shorter, at most."""
 
 
 def _open_packed(file: RawFile) -> BufferedReader:
@@ -55,6 +57,20 @@ def hash_raw(file: RawFile) -> str:
         while block := _read_block(handle, HASH_BYTES, file):
             digest.update(block)
     return digest.hexdigest()
+
+
+def unpacked_bytes(file: RawFile) -> int:
+    """About how long a file's text is; that of a gzip file is estimated.
+
+    Raises:
+        SourceError: a zip archive is damaged, or its member cannot be read.
+    """
+    with ExitStack() as stack:
+        handle = stack.enter_context(_open_packed(file))
+        with _explain_damage(file):
+            is_gzip = handle.peek(len(GZIP)).startswith(GZIP)
+    size = file.path.stat().st_size if file.member is None else member_bytes(file)
+    return size * GZIP_RATIO if is_gzip else size
 
 
 @contextmanager

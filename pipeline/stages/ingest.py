@@ -12,13 +12,18 @@ from pipeline.lake.files import STAGING
 from pipeline.sources import SOURCES, RawFile, Source, SourceError
 from pipeline.sources.accounting import count_reasons, to_rejects
 from pipeline.sources.base import Canonical, Part
+from pipeline.sources.raw_files import unpacked_bytes
 from pipeline.stages.base import Job, make_entry, make_job
 from pipeline.stages.discovery import Discovery
+from pipeline.stages.room import Room
 from schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
 VERSION = 2
 SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
+ROOM = Room(256 << 20)
+"""Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
+
 _PLANNING_FACTS = ("subset", "freeway")
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
@@ -172,12 +177,18 @@ def build(root: Path, job: Job) -> Entry:
     Raises:
         SourceError, schemas.StructureError: the recording cannot be used.
     """
-    dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
+    recording, files = job.inputs["recording"], files_of(job)
     if recording is None:
         return _build_unassigned(root, job, files[0])
-    source = SOURCE_BY_NAME[dataset]
-    parts = [_spilled_part(root, file, recording) if needs_spill(job) else Part(file) for file in files]
-    canonical = source.to_canonical(parts, recording)
+    if needs_spill(job):
+        return _build_recording(root, job, [_spilled_part(root, file, recording) for file in files])
+    with ROOM.taken(sum(map(unpacked_bytes, files))):
+        return _build_recording(root, job, [Part(file) for file in files])
+
+
+def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
+    dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
+    canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
     if not canonical.subsets:
         raise SourceError(f"recording {recording}: no carriageway has entries ({files[-1].name}).")
     written = _write(root, job, canonical)
