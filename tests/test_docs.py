@@ -19,25 +19,22 @@ BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
 COMMANDS = [line for block in BLOCKS for line in block.splitlines() if line.startswith("tracklake ")]
 
 
-@pytest.fixture(scope="module")
-def newcomer(command, lake, sample, tmp_path_factory):
+@pytest.fixture
+def newcomer(command, lake, sample, tmp_path):
     """A folder as it is after `make run`."""
-    folder = tmp_path_factory.mktemp("newcomer")
-    shutil.copytree(lake.root, folder / "lake")
-    shutil.copytree(sample, folder / "sample")
-    return replace(command, folder=folder)
+    shutil.copytree(lake.root, tmp_path / "lake")
+    shutil.copytree(sample, tmp_path / "sample")
+    return replace(command, folder=tmp_path)
 
 
-def test_there_are_commands_to_try():
+def test_the_commands_of_the_readme_run_as_printed(newcomer):
+    """One after the other, as a reader types them: later ones need what earlier ones made."""
     assert len(COMMANDS) >= 8
-
-
-@pytest.mark.parametrize("line", COMMANDS, ids=lambda line: line[:40])
-def test_a_command_of_the_readme_runs_as_printed(newcomer, line):
-    arguments = shlex.split(line.replace("--seconds 60", "--seconds 1"), comments=True)[1:]
-    done = newcomer(*arguments)
-    assert done.code == 0, done.err
-    assert done.out
+    for line in COMMANDS:
+        arguments = shlex.split(line.replace("--seconds 60", "--seconds 1"), comments=True)[1:]
+        done = newcomer(*arguments)
+        assert done.code == 0, f"{line}: {done.err}"
+        assert done.out, line
 
 
 def test_the_readme_names_every_command():
