@@ -31,6 +31,10 @@ def _open_packed(file: RawFile) -> BufferedReader:
     return file.path.open("rb") if file.member is None else open_member(file)
 
 
+def _is_gzip(handle: BufferedReader) -> bool:
+    return handle.peek(len(GZIP)).startswith(GZIP)
+
+
 @contextmanager
 def open_raw(file: RawFile) -> Iterator[BinaryIO]:
     """Open a raw file for reading bytes; what is compressed is read without unpacking it to disk.
@@ -41,7 +45,7 @@ def open_raw(file: RawFile) -> Iterator[BinaryIO]:
     with ExitStack() as stack:
         handle = stack.enter_context(_open_packed(file))
         with _explain_damage(file):
-            is_gzip = handle.peek(len(GZIP)).startswith(GZIP)
+            is_gzip = _is_gzip(handle)
         # A GzipFile reads as a binary file, though it is not declared as one.
         yield stack.enter_context(cast("BinaryIO", gzip.GzipFile(fileobj=handle))) if is_gzip else handle
 
@@ -65,10 +69,8 @@ def unpacked_bytes(file: RawFile) -> int:
     Raises:
         SourceError: a zip archive is damaged, or its member cannot be read.
     """
-    with ExitStack() as stack:
-        handle = stack.enter_context(_open_packed(file))
-        with _explain_damage(file):
-            is_gzip = handle.peek(len(GZIP)).startswith(GZIP)
+    with _open_packed(file) as handle, _explain_damage(file):
+        is_gzip = _is_gzip(handle)
     size = file.path.stat().st_size if file.member is None else member_bytes(file)
     return size * GZIP_RATIO if is_gzip else size
 
