@@ -1,15 +1,22 @@
 """What several test packages share: Prefect kept to itself, a generated sample, and a lake made of it."""
 
+import http.client
 import json
 import os
+import socket
 import subprocess
 import sys
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator
+from contextlib import chdir
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 SAMPLE_MINUTES = 0.3
+SERVER_START_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -23,10 +30,29 @@ class Finished:
 
 @dataclass(frozen=True)
 class Command:
-    """Runs `tracklake` as a user does: a process of its own, in a folder of its own."""
+    """Runs `tracklake` as a user does: a process of its own, in a folder of its own.
+
+    Prefect's API is served by one process for all of them, as where PREFECT_API_URL is set. `alone` is the command of
+    somebody who has set up nothing: each serves itself, which costs it some seconds more.
+    """
 
     folder: Path
     environment: dict[str, str]
+    own_server: dict[str, str] = field(default_factory=dict)
+
+    def here(self, *arguments: str | Path, **extra: str) -> Finished:
+        """The same in this process, which spares imports: where neither the process nor Prefect is what is tested."""
+        from typer.testing import CliRunner
+
+        from pipeline.cli import app
+
+        with chdir(self.folder), mock.patch.dict(os.environ, {**self.environment, **extra}, clear=True):
+            done = CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False)
+        return Finished(done.exit_code, done.stdout, done.stderr)
+
+    @property
+    def alone(self) -> "Command":
+        return replace(self, environment=self.own_server)
 
     def __call__(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
         done = subprocess.run(
@@ -54,11 +80,75 @@ class Command:
 
 
 @pytest.fixture(scope="session")
-def command(tmp_path_factory: pytest.TempPathFactory) -> Command:
-    home = tmp_path_factory.mktemp("prefect")
+def clean_environment() -> dict[str, str]:
+    """Without whoever runs the tests' settings of Prefect and of tracklake."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("TRACKLAKE_", "PREFECT_"))}
-    environment = {**kept, "PREFECT_HOME": str(home), "COLUMNS": "200", "PYTHONWARNINGS": "default"}
-    return Command(tmp_path_factory.mktemp("elsewhere"), environment)
+    return {**kept, "COLUMNS": "200", "PYTHONWARNINGS": "default"}
+
+
+def is_served(port: int) -> bool:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    try:
+        connection.request("GET", "/api/health")
+        return connection.getresponse().status == 200
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+@pytest.fixture(scope="session")
+def prefect_address(clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Where a Prefect server is, for PREFECT_API_URL."""
+    home = tmp_path_factory.mktemp("server")
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    arguments = ("server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-services", "--no-ui")
+    with (home / "log").open("w") as log:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "prefect", *arguments, "--analytics-off"],
+            env={**clean_environment, "PREFECT_HOME": str(home), "DO_NOT_TRACK": "1"},
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        limit = time.monotonic() + SERVER_START_S
+        while not is_served(port):
+            assert server.poll() is None, (home / "log").read_text()
+            assert time.monotonic() < limit, (home / "log").read_text()
+            time.sleep(0.1)
+        yield f"http://127.0.0.1:{port}/api"
+    finally:
+        server.terminate()
+        server.wait(timeout=30)
+
+
+@pytest.fixture(scope="session")
+def command(
+    clean_environment: dict[str, str], prefect_address: str, tmp_path_factory: pytest.TempPathFactory
+) -> Command:
+    alone = {**clean_environment, "PREFECT_HOME": str(tmp_path_factory.mktemp("prefect"))}
+    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_address}, alone)
+
+
+@pytest.fixture(scope="module")
+def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The same server for this process: for flows, and for what `command.here` does that needs them."""
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_LOGGING_TO_API_ENABLED,
+        PREFECT_RESULTS_LOCAL_STORAGE_PATH,
+        temporary_settings,
+    )
+
+    here = {
+        PREFECT_API_URL: prefect_address,
+        PREFECT_RESULTS_LOCAL_STORAGE_PATH: tmp_path_factory.mktemp("results"),
+        PREFECT_LOGGING_TO_API_ENABLED: False,  # or it would log to a server that has ended
+    }
+    with temporary_settings(here):
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -81,7 +171,7 @@ class Lake:
 @pytest.fixture(scope="session")
 def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Lake:
     root = tmp_path_factory.mktemp("lakes") / "lake"
-    done = command("run", sample, "--lake", root, "--json")
+    done = command.alone("run", sample, "--lake", root, "--json")
     assert done.code == 0, done.err
     return Lake(root, json.loads(done.out))
 

@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import pytest
 
+from pipeline.lake import connect
+
+pytestmark = pytest.mark.usefixtures("prefect_here")
+
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
 EXPECTED = ("Expected", "highD: NN_recordingMeta.csv", "NGSIM: 18 numbers a line")
 
 
 def run(command, source, tmp_path, name="lake"):
-    return command("ingest", source, "--lake", tmp_path / name)
+    return command.here("ingest", source, "--lake", tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -27,7 +31,7 @@ def test_a_file_that_is_no_recording(command, tmp_path, name, content, words):
     source = tmp_path / name
     if content is not None:
         source.write_bytes(content)
-    done = run(command, source, tmp_path)
+    done = command("ingest", source, "--lake", tmp_path / "lake")
     assert done.code == FAILED
     assert all(word in done.err for word in words), done.err
     assert "Traceback" not in done.err
@@ -65,13 +69,13 @@ def test_damaged_lines_are_quarantined_and_the_rest_goes_through(command, tmp_pa
     done = run(command, tmp_path, tmp_path.parent, f"{tmp_path.name}-lake")
     lake = tmp_path.parent / f"{tmp_path.name}-lake"
     assert done.code == DONE, done.err
-    rejects = json.loads(command("sql", "FROM rejects", "--lake", lake, "--format", "json").out)
+    rejects = json.loads(command.here("sql", "FROM rejects", "--lake", lake, "--format", "json").out)
     assert [(row["file"], row["line"]) for row in rejects] == [("01_tracks.csv", 11), ("01_tracks.csv", 22)]
     assert rejects[0]["reason"].endswith("fields instead of 25")
     assert rejects[0]["text"] == cut.decode().strip()
     assert rejects[1]["reason"] == "NUL byte"
-    (tracks,) = json.loads(command("sql", "SELECT count(*) AS n FROM tracks", "--lake", lake, "--format", "json").out)
-    assert tracks["n"] == len(lines) - 1
+    with connect(lake) as connection:
+        assert connection.sql("SELECT count(*) FROM tracks").fetchall() == [(len(lines) - 1,)]
 
 
 def test_a_highd_recording_without_its_meta_file_beside_a_good_one(command, tmp_path, sample):
@@ -88,10 +92,8 @@ def test_a_highd_recording_without_its_meta_file_beside_a_good_one(command, tmp_
     assert "recording 04: 04_tracksMeta.csv missing beside 04_recordingMeta.csv, 04_tracks.csv" in done.err
     assert "other.csv, line 1" in done.err
     assert "notes.txt" in done.out
-    rows = json.loads(
-        command("sql", "SELECT DISTINCT recording FROM subsets", "--lake", tmp_path / "lake", "--format", "json").out
-    )
-    assert rows == [{"recording": "01"}]
+    with connect(tmp_path / "lake") as lake:
+        assert lake.sql("SELECT DISTINCT recording FROM subsets").fetchall() == [("01",)]
     again = run(command, source, tmp_path)
     assert (again.code, "nothing to do" in again.out) == (REFUSED, True), "refused files are not forgotten"
 
@@ -109,28 +111,28 @@ def test_a_highd_recording_whose_files_do_not_belong_together(command, tmp_path,
 
 def test_wrong_usage(command, tmp_path):
     assert command("bogus").code == USAGE
-    assert command("run", tmp_path, "--bogus").code == USAGE
-    assert command("ingest").code == USAGE
-    assert command("ingest", tmp_path, "--dataset", "ngsin").code == USAGE
-    assert command("run", tmp_path, "--minutes", "1").code == USAGE
-    wrong = command("run", tmp_path, TRACKLAKE_WORKERS="many")
+    assert command.here("run", tmp_path, "--bogus").code == USAGE
+    assert command.here("ingest").code == USAGE
+    assert command.here("ingest", tmp_path, "--dataset", "ngsin").code == USAGE
+    assert command.here("run", tmp_path, "--minutes", "1").code == USAGE
+    wrong = command.here("run", tmp_path, TRACKLAKE_WORKERS="many")
     assert wrong.code == USAGE
     assert "setting workers" in wrong.err
-    unknown = command("validate", TRACKLAKE_THRESHOLDS='{"no_such": 1}', TRACKLAKE_LAKE=str(tmp_path))
+    unknown = command.here("validate", TRACKLAKE_THRESHOLDS='{"no_such": 1}', TRACKLAKE_LAKE=str(tmp_path))
     assert unknown.code in (FAILED, USAGE)
     assert "Traceback" not in unknown.err
 
 
 def test_a_lake_that_is_none(command, tmp_path):
     for arguments in (("validate",), ("report",), ("sql", "SELECT 1"), ("evaluate",), ("train", "lstm")):
-        done = command(*arguments, "--lake", tmp_path / "nowhere")
+        done = command.here(*arguments, "--lake", tmp_path / "nowhere")
         assert done.code == FAILED, arguments
         assert "no lake here" in done.err
         assert "tracklake run" in done.err
         assert not (tmp_path / "nowhere").exists()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("do not touch")
-    done = command("run", tmp_path, "--lake", tmp_path / "mine")
+    done = command.here("run", tmp_path, "--lake", tmp_path / "mine")
     assert done.code == FAILED
 
 
@@ -140,14 +142,14 @@ def test_a_stage_out_of_turn_names_the_stage_to_run_first(command, tmp_path, sam
     for kind in ("recordingMeta", "tracksMeta", "tracks"):
         shutil.copy(sample / f"04_{kind}.csv", source)
     assert run(command, source, tmp_path).code == DONE
-    done = command("samples", "--lake", tmp_path / "lake")
+    done = command.here("samples", "--lake", tmp_path / "lake")
     assert done.code == FAILED
     assert "tracklake validate" in done.err
 
 
 def test_settings_come_from_flags_then_environment_then_file(command, tmp_path):
     (tmp_path / "tracklake.toml").write_text('lake = "from-file"\n')
-    elsewhere = replace(command, folder=tmp_path)
+    elsewhere = replace(command, folder=tmp_path).here
     assert "from-file: no lake here" in elsewhere("sql", "SELECT 1").err
     assert "env: no lake here" in elsewhere("sql", "SELECT 1", TRACKLAKE_LAKE="env").err
     assert "flag: no lake here" in elsewhere("sql", "SELECT 1", "--lake", "flag", TRACKLAKE_LAKE="env").err

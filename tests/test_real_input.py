@@ -17,8 +17,8 @@ def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
     assert done.code == 0, done.err
     assert "repair, samples, split and tensors were left out for peachtree-1245-north" in done.out
     assert "10,000 entries" in done.out
-    query = "SELECT recording, direction, sum(entries)::INT AS entries FROM subsets GROUP BY ALL ORDER BY ALL"
-    rows = json.loads(command("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
+    query = "SELECT recording, direction, sum(entries) AS entries FROM subsets GROUP BY ALL ORDER BY ALL"
+    rows = json.loads(command.here("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
     # Counted over the file with the csv module alone: Global_Time - 100 * Frame_ID and Direction of every row.
     assert [tuple(row.values()) for row in rows] == [
         ("peachtree-1245", "north", 7613),
@@ -41,7 +41,7 @@ def test_all_excerpts_at_once(command, tmp_path):
     assert said["headline"]["recordings"] == 7
     query = """SELECT recording, measure, expected, found FROM completeness WHERE authority = 'published'
                AND recording IN ('us-101-0750', 'i-80-1600') ORDER BY ALL"""
-    rows = json.loads(command("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
+    rows = json.loads(command.here("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
     # Counted over the files with the csv module alone; seven rows of two other vehicles of US-101 07:50 are the API's.
     assert [tuple(row.values()) for row in rows] == [
         ("i-80-1600", "entries", 1_262_678, 1_005),

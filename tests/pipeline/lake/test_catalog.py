@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from decimal import Decimal
 from pathlib import Path
 
 import duckdb
@@ -17,7 +18,7 @@ from schemas import SUBSETS as SUBSETS_TABLE
 
 SQL_NAMES = {
     pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
-    pl.Int64: "BIGINT", pl.Float32: "FLOAT", pl.Float64: "DOUBLE",
+    pl.Int64: "BIGINT", pl.Float32: "FLOAT", pl.Float64: "DOUBLE", pl.Enum: "VARCHAR",
 }  # fmt: skip
 JOINED = {
     "vehicles": {"eligible": "BOOLEAN", "starts_late": "BOOLEAN", "fully_tracked": "BOOLEAN", "early": "BOOLEAN"},
@@ -229,6 +230,13 @@ def snapshot(folder: Path) -> dict[str, bytes]:
         ("-- why\nEXPLAIN ANALYZE SELECT * FROM vehicles", "analyzed_plan"),
         ("explain analyze select 1", "analyzed_plan"),
         ("SELECT text FROM rejects", "it's"),
+        # Names of switches that switch nothing: in comments, in texts, of a WITH, of columns.
+        ("-- a query (x)\nSELECT /* enable_logging() */ 'disable_logging()'", "disable_logging()"),
+        ('WITH query (x, "y") AS (SELECT 3, 4) SELECT y FROM query', 4),
+        ('WITH a AS (SELECT 1), Query (x) -- (\n AS (SELECT 5) FROM "query"', 5),
+        ('SELECT $$query(\'$$ AS "query("', "query('"),
+        ("SELECT 'ü' AS enable_profiling", "ü"),
+        ("PIVOT (SELECT 1 AS lane, 8 AS n) ON lane IN (1, 2) USING sum(n)", 8),
     ],
 )
 def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
@@ -259,7 +267,10 @@ def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
         "-- \nEXPLAIN ANALYZE CREATE TABLE x AS SELECT 1",
         "FROM enable_logging(storage = 'file', storage_path = '{lake}/splits')",
         "FROM query('FROM enable_' || 'logging()')", 'FROM "query" /* */ (\'SELECT 1\')',
-        "FROM query('COPY (SELECT 1) TO ''{lake}/splits/x.csv''')",
+        "FROM query('COPY (SELECT 1) TO ''{lake}/splits/x.csv''')", "FROM query -- (x) AS (\n('SELECT 1')",
+        "FROM main.query('SELECT 1') AS materialized (x)", "WITH query (x) AS (FROM query('SELECT 1')) FROM query",
+        "SELECT 'ü', * FROM query('SELECT 1')", "FROM (query('SELECT 1')) AS t",
+        "FROM json_execute_serialized_sql(json_serialize_sql('FROM enable_' || 'logging()'))",
         "FROM Enable_Profiling(format = 'json', save_location = '{lake}/splits/x.json')",
         "FROM '{secret}'", "FROM read_csv('{secret}')", "FROM read_text('/etc/passwd')", "FROM '/etc/passwd'",
         "FROM read_blob('{lake}/manifest.json')", "FROM read_text('{lake}/catalog.duckdb')", "FROM glob('/etc/*')",
@@ -334,6 +345,22 @@ def test_a_result_reads_and_has_no_method_that_writes(lake: Path):
             with pytest.raises(QueryError):
                 found.project(expressions)
         assert (found.fetchone(), found.fetchall()) == ((0, "car"), [(1, "car"), (2, "car")])
+
+
+def test_whole_numbers_come_as_such_where_64_bits_hold_them(lake: Path):
+    with connect(lake) as connection:
+        found = connection.sql(
+            "SELECT sum(n) AS s, 6::UHUGEINT AS u, sum(n) + 9223372036854775807 - 6 AS most, most + 1 AS more,"
+            " NULL::HUGEINT AS none, sum(n::DECIMAL(9, 1)) AS exact FROM (VALUES (1), (2), (3)) AS t(n)"
+        ).pl()
+    wide = pl.Decimal(38, 0)
+    assert found.dtypes == [pl.Int64, pl.Int64, pl.Int64, wide, pl.Int64, pl.Decimal(38, 1)]
+    assert found.row(0) == (6, 6, 2**63 - 1, Decimal(2**63), None, Decimal("6.0"))
+
+
+def test_a_pivot_without_values_is_told_what_works(lake: Path):
+    with connect(lake) as connection, pytest.raises(QueryError, match=r"PIVOT \.\.\. ON lane IN \(1, 2, 3\)"):
+        connection.sql("PIVOT (SELECT 1 AS lane, 8 AS n) ON lane USING sum(n)")
 
 
 def test_python_variables_are_no_tables(lake: Path):

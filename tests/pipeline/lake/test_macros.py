@@ -1,92 +1,15 @@
-"""The table macros: numbers derived by hand, a slow loop over a messy subset, and how they may be called."""
+"""The table macros: numbers derived by hand."""
 
-import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import duckdb
-import numpy as np
-import polars as pl
 import pytest
-from small_lake import put
+from macro_lake import PAIRS, entry, put_subset
 
-from pipeline.lake import QueryError, connect, open_for_writing
-from pipeline.lake.macros import MACROS
+from pipeline.lake import connect
 from pipeline.lake.sandbox import LakeConnection
-from schemas import SUBSETS, TRACKS, VEHICLES, Table
-
-CALLS = {
-    "flow_density": "{subset}, 2",
-    "lane_changes": "{subset}",
-    "leader_follower": "{subset}",
-    "near": "{subset}, 3, 50, 2, 60",
-    "scene": "{subset}, 3",
-    "track": "{subset}, 1",
-}
-EMPTY = {"leader_id": None, "follower_id": None, "gap_m": None, "headway_recorded_m": None}
-CLASSES = {1: "car", 2: "truck", 3: "car", 4: "motorcycle"}
-LENGTHS = {1: 4.0, 2: 12.0, 3: 5.0, 4: 2.0}
-
-
-def call(name: str, subset: str = "'a'") -> str:
-    return f"{name}({CALLS[name].format(subset=subset)})"
-
-
-def entry(vehicle: int, frame: int, x: float, lane: int | None, speed: float, **more: object) -> dict[str, object]:
-    """At 2 Hz, frames counted from 1."""
-    named = {"vehicle_id": vehicle, "frame": frame, "time_s": (frame - 1) / 2, "x_m": x, "lane": lane}
-    return {**named, "y_m": 2.0, "speed_mps": speed, **EMPTY, **more}
-
-
-def put_subset(
-    root: Path, entries: list[dict[str, object]], subset: str = "a", dataset: str = "highd", seconds: float = 5.0
-) -> None:
-    """One subset of 2 Hz with its entries, its vehicles and itself."""
-    values = {"dataset": dataset, "subset": subset}
-
-    def fill(table: Table, rows: list[dict[str, object]]) -> pl.DataFrame:
-        given = [{name: row.get(name) for name in table.dtypes} | values for row in rows]
-        return pl.DataFrame(given, schema=table.dtypes)
-
-    tracks = fill(TRACKS, entries).sort("vehicle_id", "frame")
-    vehicles = [
-        {
-            "vehicle_id": vehicle, "source_vehicle_id": vehicle, "class": CLASSES.get(vehicle, "car"),
-            "length_m": LENGTHS.get(vehicle, 4.0), "width_m": 2.0, "first_frame": own["frame"].min(),
-            "last_frame": own["frame"].max(), "entries": own.height, "start_x_m": own["x_m"][0],
-            "end_x_m": own["x_m"][-1], "start_lane": own["lane"][0], "mean_speed_mps": own["speed_mps"].mean(),
-        }
-        for (vehicle,), own in tracks.group_by("vehicle_id", maintain_order=True)
-    ]  # fmt: skip
-    facts = {
-        "recording": subset, "site": "1", "direction": "upper", "freeway": True, "frame_rate_hz": 2.0, "lanes": 2,
-        "seconds": seconds, "first_frame": 1, "last_frame": tracks["frame"].max(), "vehicles": len(vehicles),
-        "entries": tracks.height, "ids_split": 0, "on_ramp_lanes": [], "columns_missing": [],
-        "source_files": [{"file": "a.csv", "sha256": "00"}],
-    }  # fmt: skip
-    with open_for_writing(root) as writer:
-        for table, frame in ((TRACKS, tracks), (VEHICLES, fill(VEHICLES, vehicles)), (SUBSETS, fill(SUBSETS, [facts]))):
-            writer.commit(put(root, f"{table.name}/{dataset}/{subset}", 1, frame, table, **values))
-
-
-PAIRS = [
-    # A truck ahead of a faster car, which closes in, is as fast at frame 2, and overlaps it at frame 3.
-    entry(2, 1, 62.0, 1, 10.0),
-    entry(1, 1, 20.0, 1, 20.0, leader_id=2, gap_m=30.0),
-    entry(2, 2, 67.0, 1, 10.0),
-    entry(1, 2, 30.0, 1, 10.0, leader_id=2, gap_m=25.0),
-    entry(2, 3, 72.0, 1, 10.0),
-    entry(1, 3, 61.0, 1, 20.0, leader_id=2, gap_m=-1.0),
-    # Its leader has no entry at this frame.
-    entry(1, 4, 71.0, 1, 20.0, leader_id=2, gap_m=5.0),
-    # Stands, then rolls back, behind the car.
-    entry(3, 1, 10.0, 1, 0.0, leader_id=1, gap_m=6.0),
-    entry(3, 2, 9.0, 1, -2.0, leader_id=1, gap_m=17.0),
-]
-
-
-CHANGES = [entry(4, 6, 100.0, 1, 9.0), entry(4, 7, 104.5, 2, 9.0)]
+from schemas import TRACKS
 
 
 @pytest.fixture
@@ -159,6 +82,10 @@ def test_near_is_within_the_radius_and_on_it(tmp_path: Path):
     with connect(tmp_path) as connection:
         asked = "SELECT vehicle_id, distance_m, dx_m, dy_m FROM near('a', 1, 100, 2, 10)"
         assert connection.sql(asked).fetchall() == [(3, 0.0, 0.0, 0.0), (1, 5.0, 3.0, 4.0), (2, 10.0, -6.0, -8.0)]
+        counts = [
+            connection.sql(f"FROM near('a', 1, 100, 2, {radius})").count() for radius in ("0", "-0.0", "-10", "NULL")
+        ]
+        assert counts == [1, 1, 0, 0]  # only the one that is there; nobody is nearer than that
 
 
 def test_lane_changes_bridge_no_gaps(tmp_path: Path):
@@ -228,14 +155,17 @@ def test_flow_density_of_the_whole_recording_and_of_every_frame(tmp_path: Path):
 
 @pytest.mark.parametrize("seconds", [0.28, 0.7, 0.1])
 def test_intervals_hold_the_frames_they_should(tmp_path: Path, seconds: float):
-    """25 Hz and 0.28 s: seven frames; in floating point, 0.28 * 25 is a little more."""
+    """28, 70 and 10 frames, asked for in the seconds of the subset's own 2 Hz: 14, 35 and 5 s.
+
+    In floating point, 0.28 * 100 / 2 is a little more than 14.
+    """
     rate, frames = 100, 300
     entries = [entry(1, frame, frame / 10, 1, 10.0) for frame in range(1, frames + 1)]
     put_subset(tmp_path, [{**row, "time_s": (row["frame"] - 1) / rate} for row in entries], seconds=frames / rate)
     per_interval = round(seconds * rate)
     whole, rest = divmod(frames, per_interval)
     with connect(tmp_path) as connection:
-        # The subset says 2 Hz: the rate in its row is what counts, so ask in its own seconds.
+        # The rate in its row is what counts, whatever time its entries say.
         found = connection.sql(f"SELECT entries FROM flow_density('a', {seconds * rate / 2})").fetchall()
     assert [count for (count,) in found] == [per_interval] * whole + ([rest] if rest else [])
 
@@ -252,207 +182,3 @@ def test_a_recording_announced_shorter_than_it_is_has_no_endless_flow(tmp_path: 
     with connect(tmp_path) as connection:
         found = connection.sql("SELECT DISTINCT interval, interval_s FROM flow_density('a', 2) ORDER BY 1").fetchall()
     assert found == [(0, 2.0), (1, 2.0), (2, 1.0)]
-
-
-# ------------------------------------------------------------------------------------------- a messy subset
-
-
-@pytest.fixture(scope="module")
-def messy(tmp_path_factory: pytest.TempPathFactory) -> tuple[LakeConnection, list[dict[str, object]]]:
-    """Thirty vehicles with gaps, missing lanes, leaders that are not there, standing and rolling back."""
-    random = np.random.default_rng(5)
-    entries = []
-    for vehicle in (*range(1, 30), 2**31 - 1):
-        for frame in range(int(random.integers(1, 30)), int(random.integers(30, 60))):
-            if random.random() < 0.1:
-                continue
-            lane = None if random.random() < 0.1 else int(random.integers(1, 4))
-            speed = float(random.choice([-1.5, 0.0, 0.25, 8.5, 20.0, 31.75]))
-            leader = None if random.random() < 0.3 else int(random.integers(1, 40))
-            gap = None if leader is None else float(round(random.uniform(-5, 60), 3))
-            x, y = round(random.uniform(0, 400), 3), round(random.uniform(0, 12), 3)
-            entries.append(entry(vehicle, frame, x, lane, speed, y_m=y, leader_id=leader, gap_m=gap))
-    root = tmp_path_factory.mktemp("messy")
-    put_subset(root, entries, seconds=31.7)
-    return connect(root), entries
-
-
-def close_to(row: tuple[float | None, ...]) -> tuple[object, ...]:
-    return tuple(value if value is None else pytest.approx(value, rel=1e-9, abs=1e-9) for value in row)
-
-
-def test_leader_follower_finds_what_a_loop_finds(messy):
-    connection, entries = messy
-    at = {(row["vehicle_id"], row["frame"]): row for row in entries}
-    expected = []
-    for row in sorted(entries, key=lambda row: (row["vehicle_id"], row["frame"])):
-        ahead = at.get((row["leader_id"], row["frame"]))
-        if ahead is None:
-            continue
-        spacing, closing = ahead["x_m"] - row["x_m"], row["speed_mps"] - ahead["speed_mps"]
-        headway = spacing / row["speed_mps"] if row["speed_mps"] > 0 else None
-        ttc = row["gap_m"] / closing if closing > 0 and row["gap_m"] >= 0 else None
-        expected.append((row["vehicle_id"], row["leader_id"], row["frame"], round(spacing, 3), headway, closing, ttc))
-    asked = "SELECT follower_id, leader_id, frame, spacing_m, time_headway_s, closing_mps, ttc_s"
-    found = connection.sql(f"{asked} FROM leader_follower('a')").fetchall()
-    assert len(expected) > 200
-    assert len([row for row in expected if row[-1] is not None]) > 50
-    assert found == [close_to(row) for row in expected]
-
-
-def test_lane_changes_finds_what_a_loop_finds(messy):
-    connection, entries = messy
-    at = {(row["vehicle_id"], row["frame"]): row["lane"] for row in entries}
-    expected = [
-        (vehicle, frame, at[vehicle, frame - 1], lane, "right" if lane > at[vehicle, frame - 1] else "left")
-        for (vehicle, frame), lane in sorted(at.items(), key=lambda item: item[0])
-        if lane is not None and at.get((vehicle, frame - 1)) not in (None, lane)
-    ]
-    asked = "SELECT vehicle_id, frame, from_lane, to_lane, direction FROM lane_changes('a')"
-    assert len(expected) > 300
-    assert connection.sql(asked).fetchall() == expected
-
-
-def test_flow_density_finds_what_a_loop_finds(messy):
-    connection, entries = messy
-    xs = [row["x_m"] for row in entries]
-    section, rate, end, length = max(xs) - min(xs), 2.0, 31.7, 3.0
-    expected = []
-    for lane in (1, 2, 3, None):
-        for interval in range(11):  # 10 of 3 s and one of 1.7 s
-            duration = length if interval < 10 else end - 30.0
-            # six frames an interval
-            own = [row for row in entries if row["lane"] == lane and (row["frame"] - 1) // 6 == interval]
-            metres, seconds = sum(row["speed_mps"] for row in own) / rate, len(own) / rate
-            area = section * duration
-            flow, density = metres / area * 3600, seconds / area * 1000
-            expected.append((lane, interval, len(own), flow, density, metres / seconds if own else None))
-    asked = "SELECT lane, interval, entries, flow_veh_per_h, density_veh_per_km, speed_mps FROM flow_density('a', 3)"
-    assert sum(row[2] for row in expected) == len(entries)
-    assert connection.sql(asked).fetchall() == [close_to(row) for row in expected]
-
-
-def test_near_and_scene_find_what_a_loop_finds(messy):
-    connection, entries = messy
-    for frame in (1, 29, 40):
-        here = [row for row in entries if row["frame"] == frame]
-        found = connection.sql(f"SELECT vehicle_id FROM scene('a', {frame})").fetchall()
-        assert sorted(vehicle for (vehicle,) in found) == sorted(row["vehicle_id"] for row in here)
-        far = {row["vehicle_id"]: ((row["x_m"] - 200) ** 2 + (row["y_m"] - 6) ** 2) ** 0.5 for row in here}
-        expected = sorted((metres, vehicle) for vehicle, metres in far.items() if metres <= 120)
-        found = connection.sql(f"SELECT distance_m, vehicle_id FROM near('a', {frame}, 200, 6, 120)").fetchall()
-        assert found == [close_to(row) for row in expected]
-
-
-# ------------------------------------------------------------------------------------------- how they are called
-
-
-@pytest.fixture(scope="module")
-def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three subsets, one of which stands in both data sets."""
-    root = tmp_path_factory.mktemp("several")
-    for dataset, subset in (("highd", "a"), ("highd", "b"), ("ngsim", "b"), ("ngsim", "c")):
-        put_subset(root, PAIRS[: {"a": 9, "b": 7, "c": 4}[subset]], subset=subset, dataset=dataset)
-    return root
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_a_macro_reads_its_subset_and_no_other(several: Path, tmp_path: Path, name: str):
-    root = tmp_path / "lake"
-    shutil.copytree(several, root)
-    for file in root.glob("*/*/subset=[bc]/*.parquet"):
-        file.write_bytes(b"x" * file.stat().st_size)
-    with connect(several) as whole, connect(root) as connection:
-        expected = whole.sql(f"FROM {call(name)}").fetchall()
-        assert connection.sql(f"FROM {call(name)}").fetchall() == expected
-        for subset, parameters in (("'a'", None), ("$asked", {"asked": "a"})):
-            explained = f"EXPLAIN (ANALYZE, FORMAT json) FROM {call(name, subset)}"
-            plan = whole.sql(explained, parameters).fetchall()[0][1]
-            # Of four, or of one where the others were left out even earlier; for every reading there is.
-            counts = re.findall(r'"Scanning Files": "(\d+)/[14]"', plan)
-            assert counts == ["1"] * plan.count('"Function": "READ_PARQUET"')
-        with pytest.raises(duckdb.Error):
-            connection.sql("SELECT sum(x_m) FROM tracks").fetchall()
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_a_subset_of_two_data_sets_gives_both_apart(tmp_path: Path, name: str):
-    here = {"highd": PAIRS + CHANGES, "ngsim": [{**row, "x_m": row["x_m"] + 10.0} for row in PAIRS[:7] + CHANGES]}
-    expected = []
-    for dataset, entries in here.items():
-        put_subset(tmp_path / dataset, entries, dataset=dataset)
-        put_subset(tmp_path / "both", entries, dataset=dataset)
-        with connect(tmp_path / dataset) as connection:
-            expected += connection.sql(f"FROM {call(name)}").fetchall()
-    with connect(tmp_path / "both") as connection:
-        assert connection.sql(f"FROM {call(name)}").fetchall() == expected
-    assert {row[0] for row in expected} == set(here)
-
-
-@pytest.mark.parametrize("name", CALLS)
-@pytest.mark.parametrize("alias", ["subsets", "entry", "asked", "tracks", "recording", "follower", "vehicle"])
-def test_arguments_may_be_columns_whatever_their_table_is_called(several: Path, name: str, alias: str):
-    """Never taken for a column of the macro's own tables, which would give every subset's rows for each."""
-    with connect(several) as connection:
-        expected = {
-            subset: connection.sql(f"SELECT count(*) FROM {call(name, repr(subset))}").fetchall()[0][0]
-            for subset in ("a", "c")
-        }
-        for argument in (f'"{alias}".subset', "subset"):
-            found = connection.sql(
-                f'SELECT asked_for, count(*) FROM (SELECT subset, subset AS asked_for FROM subsets) AS "{alias}",'
-                f" {call(name, argument)} AS given WHERE asked_for <> 'b' GROUP BY ALL"
-            ).fetchall()
-            assert dict(found) == {subset: rows for subset, rows in expected.items() if rows}
-
-
-def test_macros_take_named_arguments_and_parameters(several: Path):
-    with connect(several) as connection:
-        expected = connection.sql("FROM track('a', 1)").fetchall()
-        assert connection.sql("FROM track(vehicle := 1, subset := 'a')").fetchall() == expected
-        assert connection.sql("FROM track($subset, $id)", {"subset": "a", "id": 1}).fetchall() == expected
-        assert connection.sql("FROM track((SELECT min(subset) FROM subsets), 1)").fetchall() == expected
-        with pytest.raises(QueryError, match=r"track\(subset, vehicle\)"):
-            connection.sql("FROM track('a')")
-        for statement in ("CREATE OR REPLACE MACRO track(a) AS TABLE SELECT 1", "DROP MACRO TABLE track"):
-            with pytest.raises(QueryError, match="read-only"):
-                connection.sql(statement)
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_a_querys_own_tables_do_not_take_the_lakes_place(several: Path, name: str):
-    names = ("tracks", "vehicles", "subsets", "asked", "entry", "recording", "counted", "cells", "lanes", "section")
-    own = ", ".join(f"{name} AS (SELECT 1 AS one)" for name in names)
-    with connect(several) as connection:
-        expected = connection.sql(f"FROM {call(name)}").fetchall()
-        assert connection.sql(f"WITH {own} FROM {call(name)}").fetchall() == expected
-
-
-@pytest.mark.parametrize("name", CALLS)
-def test_the_catalog_carries_the_macros_also_after_a_move(several: Path, tmp_path: Path, monkeypatch, name: str):
-    shutil.copytree(several, tmp_path / "moved")
-    with connect(several) as connection:
-        expected = connection.sql(f"FROM {call(name)}").fetchall()
-    monkeypatch.chdir(tmp_path / "moved")
-    with duckdb.connect("catalog.duckdb", read_only=True) as plain:
-        assert plain.sql(f"FROM {call(name)}").fetchall() == expected
-
-
-@pytest.mark.parametrize("macro", MACROS, ids=lambda macro: macro.name)
-def test_a_macro_says_what_it_gives(several: Path, macro):
-    """Its file's header: meaning, parameters with theirs, and all columns in order."""
-    header = [line.removeprefix("--").strip() for line in macro.statement.splitlines() if line.startswith("--")]
-    paragraphs = [part.split("\n") for part in "\n".join(header).split("\n\n")]
-    assert paragraphs[0][0] == macro.meaning
-    assert tuple(line.split(":")[0] for line in paragraphs[-2]) == macro.parameters
-    with connect(several) as connection:
-        columns = connection.sql(f"FROM {call(macro.name)}").columns
-        listed = connection.sql(
-            f"SELECT parameters, comment FROM duckdb_functions() WHERE function_name = '{macro.name}' AND NOT internal"
-        )
-        assert listed.fetchall() == [(list(macro.parameters), macro.meaning)]
-    if macro.name == "track":
-        assert columns == list(TRACKS.dtypes)
-    else:
-        named = [name for line in paragraphs[-1] for name in line.split(":")[0].split(", ")]
-        assert columns == named

@@ -1,0 +1,58 @@
+"""Files that a rebuild found: left to those who read them, and to nobody else."""
+
+import json
+from pathlib import Path
+
+import pytest
+from small_lake import find_files, put_round
+
+from pipeline.lake import load, open_for_writing
+from pipeline.settings import Settings
+from pipeline.stages import tensors
+from pipeline.stages.base import Job
+from schemas.tensors import INDEX_FILE
+
+
+def test_what_a_rebuild_found_is_neither_used_again_nor_replaced(tmp_path: Path):
+    with open_for_writing(tmp_path) as writer:
+        writer.commit(put_round(tmp_path, "01-upper", 1))
+    made: list[dict[str, bytes]] = [{}, read_live(tmp_path)]
+    for round_number in (2, 3):
+        with open_for_writing(tmp_path, rebuild=True) as writer:
+            again = put_round(tmp_path, "01-upper", 1)
+            assert put_round(tmp_path, "01-upper", 1) == again, "what this session wrote is used again"
+            writer.commit(again)
+        made.append(read_live(tmp_path))
+        assert len(made[-1]) == 5
+        assert all(f"{1:016x}-{round_number}" in path for path in made[-1])
+        # The generation before the last one is still there for its readers, byte for byte.
+        assert made[-2] == {path: (tmp_path / path).read_bytes() for path in made[-2]}
+    for number in (2, 3):
+        with open_for_writing(tmp_path) as writer:
+            writer.commit(put_round(tmp_path, "01-upper", number))
+    assert not find_files(tmp_path) & (made[1].keys() | made[2].keys())
+
+
+def read_live(root: Path) -> dict[str, bytes]:
+    return {path: (root / path).read_bytes() for path in load(root).live_paths()}
+
+
+def test_the_tensors_of_a_rebuild_are_those_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Made of one sample before and of two now, under one fingerprint."""
+    samples = 1
+
+    def write(folder: Path, *_: object, **__: object) -> None:
+        (folder / INDEX_FILE).write_text(json.dumps({"sizes": {"S": samples}, "samples_by_part": {}}))
+
+    monkeypatch.setattr(tensors, "read_split", lambda *_: (None, None))
+    monkeypatch.setattr(tensors, "_sampled_subsets", lambda *_: [{}])
+    monkeypatch.setattr(tensors, "write_tensors", write)
+    job, settings = Job("tensors", f"{1:016x}"), Settings(lake=tmp_path)
+    with open_for_writing(tmp_path) as writer:
+        writer.commit(tensors.build(tmp_path, job, settings))
+    samples = 2
+    with open_for_writing(tmp_path, rebuild=True) as writer:
+        again = tensors.build(tmp_path, job, settings)
+        writer.commit(again)
+    assert again.info["samples"] == 2
+    assert {Path(file.path).parent.as_posix() for file in again.files["tensors"]} == {again.info["path"]}
