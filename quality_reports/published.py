@@ -8,6 +8,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from schemas.completeness import PUBLISHED_TOTALS
+
 SOURCE = (
     "the appendices of the study that validates NGSIM and highD (speeds averaged per vehicle and second, errors by the "
     "rules' default thresholds); vehicles and entries: the publishers' totals"
@@ -49,16 +51,18 @@ class Published:
     slow_vehicles: int | None
 
 
+TOTALS = {name: (totals["vehicles"], totals["entries"]) for name, totals in PUBLISHED_TOTALS.items()}
+
 # fmt: off
 PUBLISHED = (
     Published("highd", None, 110_516, 39_725_708, 9.63, 28.73, 39.38, 28.14, 6.91, 0, 0, None, 0),
     Published("ngsim", None, 11_779, 8_665_320, 0.0, 7.31, 17.23, 7.50, 4.48, 1_238, 31_436, 440_641, 389),
-    Published("ngsim", "i-80-1600", 2_052, 1_262_678, 0.89, 7.48, 18.48, 7.72, 4.06, 205, 3_474, 105_293, 8),
-    Published("ngsim", "i-80-1700", 1_836, 1_549_918, 0.0, 4.88, 15.24, 5.62, 3.89, 319, 10_632, 69_244, 93),
-    Published("ngsim", "i-80-1715", 1_790, 1_753_791, 0.0, 4.23, 13.74, 4.83, 3.62, 353, 11_650, 78_189, 194),
-    Published("ngsim", "us-101-0750", 2_169, 1_180_598, 1.33, 11.96, 19.56, 11.43, 4.53, 120, 1_912, 70_785, 13),
-    Published("ngsim", "us-101-0805", 2_017, 1_403_095, 0.22, 9.15, 15.91, 8.94, 4.09, 139, 1_800, 56_347, 37),
-    Published("ngsim", "us-101-0820", 1_915, 1_515_240, 0.49, 8.03, 14.68, 7.84, 3.67, 102, 1_968, 60_783, 44),
+    Published("ngsim", "i-80-1600", *TOTALS["i-80-1600"], 0.89, 7.48, 18.48, 7.72, 4.06, 205, 3_474, 105_293, 8),
+    Published("ngsim", "i-80-1700", *TOTALS["i-80-1700"], 0.0, 4.88, 15.24, 5.62, 3.89, 319, 10_632, 69_244, 93),
+    Published("ngsim", "i-80-1715", *TOTALS["i-80-1715"], 0.0, 4.23, 13.74, 4.83, 3.62, 353, 11_650, 78_189, 194),
+    Published("ngsim", "us-101-0750", *TOTALS["us-101-0750"], 1.33, 11.96, 19.56, 11.43, 4.53, 120, 1_912, 70_785, 13),
+    Published("ngsim", "us-101-0805", *TOTALS["us-101-0805"], 0.22, 9.15, 15.91, 8.94, 4.09, 139, 1_800, 56_347, 37),
+    Published("ngsim", "us-101-0820", *TOTALS["us-101-0820"], 0.49, 8.03, 14.68, 7.84, 3.67, 102, 1_968, 60_783, 44),
 )
 # fmt: on
 

@@ -1,7 +1,7 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
 from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
-from pipeline.lake.files import is_intact, scan, write_folder, write_table
+from pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
 from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
 from pipeline.lake.rebuild import list_ingested
 from pipeline.lake.sandbox import LakeResult, connect, query, query_errors
@@ -19,6 +19,7 @@ __all__ = [
     "QueryError",
     "Writer",
     "connect",
+    "free_path",
     "is_intact",
     "list_ingested",
     "load",

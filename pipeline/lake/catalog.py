@@ -45,6 +45,8 @@ def sql_type(dtype: pl.DataType | DataTypeClass) -> str:
     if isinstance(dtype, pl.Struct):
         inner = ", ".join(f'"{field.name}" {sql_type(field.dtype)}' for field in dtype.fields)
         return f"STRUCT({inner})"
+    if isinstance(dtype, pl.Enum):
+        return "VARCHAR"
     instance = dtype() if isinstance(dtype, type) else dtype
     return _SQL_TYPES[instance]
 

@@ -5,12 +5,14 @@ import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from itertools import count
+from pathlib import Path, PurePosixPath
 from urllib.parse import quote, unquote
 
 import polars as pl
 
-from pipeline.lake.manifest import LakeFile, Manifest, sync
+from pipeline.lake.errors import LakeMissingError
+from pipeline.lake.manifest import LakeFile, Manifest, load, sync
 from schemas import TABLES, Table
 
 STAGING = ".staging"
@@ -52,7 +54,8 @@ def write_table(
         table: what it is.
         frame: all the table's columns, in order.
         values: of the partition columns.
-        fingerprint: part of the name; a whole file that stands there already came from the same inputs and is kept.
+        fingerprint: part of the name; a whole file that stands there already came from the same inputs and is kept,
+            unless a rebuild made it void (see `free_path`).
         where: the recording, for messages.
 
     Returns:
@@ -64,7 +67,7 @@ def write_table(
     if frame.is_empty():
         return []
     table.validate(frame, where=where)
-    path = place(table, values, fingerprint)
+    path = free_path(root, place(table, values, fingerprint))
     target = root / path
     if not _holds(target, frame.height):
         stored = frame.drop(*table.partition)
@@ -87,18 +90,38 @@ def _holds(target: Path, rows: int) -> bool:
     return bool(found == rows)
 
 
+def free_path(root: Path, path: str) -> str:
+    """A path for a file or folder, numbered where a void one has it: `part-1.parquet`, `part-1-2.parquet`.
+
+    What a rebuild found is neither replaced, as readers may have it open, nor used again.
+    """
+    if not (root / path).exists():
+        return path
+    try:
+        void = {item.path for item in load(root).retired if item.void}
+    except LakeMissingError:
+        return path
+    first = PurePosixPath(path)
+    for number in count(2):
+        if path not in void and not any(item.startswith(f"{path}/") for item in void):
+            break
+        path = str(first.with_name(f"{first.stem}-{number}{first.suffix}"))
+    return path
+
+
 def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[LakeFile]:
     """Put a whole folder of files into the lake at once.
 
     Args:
         root: the lake.
-        path: of the folder, relative to the lake; carries the fingerprint. A whole folder that stands there is kept.
+        path: of the folder, relative to the lake; carries the fingerprint. A whole folder that stands there is kept,
+            unless a rebuild made it void; `free_path` tells the path of the one that is then made.
         write: fills the folder it is given.
 
     Returns:
         Its files, and the listing of them that is added.
     """
-    target = root / path
+    target = root / free_path(root, path)
     if not _is_whole(target):
 
         def fill(aside: Path) -> None:

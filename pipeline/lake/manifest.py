@@ -58,10 +58,17 @@ class Entry:
 
 @dataclass(frozen=True)
 class Retired:
-    """A file that is no longer live, kept for readers that opened the lake before it was replaced."""
+    """A file that is no longer live, kept for readers that opened the lake before it was replaced.
+
+    Args:
+        path: relative to the lake's root.
+        generation: in which it was replaced.
+        void: never to be used again, though what it was made of may be as before: a rebuild makes all anew.
+    """
 
     path: str
     generation: int
+    void: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,6 +103,11 @@ class Manifest:
     def of_stage(self, stage: str) -> list[Entry]:
         """The entries of a stage, sorted by key."""
         return sorted((entry for entry in self.entries.values() if entry.stage == stage), key=lambda entry: entry.key)
+
+    def of_recording(self, recording: str) -> "Manifest":
+        """The manifest without what was made of other recordings than this one (`dataset/recording`)."""
+        entries = {key: entry for key, entry in self.entries.items() if key.partition("/")[2] in ("", recording)}
+        return replace(self, entries=entries)
 
     def committing(self, entry: Entry, generation: int) -> "Manifest":
         """The manifest with an entry added or replaced; what it replaces is retired."""

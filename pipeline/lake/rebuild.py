@@ -13,7 +13,8 @@ from schemas import SCHEMA_VERSION
 def begin_anew(root: Path) -> Manifest:
     """The manifest that takes a lake's place, not stored yet: without entries, under a new id.
 
-    Readers of the old tables find their files for two more generations, like those of any replaced file.
+    Readers of the old tables find their files for two more generations, like those of any replaced file. Nothing of
+    them is used again, and none is overwritten: see `files.free_path`.
 
     Raises:
         LakeMissingError: no manifest there.
@@ -30,7 +31,7 @@ def begin_anew(root: Path) -> Manifest:
     files = {*_committed(root, document), *_standing(root)}
     return Manifest(
         generation=generation,
-        retired=tuple(Retired(path, generation + 1) for path in sorted(files)),
+        retired=tuple(Retired(path, generation + 1, void=True) for path in sorted(files)),
         ingested_from=remembered_sources(document),
     )
 

@@ -18,11 +18,18 @@ if TYPE_CHECKING:
     import duckdb
 
 _EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", re.IGNORECASE)
-_SWITCHES = re.compile(
-    r"""\b((enable|disable)_(logging|profiling)\b|query"?(\s|/\*.*?\*/|--[^\n]*\n)*\()""", re.IGNORECASE | re.DOTALL
-)
+_WORD = re.compile(r'\w+|"(""|[^"])*"')
+_SWITCHES = {
+    *("enable_logging", "disable_logging", "enable_profiling", "disable_profiling"),
+    *("query", "json_execute_serialized_sql"),
+}
 """Functions by which a SELECT changes a setting in spite of the locked configuration, or runs a text it made up. What
 they would write is refused by the file system all the same, but DuckDB then ends the whole process."""
+
+_PIVOT_HINT = (
+    " A PIVOT that finds out the values by itself creates a type first; with the values named it is one SELECT: "
+    "PIVOT ... ON lane IN (1, 2, 3)."
+)
 
 Parameters = Mapping[str, Any] | Sequence[Any]
 
@@ -65,8 +72,16 @@ class LakeResult:
         return int(rows)
 
     def pl(self) -> pl.DataFrame:
-        """The rows as a Polars frame."""
-        return self._relation.pl()
+        """The rows as a Polars frame; whole numbers of 128 bits, as DuckDB's sums are, in 64 where they fit.
+
+        Where they do not, they are Decimal, which JSON writes as text.
+        """
+        frame = self._relation.pl()
+        wide = [column for column, kind in zip(frame, self.types, strict=True) if str(kind) in ("HUGEINT", "UHUGEINT")]
+        fitting = [column.cast(pl.Int64, strict=False) for column in wide]
+        return frame.with_columns(
+            narrow for column, narrow in zip(wide, fitting, strict=True) if narrow.null_count() == column.null_count()
+        )
 
     def limit(self, n: int, offset: int = 0) -> "LakeResult":
         """At most n rows, after the first `offset`."""
@@ -120,7 +135,7 @@ class LakeConnection:
         self.close()
 
 
-def connect(lake: Path | str) -> LakeConnection:
+def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection:
     """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
 
     Nothing but the lake's live files can be reached, no statement but a SELECT is admitted, no extension loaded, no
@@ -128,6 +143,7 @@ def connect(lake: Path | str) -> LakeConnection:
 
     Args:
         lake: the lake's folder, wherever it stands now.
+        recording: as if the lake held only this one (`dataset/recording`), but for tables over the whole lake.
 
     Raises:
         LakeMissingError: no lake there.
@@ -136,7 +152,7 @@ def connect(lake: Path | str) -> LakeConnection:
     import duckdb
 
     root = Path(lake).resolve()
-    manifest = load(root)
+    manifest = load(root) if recording is None else load(root).of_recording(recording)
     connection = duckdb.connect(
         ":memory:",
         config={
@@ -181,7 +197,8 @@ def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: 
         allowed = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
         if len(statements) != 1 or kinds[0] not in allowed:
             asked = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
-            raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.")
+            hint = _PIVOT_HINT if any(word.lower() == "pivot" for word in _split(sql)) else ""
+            raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.{hint}")
         if kinds[0] == duckdb.StatementType.EXPLAIN:
             _refuse_explained_writes(connection, statements[0].query)
         _refuse_switches(sql)
@@ -189,8 +206,32 @@ def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: 
 
 
 def _refuse_switches(sql: str) -> None:
-    if switch := _SWITCHES.search(sql):
-        raise QueryError(f"{switch[1]!r} is not available here; the lake is read-only.")
+    words = _split(sql)
+    for place, word in enumerate(words):
+        name, following = word.strip('"').lower(), words[place + 1 :]
+        if name in _SWITCHES and following[:1] == ["("] and not _goes_on_as_a_with(following):
+            raise QueryError(f"{name}(...) is not available here; the lake is read-only.")
+
+
+def _split(sql: str) -> list[str]:
+    """A statement's words and signs, as DuckDB itself reads it: without comments, and a quote for every text."""
+    import duckdb
+
+    text, tokens = sql.encode(), duckdb.tokenize(sql)
+    starts = [*(start for start, _ in tokens), len(text)]
+    words = []
+    for (start, kind), end in zip(tokens, starts[1:], strict=True):
+        token = text[start:end].decode()  # with the blanks and comments behind it
+        word = _WORD.match(token)
+        words.append("'" if kind == duckdb.token_type.string_const else word[0] if word else token[0])
+    return words
+
+
+def _goes_on_as_a_with(following: list[str]) -> bool:
+    """Whether a name's following words are `(x, y) AS (`, as in a WITH; after no call of a function are they."""
+    end = following.index(")") if ")" in following else 0
+    is_list = all(word == "," or _WORD.fullmatch(word) for word in following[1:end])
+    return is_list and [word.upper() for word in following[end + 1 : end + 3]] == ["AS", "("]
 
 
 @contextmanager

@@ -22,7 +22,7 @@ def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFra
         key: one or two Int32 columns that sort equal rows next to each other.
 
     Returns:
-        (first occurrences, repetitions), sorted by key, then file and line.
+        (first occurrences, repetitions), sorted by key, rows of one key by their values, equal ones by file and line.
     """
     values = [name for name in rows.columns if name not in (FILE, LINE)]
     rest = [name for name in values if name not in key]

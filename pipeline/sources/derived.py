@@ -13,11 +13,12 @@ IN_FULLER_FILE = "duplicate row: the same entry stands in a fuller file"
 def split_derived(
     rows: pl.DataFrame, shares: Sequence[pl.DataFrame], essential: Sequence[str]
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Part rows from those that a fuller file of the recording has too.
+    """Part rows from those that a fuller file of the recording has too, which take over what only the others say.
 
     A file that lacks columns (no lane, no size) says less of the same entries, so that its rows are no exact
     repetitions. One of them is dropped if a row of a file with more columns has the same values in all columns that
-    both files have; the others stay.
+    both files have; the others stay. Where the file has a column that the fuller one lacks (its only lanes, say), the
+    fuller one's row gets the value first: of rows that differ in nothing else, the first one's.
 
     Args:
         rows: of all files, with FILE.
@@ -25,7 +26,7 @@ def split_derived(
         essential: columns that tell entries apart; without them in common nothing is compared.
 
     Returns:
-        (rows to keep, rows that stand in a fuller file), in the order given.
+        (rows to keep, rows that stand in a fuller file), in the order given; the latter as they were.
     """
     present = [frozenset(_filled(share) & set(rows.columns)) for share in shares]
     # Files that hold nothing of the recording have no columns either.
@@ -36,18 +37,41 @@ def split_derived(
         rows.filter(pl.col(FILE).is_in([file for file, columns in enumerate(present) if columns == kind]))
         for kind in kinds
     ]
+    said = [set(kind) for kind in kinds]
     dropped = [rows.clear().select(FILE, LINE)]
-    for number, poorer in enumerate(of_kind[1:], start=1):
-        for fuller, columns in zip(of_kind[:number], kinds[:number], strict=True):
+    # From the poorest up, so that what a row takes over goes on with it to a fuller file still.
+    for number in range(len(kinds) - 1, 0, -1):
+        for fuller, columns in enumerate(kinds[:number]):
             common = sorted(columns & kinds[number])
             if set(essential) <= set(common):
-                dropped.append(poorer.join(fuller, on=common, how="semi", nulls_equal=True).select(FILE, LINE))
+                repeating = of_kind[number].join(of_kind[fuller], on=common, how="semi", nulls_equal=True)
+                dropped.append(repeating.select(FILE, LINE))
+                further = sorted(said[number] - columns)
+                of_kind[fuller] = _take_over(of_kind[fuller], repeating, common, further)
+                said[fuller] |= set(further)
     repeated = pl.concat(dropped)
     if repeated.is_empty():
         return rows, rows.clear()
     place = [FILE, LINE]
-    kept = rows.join(repeated, on=place, how="anti", maintain_order="left")
+    kept = rows.select(place).join(repeated, on=place, how="anti", maintain_order="left")
+    kept = kept.join(pl.concat(of_kind), on=place, how="left", maintain_order="left").select(rows.columns)
     return kept, rows.join(repeated, on=place, how="semi", maintain_order="left")
+
+
+def _take_over(
+    rows: pl.DataFrame, repeating: pl.DataFrame, common: Sequence[str], further: Sequence[str]
+) -> pl.DataFrame:
+    """Rows with values of further columns, where they have none, from those that are the same in the common ones."""
+    if not further or repeating.is_empty():
+        return rows
+    found = repeating.sort(FILE, LINE).unique(common, keep="first").select(*common, *further)
+    joined = rows.join(found, on=common, how="left", nulls_equal=True, maintain_order="left", suffix=_FOUND)
+    return joined.select(
+        pl.coalesce(name, f"{name}{_FOUND}") if name in further else pl.col(name) for name in rows.columns
+    )
+
+
+_FOUND = " found"
 
 
 def _filled(share: pl.DataFrame) -> set[str]:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Any
@@ -14,8 +14,9 @@ from pipeline.sources.assemble import assemble_subset
 from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
 from pipeline.sources.completeness import Announced, compare
 from pipeline.sources.highd_rows import (
+    DIRECTION,
     STRANGER,
-    find_directions,
+    add_directions,
     split_conflicts,
     split_impossible,
     split_strangers,
@@ -60,9 +61,9 @@ def group(files: Sequence[RawFile]) -> Grouping:
     that three archives of one file each are a recording too. Of two files of one kind the one that is named as shipped
     is taken and the other refused.
     """
-    together, refusals = _gather(files, lambda file: file.folder)
+    together, refusals = gather_sets(files, lambda file: file.folder)
     scattered = [file for _, found in together if len(found) < len(FIELDS) for file in found.values()]
-    beside, more_refusals = _gather(scattered, lambda file: str(file.path.parent))
+    beside, more_refusals = gather_sets(scattered, lambda file: str(file.path.parent))
     together = [*(each for each in together if len(each[1]) == len(FIELDS)), *beside]
     refusals += more_refusals
     units: list[Unit] = []
@@ -84,7 +85,7 @@ def group(files: Sequence[RawFile]) -> Grouping:
     return Grouping(tuple(units), tuple(refusals))
 
 
-def _gather(files: Sequence[RawFile], folder_of: Callable[[RawFile], str]) -> tuple[list[_Set], list[str]]:
+def gather_sets(files: Sequence[RawFile], folder_of: Callable[[RawFile], str]) -> tuple[list[_Set], list[str]]:
     """Files by folder and number, then by dialect; and messages about those that have no place."""
     gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
     refusals = []
@@ -125,10 +126,11 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     meta_file, vehicles_file, tracks_file = (part.file for part in parts)
     meta_rows, vehicles, tracks = (_read(part.file) for part in parts)
     meta = _only_row(meta_rows, meta_file)
-    if f"{meta['id']:02d}" != recording:
+    _check_number(meta, meta_file, recording)
+    if tracks.frame.is_empty():
         raise SourceError(
-            f"{meta_file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
-            "Two recordings' files are mixed; restore the originals."
+            f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ... in each."
+            f"{_first_reject(tracks.rejects)} Restore the original file."
         )
     rejected = [
         Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
@@ -137,21 +139,19 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
     del tracks  # the largest recordings have two million rows: no frame of theirs is kept longer than it is used
     entries, conflicts = split_conflicts(entries)
-    if entries.is_empty():
-        raise SourceError(f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ...")
     known, known_again = _unique_vehicles(vehicles.frame, vehicles_file)
     entries, strangers = split_strangers(entries, known, tracks_file, vehicles_file)
     markings = {
         UPPER: _markings(meta["upperLaneMarkings"], meta_file),
         LOWER: _markings(meta["lowerLaneMarkings"], meta_file),
     }
-    entries, impossible = split_impossible(entries, known, *(len(marked) - 1 for marked in markings.values()))
+    entries = add_directions(entries, known)
+    entries, impossible = split_impossible(entries, *(len(marked) - 1 for marked in markings.values()))
     dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
     dropped += [(strangers, STRANGER), *impossible]
     log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
-    direction_of_entry = find_directions(entries, known)
-    carriageways = {direction: entries.filter(direction_of_entry == direction) for direction in CARRIAGEWAYS}
+    carriageways = {direction: entries.filter(pl.col(DIRECTION) == direction) for direction in CARRIAGEWAYS}
     del entries
     subsets = [
         _to_subset(carriageways.pop(direction), known, direction, recording, meta, markings, files)
@@ -160,6 +160,35 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     found = tuple(subset for subset in subsets if subset is not None)
     whole = compare("highd", recording, found, _announced(meta, known), log.filter(pl.col("dialect") == TRACKS))
     return Canonical(found, log, rejects, whole.table, whole.notes)
+
+
+def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:
+    """Read what recordingMeta and tracksMeta say.
+
+    Args:
+        files: by dialect; the tracks are not read.
+        recording: its name, the number in the files' names.
+
+    Returns:
+        The row of recordingMeta; lanes by driving direction; the rows of tracksMeta, one per vehicle.
+
+    Raises:
+        SourceError: a file cannot be read, or is of another recording.
+    """
+    meta = _only_row(_read(files[RECORDING]), files[RECORDING])
+    _check_number(meta, files[RECORDING], recording)
+    columns = {UPPER: "upperLaneMarkings", LOWER: "lowerLaneMarkings"}
+    lanes = {side: len(_markings(meta[column], files[RECORDING])) - 1 for side, column in columns.items()}
+    vehicles, _ = _unique_vehicles(_read(files[VEHICLES]).frame, files[VEHICLES])
+    return meta, lanes, vehicles
+
+
+def _check_number(meta: dict[str, Any], file: RawFile, recording: str) -> None:
+    if f"{meta['id']:02d}" != recording:
+        raise SourceError(
+            f"{file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
+            "Two recordings' files are mixed; restore the originals."
+        )
 
 
 def _read(file: RawFile) -> Chunk:
@@ -188,12 +217,16 @@ def _layout(dialect: str, raw: Table) -> Layout:
 
 def _only_row(meta: Chunk, file: RawFile) -> dict[str, Any]:
     if meta.frame.height != 1:
-        why = "".join(f" Line {line} cannot be read: {reason}." for line, reason, _ in meta.rejects.head(1).rows())
+        why = _first_reject(meta.rejects)
         raise SourceError(
             f"{file.name}: expected one readable row under the header, got {meta.frame.height}.{why} "
             "Restore the original file."
         )
     return meta.frame.row(0, named=True)
+
+
+def _first_reject(rejects: pl.DataFrame) -> str:
+    return "".join(f" Line {line} cannot be read: {reason}." for line, reason, _ in rejects.head(1).rows())
 
 
 def _unique_vehicles(vehicles: pl.DataFrame, file: RawFile) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -233,7 +266,7 @@ def _to_subset(
 ) -> Subset | None:
     if entries.is_empty():
         return None
-    mine = vehicles.filter(pl.col("drivingDirection") == direction)
+    mine = vehicles.filter(pl.col(DIRECTION) == direction)
     upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)

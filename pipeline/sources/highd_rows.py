@@ -9,6 +9,7 @@ from pipeline.transforms.orientation import LOWER, UPPER
 from schemas import TRACKS
 
 STRANGER = "vehicle without a row in tracksMeta"
+DIRECTION = "drivingDirection"
 LANE = "laneId is no lane of the vehicle's carriageway, nor beside it"
 SPEED = "xVelocity is no speed on the vehicle's carriageway"
 
@@ -52,15 +53,16 @@ def split_strangers(
     return entries.join(vehicles, on="id", how="semi", maintain_order="left"), strangers
 
 
-def find_directions(entries: pl.DataFrame, vehicles: pl.DataFrame) -> pl.Series:
-    """The driving direction of every entry; entries are sorted by id."""
+def add_directions(entries: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
+    """Entries, sorted by id, with the drivingDirection of their vehicle."""
     runs = entries["id"].rle().struct.unnest()
     directions = runs.join(vehicles, left_on="value", right_on="id", how="left", maintain_order="left")
-    return pl.Series(np.repeat(directions["drivingDirection"].to_numpy(), runs["len"].to_numpy()))
+    of_entry = np.repeat(directions[DIRECTION].to_numpy(), runs["len"].to_numpy())
+    return entries.with_columns(pl.Series(DIRECTION, of_entry))
 
 
 def split_impossible(
-    entries: pl.DataFrame, vehicles: pl.DataFrame, upper_lanes: int, lower_lanes: int
+    entries: pl.DataFrame, upper_lanes: int, lower_lanes: int
 ) -> tuple[pl.DataFrame, list[tuple[pl.DataFrame, str]]]:
     """Rows that may be true on their carriageway, and those that may not, each set with its reason.
 
@@ -68,12 +70,11 @@ def split_impossible(
     within the bounds of `tracks`.
 
     Args:
-        entries: id, laneId, xVelocity; sorted by id.
-        vehicles: id, drivingDirection.
+        entries: laneId, xVelocity, drivingDirection.
         upper_lanes: of the upper carriageway, whose laneIds begin with 2 (1 is its shoulder).
         lower_lanes: of the lower carriageway.
     """
-    direction = find_directions(entries, vehicles)
+    direction = entries[DIRECTION].to_numpy()
     # The median stands between the carriageways with an id of its own: it is left of both.
     median = upper_lanes + 2
     first = np.where(direction == UPPER, 1, median)

@@ -13,12 +13,12 @@ from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, So
 from pipeline.sources.completeness import Announced, compare
 from pipeline.sources.derived import IN_FULLER_FILE, split_derived
 from pipeline.sources.lines import REJECT_SCHEMA, Chunk, map_chunks
-from pipeline.sources.ngsim_dialects import PUBLISHED_TOTALS, SITES, Site, detect, layout_of, name_recording, site_of
+from pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording, site_of
 from pipeline.sources.raw_files import LINE, read_head
 from pipeline.transforms.identities import identify_vehicles
 from pipeline.transforms.orientation import DIRECTIONS, orient_ngsim
 from schemas.columns import FOOT_M
-from schemas.completeness import PUBLISHED, TOTAL_FRAMES
+from schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
 from schemas.raw_ngsim import RAW_NGSIM
 
 FRAME_RATE_HZ = 10.0
@@ -230,7 +230,7 @@ NGSIM = Source(
     "(NGSIM) Vehicle Trajectories and Supporting Data. doi.org/10.21949/1504477",
     looks_like="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
     "Global_Time, Local_X, Local_Y, v_Vel",
-    version=1,
+    version=2,
     detect=detect,
     group=group,
     to_canonical=to_canonical,

@@ -98,16 +98,6 @@ Peachtree's clock counts seconds since 1970 (shifted by a time zone) yet advance
 apart, the 3 h 15 min between its two periods.
 """
 
-PUBLISHED_TOTALS: dict[str, dict[str, int]] = {
-    "i-80-1600": {"vehicles": 2_052, "entries": 1_262_678},
-    "i-80-1700": {"vehicles": 1_836, "entries": 1_549_918},
-    "i-80-1715": {"vehicles": 1_790, "entries": 1_753_791},
-    "us-101-0750": {"vehicles": 2_169, "entries": 1_180_598},
-    "us-101-0805": {"vehicles": 2_017, "entries": 1_403_095},
-    "us-101-0820": {"vehicles": 1_915, "entries": 1_515_240},
-}
-"""Vehicles (ids) and rows of the freeway recordings as published; together 11,779 and 8,665,320."""
-
 UNKNOWN = "unknown"
 _LOCAL = ZoneInfo("America/Los_Angeles")
 

@@ -21,6 +21,8 @@ from schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 VERSION = 2
 SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
+REASONS_SHOWN = 3
+"""Of those for which all rows of a recording were dropped."""
 ROOM = Room(256 << 20)
 """Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
 
@@ -190,7 +192,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
     dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
     canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
     if not canonical.subsets:
-        raise SourceError(f"recording {recording}: no carriageway has entries ({files[-1].name}).")
+        raise SourceError(_nothing_left(recording, canonical))
     written = _write(root, job, canonical)
     info = {
         "dataset": dataset,
@@ -201,6 +203,25 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }
     return make_entry(job, written, info)
+
+
+def _nothing_left(recording: str, canonical: Canonical) -> str:
+    """Why not one row of a recording could be used: the commonest reasons, and a line of each to look at."""
+    reasons = (
+        canonical.rejects.sort("file", "line")
+        .group_by("reason")
+        .agg(pl.len().alias("rows"), pl.col("file", "line", "text").first())
+        .sort("rows", "reason", descending=[True, False])
+    )
+    shown = [
+        f"{rows:,} {'row' if rows == 1 else 'rows'} ({reason}; first {file}, line {line}: {text[:60]!r})"
+        for reason, rows, file, line, text in reasons.head(REASONS_SHOWN).rows()
+    ]
+    more = [f"{reasons['rows'][REASONS_SHOWN:].sum():,} for other reasons"] if len(reasons) > REASONS_SHOWN else []
+    return (
+        f"recording {recording}: no carriageway has entries. Expected rows that can be used, got dropped ones only: "
+        f"{', '.join([*shown, *more])}. Restore the original files, or repair these lines."
+    )
 
 
 def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:

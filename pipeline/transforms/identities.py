@@ -47,8 +47,10 @@ def identify_vehicles(
 
     A leader or follower that names an id that was split is the vehicle of that id in the same frame: for a leader the
     nearest one ahead, for a follower the nearest one behind, one in the same lane before one in another, and only where
-    there is none, one on the other side. An id that no vehicle has in that frame is left as recorded. Nobody is the
-    leader or follower of itself: where an entry names its own id and no other vehicle has that, there is none.
+    there is none, one on the other side. Where no vehicle of that id has an entry in that frame, it is the one whose
+    first and last frame lie either side of it; where that is none or several, nobody can say, and it is null. An id
+    that was not split is left as recorded. Nobody is the leader or follower of itself: where an entry names its own id
+    and no other vehicle has that, there is none.
 
     Args:
         entries: source_id, frame, x_m, y_m, speed_mps, lane, leader_source_id, follower_source_id (0 or null = none)
@@ -190,14 +192,15 @@ def _other(role: str) -> pl.Expr:
 def _in_frame(entries: pl.DataFrame, role: str, split: pl.Series) -> pl.Series:
     """The ids of a role, pointed at vehicles where the source id they name was split."""
     source, sign = f"{role}_source_id", 1 if role == "leader" else -1
-    present = entries.filter(pl.col("source_id").is_in(split.implode())).select(
-        "frame", "lane", "x_m", pl.col("source_id").alias(source), named="vehicle_id"
-    )
+    several = entries.filter(pl.col("source_id").is_in(split.implode()))
+    present = several.select("frame", "lane", "x_m", pl.col("source_id").alias(source), named="vehicle_id")
     ahead = sign * (pl.col("x_m_right") - pl.col("x_m"))
     naming = entries.with_row_index(ROW).select(ROW, "frame", "lane", "x_m", "vehicle_id", source)
+    naming = naming.filter(pl.col(source).is_in(split.implode()))
+    is_other = pl.col("named") != pl.col("vehicle_id")
     candidates = (
         naming.join(present, on=["frame", source])
-        .filter(pl.col("named") != pl.col("vehicle_id"))
+        .filter(is_other)
         .select(
             ROW,
             "named",
@@ -208,4 +211,18 @@ def _in_frame(entries: pl.DataFrame, role: str, split: pl.Series) -> pl.Series:
         .sort(ROW, "wrong_side", "other_lane", "away_m", "named")
         .unique(ROW, keep="first", maintain_order=True)
     )
-    return entries[f"{role}_id"].scatter(candidates[ROW], candidates["named"])
+    spans = several.group_by(pl.col("source_id").alias(source), pl.col("vehicle_id").alias("named")).agg(
+        first=pl.col("frame").min(), last=pl.col("frame").max()
+    )
+    missing = (
+        naming.join(candidates, on=ROW, how="anti")
+        .join(spans, on=source)
+        .filter(is_other, pl.col("frame").is_between("first", "last"))
+        .filter(pl.len().over(ROW) == 1)
+    )
+    return (
+        entries[f"{role}_id"]
+        .scatter(naming[ROW], None)
+        .scatter(candidates[ROW], candidates["named"])
+        .scatter(missing[ROW], missing["named"])
+    )

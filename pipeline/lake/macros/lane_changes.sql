@@ -11,18 +11,18 @@
 -- x_m, y_m, speed_mps, lateral_speed_mps: of that entry
 CREATE MACRO lane_changes(subset) AS TABLE
 SELECT
-    dataset,
+    entered.dataset,
     entered.subset,
-    vehicle_id,
-    frame,
-    time_s,
-    lane_before AS from_lane,
-    lane AS to_lane,
-    CASE WHEN lane > lane_before THEN 'right' ELSE 'left' END AS direction,
-    x_m,
-    y_m,
-    speed_mps,
-    lateral_speed_mps
+    entered.vehicle_id,
+    entered.frame,
+    entered.time_s,
+    entered.lane_before AS from_lane,
+    entered.lane AS to_lane,
+    CASE WHEN entered.lane > entered.lane_before THEN 'right' ELSE 'left' END AS direction,
+    entered.x_m,
+    entered.y_m,
+    entered.speed_mps,
+    entered.lateral_speed_mps
 FROM (
     SELECT
         entry.dataset,
@@ -42,5 +42,5 @@ FROM (
         ON entry.subset = asked.subset_asked
     WINDOW track AS (PARTITION BY entry.dataset, entry.subset, entry.vehicle_id ORDER BY entry.frame)
 ) AS entered
-WHERE frame_before = frame - 1 AND lane_before <> lane
-ORDER BY dataset, vehicle_id, frame
+WHERE entered.frame_before = entered.frame - 1 AND entered.lane_before <> entered.lane
+ORDER BY entered.dataset, entered.vehicle_id, entered.frame

@@ -4,7 +4,7 @@
 -- frame: the source's frame number
 -- x: of the point in metres, along the direction of travel, as x_m
 -- y: of the point in metres, to the driver's right, as y_m
--- radius: in metres; a vehicle exactly that far away is within it
+-- radius: in metres; a vehicle exactly that far away is within it; nobody is within a negative one
 --
 -- dataset, subset, frame, time_s, vehicle_id
 -- distance_m: from the point to the vehicle's front centre
@@ -34,5 +34,6 @@ FROM (
 ) AS asked
 JOIN (SELECT * FROM main.tracks AS entry WHERE entry.subset = subset) AS entry
     ON entry.subset = asked.subset_asked AND entry.frame = asked.frame_asked
-WHERE (entry.x_m - asked.x_asked) ** 2 + (entry.y_m - asked.y_asked) ** 2 <= asked.radius_asked ** 2
+WHERE asked.radius_asked >= 0
+    AND (entry.x_m - asked.x_asked) ** 2 + (entry.y_m - asked.y_asked) ** 2 <= asked.radius_asked ** 2
 ORDER BY entry.dataset, distance_m, entry.vehicle_id

@@ -231,7 +231,7 @@ def test_hashes_of_members_are_remembered_until_the_archive_changes(tmp_path, mo
     first = look()
     assert first == [sha256(NGSIM_FILES[name]).hexdigest() for name in ("export", "named")]
     assert look() == first
-    assert unpacked == ["a.zip/a.csv", "a.zip/b.csv"]
+    assert sorted(unpacked) == ["a.zip/a.csv", "a.zip/b.csv"], "each once, by threads that take no turns"
     pack(path, {"a.csv": NGSIM_FILES["export"], "b.csv": NGSIM_FILES["bare"]}, method=zipfile.ZIP_STORED)
     assert look() == [first[0], sha256(NGSIM_FILES["bare"]).hexdigest()]
     assert len(unpacked) == 4

@@ -13,11 +13,11 @@ from raw_texts import TEXT_NAMES, as_csv, ngsim, ngsim_row, read_highd, read_ngs
 
 from pipeline.sources.base import Subset
 from pipeline.sources.completeness import Announced, compare
-from pipeline.sources.ngsim_dialects import PUBLISHED_TOTALS, RECORDINGS
+from pipeline.sources.ngsim_dialects import RECORDINGS
 from schemas import COMPLETENESS, INGEST_LOG, SUBSETS
 from schemas import TRACKS as TRACKS_TABLE
 from schemas import VEHICLES as VEHICLES_TABLE
-from schemas.completeness import MEASURES
+from schemas.completeness import MEASURES, PUBLISHED_TOTALS
 
 INT32_MAX = 2**31 - 1
 
@@ -227,11 +227,7 @@ def vehicle_rows(vehicle, frames, announced, **values):
 
 def test_total_frames_that_are_kept_and_others(tmp_path):
     """Vehicle 3 has its 2 rows, 7 has 2 of 1,156, and 9 has 2 where it announces 1."""
-    rows = [
-        *vehicle_rows(3, (1, 2), 2),
-        *vehicle_rows(7, (5, 6), "1,156"),
-        *vehicle_rows(9, (1, 2), 1),
-    ]
+    rows = [*vehicle_rows(3, (1, 2), 2), *vehicle_rows(7, (5, 6), "1,156"), *vehicle_rows(9, (1, 2), 1)]
     canonical = ngsim(tmp_path, as_csv(rows))
     assert figures(canonical) == {
         ("Total_Frames", "entries"): (2 + 1156 + 1, 6),

@@ -62,6 +62,37 @@ def test_other_values_are_another_entry(tmp_path):
     assert canonical.rejects.height == 3
 
 
+def test_the_only_lanes_are_taken_over_from_the_file_with_fewer_columns(tmp_path):
+    """full.csv has no lanes; derived.csv has fewer columns, but lanes 1, 2 and 3, and an entry of its own."""
+    rows = [row | {"Lane_ID": row["Vehicle_ID"]} for row in ROWS]
+    fuller = [name for name in TEXT_NAMES if name != "Lane_ID"]
+    lanes = as_csv(plain([*rows, ngsim_row(9, 1, Lane_ID=5)]), [*FEW, "Lane_ID"])
+    canonical = both(tmp_path, as_csv(plain(rows[:-1]), fuller), lanes)
+    (subset,) = canonical.subsets
+    assert subset.tracks["lane"].to_list() == [1] * 4 + [2] * 4 + [3] * 4 + [5]
+    assert subset.facts["columns_missing"].to_list() == [[]]
+    assert (subset.facts["ids_split"].item(), subset.vehicles.height) == (0, 4)
+    # What only the fuller file says is still there: 15 ft for all but vehicle 9, and no leader.
+    assert subset.vehicles["length_m"].to_list() == pytest.approx([4.572] * 3 + [None])
+    assert dict(canonical.log.select("file", "rows_kept").rows()) == {"full.csv": 11, "derived.csv": 2}
+    assert not [note for note in canonical.notes if "the files have no" in note]
+
+
+def test_values_taken_over_go_on_to_a_fuller_file_still():
+    """c, d and e stand in one file each: what the first file's row gets from the second, that has from the third."""
+    schema = {**dict.fromkeys("abcdefgh", pl.Int32), FILE: pl.Int64, "line": pl.Int64}
+    shares = [
+        pl.DataFrame([{**values, FILE: file, "line": 1}], schema=schema)
+        for file, values in enumerate(
+            [dict.fromkeys("acfgh", 1), dict.fromkeys("abdf", 1) | {"d": 2}, {"a": 1, "b": 1, "e": 3}]
+        )
+    ]
+    kept, dropped = split_derived(pl.concat(shares), shares, ["a"])
+    # e reaches the first row by the second and by itself; b comes from both.
+    assert kept.rows() == [(1, 1, 1, 2, 3, 1, 1, 1, 0, 1)]
+    assert dropped.rows() == pl.concat(shares[1:]).rows(), "as they were"
+
+
 def test_a_value_that_differs_in_any_column_of_both_is_another_entry(tmp_path):
     derived = [ROWS[0] | {"v_Vel": "51"}, *ROWS[1:]]
     assert tracks_of(both(tmp_path, as_csv(ROWS), as_csv(plain(derived), FEW))).height == 13
@@ -127,7 +158,18 @@ def test_against_a_loop(files):
                 common = set(columns[file]) & set(columns[other])
                 if fuller and any(all(row[place] == twin[place] for place in common) for twin in others):
                     expected.add((file, line))
+    # The only columns that may be lacking in the fuller of two files: d, where that has c and the other has d.
+    taken_over = {}
+    for file, rows in reversed(list(enumerate(blank))):
+        for row in reversed(rows if columns[file] == [0, 1, 3] else []):
+            taken_over[row[:2]] = row[3]
     kept, dropped = split_derived(pl.concat(shares), shares, KEY)
+    assert kept.select("a", "b", "c", "d").rows() == [
+        (*row[:3], taken_over.get(row[:2])) if columns[file] == [0, 1, 2] else row
+        for file, rows in enumerate(blank)
+        for line, row in enumerate(rows, start=1)
+        if (file, line) not in expected
+    ]
     assert set(dropped.select(FILE, "line").rows()) == expected
     every = {(file, line) for file, rows in enumerate(blank) for line in range(1, len(rows) + 1)}
     assert set(kept.select(FILE, "line").rows()) == every - expected

@@ -146,8 +146,8 @@ def test_a_vehicle_in_both_directions_is_refused(tmp_path):
         ({"meta": meta_row(lower="20;inf")}, "increasing"),
         ({"vehicles": VEHICLES[:2]}, r"01_tracks\.csv, line 6: vehicle 3 has no row in 01_tracksMeta\.csv \(2 such"),
         ({"vehicles": []}, r"line 2: vehicle 1 has no row .* \(4 such vehicles\)\. .*restore"),
-        ({"tracks": []}, r"01_tracks\.csv: no readable row\. Expected frame,id,x,y"),
-        ({"tracks": ["1,2"]}, r"01_tracks\.csv: no readable row"),
+        ({"tracks": []}, r"01_tracks\.csv: no readable row\. Expected frame,id,x,y, .* each\. Restore"),
+        ({"tracks": ["1,2"]}, r"no readable row\. .* each\. Line 2 cannot be read: 2 fields instead of 25\. Restore"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused_with_a_next_step(tmp_path, changes, message):

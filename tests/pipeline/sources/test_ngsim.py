@@ -250,27 +250,31 @@ def test_directions_of_an_arterial(tmp_path):
 
 
 def test_an_id_that_stands_for_two_vehicles_is_split(tmp_path):
-    """Vehicle 5 is a car that announces 100 frames and a truck that announces 40; both are there in frame 2."""
+    """Vehicle 5 is a car that announces 100 frames and a truck that announces 40; both are there in frame 2.
+
+    The truck's row of frame 4 is missing, and nobody of that id is left in frame 6.
+    """
     truck = {"Total_Frames": 40, "v_length": 40, "v_Class": 3, "Lane_ID": 3}
     rows = [
         arterial(5, 1, 2, 12, 100, Following=9), arterial(5, 2, 2, 12, 110),
         arterial(5, 2, 2, 24, 300, **truck), arterial(5, 3, 2, 24, 310, **truck, Preceding=8),
+        arterial(5, 5, 2, 24, 330, **truck),
         arterial(9, 1, 2, 12, 50, Preceding=5, Space_Headway=50),
         arterial(9, 2, 2, 24, 60, Preceding=5, Space_Headway=240, Lane_ID=3),
         arterial(9, 3, 2, 24, 70, Preceding=5, Space_Headway=240, Lane_ID=3),
         arterial(9, 4, 2, 24, 80, Preceding=5, Space_Headway=240, Lane_ID=3),
+        arterial(9, 6, 2, 24, 100, Preceding=5, Space_Headway=240, Lane_ID=3),
     ]  # fmt: skip
     canonical = valid(ngsim(tmp_path, as_csv(rows)))
     (subset,) = canonical.subsets
     assert subset.facts["ids_split"][0] == 1
     assert canonical.notes[0] == "peachtree-1600-north: 1 ids stood for more than one vehicle and were split"
     vehicles = subset.vehicles.select("vehicle_id", "source_vehicle_id", "class", "entries").rows()
-    assert vehicles == [(5, 5, "car", 2), (9, 9, "car", 4), (10, 5, "truck", 2)]
+    assert vehicles == [(5, 5, "car", 2), (9, 9, "car", 5), (10, 5, "truck", 3)]
     follower = subset.tracks.filter(pl.col("vehicle_id") == 9)
-    # In frame 4 no vehicle 5 has an entry: the id stays as recorded.
-    assert follower["leader_id"].to_list() == [5, 10, 10, 5]
-    # 50 - 15 ft; 240 - 40 ft twice, from positions; 240 - 15 ft from the recorded headway
-    assert follower["gap_m"].to_list() == [10.668, 60.96, 60.96, 68.58]
+    assert follower["leader_id"].to_list() == [5, 10, 10, 10, None]
+    # 50 - 15 ft; 240 - 40 ft twice, from positions, and once from the recorded headway
+    assert follower["gap_m"].to_list() == [10.668, 60.96, 60.96, 60.96, None]
     check_accounts(canonical, entries_from=["trajectories.csv"])
 
 

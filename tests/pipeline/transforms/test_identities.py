@@ -77,9 +77,30 @@ def test_a_leader_is_the_vehicle_of_that_id_in_the_frame_and_lane():
              entry(7, 3, 2.0, lane=2, leader=5, follower=6)]  # fmt: skip
     found = identify([*two, *seven])
     # The vehicle that announces 8 (lane 2) sorts first and keeps the id; the other is 8, beyond 7. Nobody of id 5 is
-    # behind in frame 2, so that the follower is the one in the lane; frame 3 has no vehicle 5.
+    # behind in frame 2, so that the follower is the one in the lane; no vehicle 5 lasts until frame 3.
     follower = found.entries.filter(pl.col("vehicle_id") == 7).select("leader_id", "follower_id").rows()
-    assert follower == [(8, None), (5, 5), (5, 6)]
+    assert follower == [(8, None), (5, 5), (None, 6)]
+
+
+def test_a_leader_out_of_sight_is_the_vehicle_of_that_id_whose_frames_lie_either_side():
+    """Id 1 is a car in frames 1-10 and a truck in frames 400-409, whose row of frame 405 is missing."""
+    car = drive(1, range(1, 11), 0.0, length=4.572)
+    truck = drive(1, [400, 401, 402, 403, 404, 406, 407, 408, 409], 60.0, length=18.288)
+    behind = drive(9, [5, 200, 404, 405, 406, 500], -900.0, leader=1, follower=1)
+    found = identify([*car, *truck, *behind])
+    # The car keeps the id, the truck is 10, beyond 9. In frames 200 and 500 neither is there, nor before and after.
+    named = found.entries.filter(pl.col("vehicle_id") == 9).select("frame", "leader_id", "follower_id").rows()
+    assert named == [(frame, leader, leader) for frame, leader in
+                     ((5, 1), (200, None), (404, 10), (405, 10), (406, 10), (500, None))]  # fmt: skip
+
+
+def test_of_two_vehicles_out_of_sight_at_once_nobody_says_which_it_was():
+    found = identify([*drive(5, [1, 2, 4], 60.0, 3.5), *drive(5, [1, 2, 4], 60.0), entry(9, 3, 0.0, leader=5)])
+    assert found.ids_split == 1
+    assert found.entries.filter(pl.col("vehicle_id") == 9)["leader_id"].to_list() == [None]
+    # Where one of the two names the id itself, it is the other.
+    found = identify([*drive(5, [1, 2, 3, 4], 60.0, 3.5, leader=5), *drive(5, [1, 2, 4], 60.0)])
+    assert found.entries.filter(pl.col("frame") == 3).select("vehicle_id", "leader_id").rows() == [(6, 5)]
 
 
 def in_frame_one(*others, x_m, lane, leader=0, follower=0):
@@ -173,16 +194,21 @@ def test_every_entry_has_one_vehicle_and_the_order_of_rows_is_irrelevant(rows, o
         assert firsts[source] == min(firsts.values())
         assert all(vehicle == source or vehicle not in named for vehicle in firsts)
     assert len({vehicle for firsts in vehicles.values() for vehicle in firsts}) == sum(map(len, vehicles.values()))
-    present = set(entries.select("vehicle_id", "frame").rows())
+    frames = {vehicle: rows["frame"] for (vehicle,), rows in entries.partition_by("vehicle_id", as_dict=True).items()}
     of_source = {vehicle: source for source, firsts in vehicles.items() for vehicle in firsts}
     for role in ("leader", "follower"):
         for own, frame, recorded, resolved in entries.select(
             "vehicle_id", "frame", f"{role}_source_id", f"{role}_id"
         ).rows():
             assert resolved != own
-            if resolved != recorded and resolved is not None:
-                assert of_source[resolved] == recorded
-                assert (resolved, frame) in present
+            others = {vehicle: frames[vehicle] for vehicle in vehicles[recorded] if vehicle != own}
+            if len(vehicles[recorded]) < 2:
+                assert resolved == (None if recorded in (0, None, of_source[own]) else recorded)
+            elif there := [vehicle for vehicle, seen in others.items() if frame in seen]:
+                assert resolved in there
+            else:
+                around = [vehicle for vehicle, seen in others.items() if seen.min() < frame < seen.max()]
+                assert resolved == (around[0] if len(around) == 1 else None)
     again = identify(data.draw(st.permutations(rows)), one_way=one_way)
     assert again.entries.equals(entries)
     assert again.ids_split == found.ids_split
