@@ -8,7 +8,7 @@ from pipeline.stages.base import Job, make_entry, make_job, recordings
 from pipeline.transforms.late_starts import estimate_missing_starts, judge_starts
 from schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
 
-VERSION = 1
+VERSION = 2
 
 
 def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:

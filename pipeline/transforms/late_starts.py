@@ -4,13 +4,13 @@ DESIGN section 6. Positions are never invented: the tables made here only say wh
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.transforms.references import Floats, References
 from pipeline.transforms.resample import find_stride
 from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from schemas.vehicles import VEHICLE_STARTS
@@ -25,9 +25,6 @@ REACH_M = 40.0
 """A missing vehicle this near, along the road, belongs to an entry's surroundings."""
 ROUNDING_M = 1e-6
 """Far below the precision of a position (1 mm): keeps rounding from deciding an inclusive bound."""
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def find_cutoff(start_x_m: Floats) -> float | None:
@@ -169,7 +166,7 @@ def estimate_missing_starts(
         return MISSING_STARTS.empty()
     first_entries = tracks.join(late, on="vehicle_id", how="semi").sort("vehicle_id", "frame")
     first_entries = first_entries.unique("vehicle_id", keep="first", maintain_order=True)
-    references = _References.gather(tracks, vehicle_starts, cutoff_m)
+    references = References.gather(tracks, vehicle_starts, cutoff_m)
     mean_speed_mps = float(tracks["speed_mps"].to_numpy().mean(dtype=np.float64))
 
     rows = []
@@ -211,66 +208,6 @@ def estimate_missing_starts(
     return pl.DataFrame(rows, schema=MISSING_STARTS.dtypes)
 
 
-@dataclass(frozen=True)
-class _References:
-    """The fully tracked vehicles' entries, vehicle after vehicle, and when each vehicle first crossed the cut-off."""
-
-    frame: Ints
-    x_m: Floats
-    farthest_m: Floats
-    """Running maximum of x_m within a track: it rises, and first reaches a position when the track does."""
-    speed_mps: Floats
-    first: Ints
-    """(R,) each vehicle's first row."""
-    last: Ints
-    left_cutoff: Floats
-    """(R,) frame of the first crossing of the cut-off; NaN where it is never reached."""
-
-    @classmethod
-    def gather(cls, tracks: pl.DataFrame, vehicle_starts: pl.DataFrame, cutoff_m: float) -> "_References":
-        """Pick the fully tracked vehicles out of the tracks."""
-        wanted = vehicle_starts.filter("fully_tracked").select("vehicle_id")
-        entries = tracks.join(wanted, on="vehicle_id", how="semi", maintain_order="left").with_columns(
-            farthest_m=pl.col("x_m").cum_max().over("vehicle_id")
-        )
-        vehicle_id = entries["vehicle_id"].to_numpy()
-        first = np.flatnonzero(np.diff(vehicle_id, prepend=vehicle_id[:1] - 1))
-        references = cls(
-            frame=entries["frame"].cast(pl.Int64).to_numpy(),
-            x_m=entries["x_m"].to_numpy(),
-            farthest_m=entries["farthest_m"].to_numpy(),
-            speed_mps=entries["speed_mps"].cast(pl.Float64).to_numpy(),
-            first=first,
-            last=np.append(first, vehicle_id.size)[1:] - 1,
-            left_cutoff=np.full(first.size, np.nan),
-        )
-        reach = np.flatnonzero(references.farthest_m[references.last] >= cutoff_m)
-        references.left_cutoff[reach] = references._cross(reach, cutoff_m)[0]
-        return references
-
-    def drive_to(self, x_m: float) -> tuple[Floats, Floats]:
-        """Frames from the cut-off to x_m and speeds there, of those vehicles that reach it (x_m beyond the cut-off)."""
-        reach = np.flatnonzero(self.farthest_m[self.last] >= x_m)
-        arrived, speed_mps = self._cross(reach, x_m)
-        return arrived - self.left_cutoff[reach], speed_mps
-
-    def _cross(self, reach: Ints, x_m: float) -> tuple[Floats, Floats]:
-        """First crossings of x_m: frame (between entries: linear), speed of the nearer entry."""
-        low, high = self.first[reach], self.last[reach]
-        while (low < high).any():  # binary search in all tracks at once: as many rounds as the longest one needs
-            middle = (low + high) // 2
-            there = self.farthest_m[middle] >= x_m
-            low, high = np.where(there, low, middle + 1), np.where(there, middle, high)
-        after = low
-        before = np.maximum(after - 1, self.first[reach])  # the same entry where a track starts on x_m exactly
-        step_m = self.x_m[after] - self.x_m[before]
-        short_m = x_m - self.x_m[before]
-        share = np.divide(short_m, step_m, out=np.zeros_like(step_m), where=step_m > 0)
-        frame = self.frame[before] + share * (self.frame[after] - self.frame[before])
-        nearer = np.where(short_m <= self.x_m[after] - x_m, before, after)
-        return frame, self.speed_mps[nearer]
-
-
 def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
     """Fit frames = b0 + b1 * speed by ordinary least squares.
 
@@ -278,14 +215,21 @@ def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
         intercept_frames (b0), slope_frames_per_mps (b1; 0 where the speeds do not vary), r2 (None where the frames do
         not vary).
     """
-    speed_offset, frames_offset = speed_mps - speed_mps.mean(), frames - frames.mean()
-    spread, variation = float(speed_offset @ speed_offset), float(frames_offset @ frames_offset)
-    slope = float(speed_offset @ frames_offset) / spread if spread > 0 else 0.0
-    residual = frames_offset - slope * speed_offset
+    frames_vary = float(np.ptp(frames)) > 0
+    if not frames_vary or float(np.ptp(speed_mps)) == 0:  # what rounding leaves of a mean would pass for a slope
+        return {
+            "intercept_frames": float(frames.mean()),
+            "slope_frames_per_mps": 0.0,
+            "r2": 0.0 if frames_vary else None,
+        }
+    from sklearn.linear_model import LinearRegression  # imported only where something is fitted
+
+    speeds = speed_mps[:, np.newaxis]
+    line = LinearRegression().fit(speeds, frames)
     return {
-        "intercept_frames": float(frames.mean()) - slope * float(speed_mps.mean()),
-        "slope_frames_per_mps": slope,
-        "r2": 1.0 - float(residual @ residual) / variation if variation > 0 else None,
+        "intercept_frames": float(line.intercept_),
+        "slope_frames_per_mps": float(line.coef_[0]),
+        "r2": float(line.score(speeds, frames)),
     }
 
 
