@@ -218,7 +218,7 @@ class Table:
         return [
             {
                 "column": name,
-                "dtype": str(self.dtypes[name]),
+                "dtype": "Enum" if isinstance(self.dtypes[name], pl.Enum) else str(self.dtypes[name]),
                 "unit": (declared.metadata or {}).get("unit") or "",
                 "null": "yes" if declared.nullable else "",
                 "meaning": declared.description or "",

@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,9 @@ class Protocol:
         history_s: a sample needs this much track before it, without a gap.
         horizon_s: how far the future is predicted; what is missing of it is masked.
         min_future_s: a sample needs this much track after it, without a gap.
+        drop_error_findings: an entry is no sample where its own vehicle breaks a rule of severity error in the
+            history or the horizon.
+        nearest: how many of the nearest vehicles are listed for each sample; 0 = none.
         split: the split whose parts train and evaluate.
     """
 
@@ -23,6 +27,8 @@ class Protocol:
     history_s: float = 3.0
     horizon_s: float = 5.0
     min_future_s: float = 0.2
+    drop_error_findings: bool = False
+    nearest: int = 10
     split: str = "flow-balanced"
 
     @property
@@ -37,13 +43,18 @@ class Protocol:
 
     @property
     def min_future_ticks(self) -> int:
-        """Positions after the sample that must exist."""
-        return max(1, round(self.min_future_s * self.rate_hz))
+        """Positions after the sample that must exist: enough to last `min_future_s`, and one at least."""
+        return max(1, math.ceil(self.min_future_s * self.rate_hz - 1e-9))
 
     @property
     def digest(self) -> str:
         """First 12 hex digits of the sha256 of every parameter."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
+    def sampling_digest(self) -> str:
+        """The same of what samples depend on: every parameter but the split."""
+        return replace(self, split="").digest
 
 
 CSP = Protocol(name="csp")

@@ -1,4 +1,4 @@
-"""`samples`, `sample_drops` and `neighbors`: prediction origins, what was left out, and who stands around them."""
+"""`samples`, what was left out of them (`sample_drops`, `sample_counts`), and `neighbors`: who stands around them."""
 
 import polars as pl
 
@@ -23,8 +23,14 @@ SAMPLES = Table(
             nullable=True,
         ),
         "lane": column(pl.Int16, "lane at the tick"),
-        "lateral_maneuver": column(pl.String, "keep, left or right", isin=LATERAL_MANEUVERS),
-        "longitudinal_maneuver": column(pl.String, "normal or brake", isin=LONGITUDINAL_MANEUVERS),
+        "lateral_maneuver": column(pl.Enum(LATERAL_MANEUVERS), "keep, left or right"),
+        "longitudinal_maneuver": column(pl.Enum(LONGITUDINAL_MANEUVERS), "normal or brake"),
+        "nearest": column(
+            pl.List(pl.Int32),
+            "the nearest vehicles at the tick, whatever their lanes, the nearest first (of two equally far the smaller "
+            "id); as many as the protocol lists, fewer only where there are no more; null where it lists none",
+            nullable=True,
+        ),
     },
 )
 
@@ -39,6 +45,28 @@ SAMPLE_DROPS = Table(
         "subset": SUBSET,
         "reason": column(pl.String, "the first that applies"),
         "entries": column(pl.Int64, "entries dropped", ge=1),
+    },
+)
+
+
+SAMPLE_COUNTS = Table(
+    "sample_counts",
+    "One row per (protocol, subset): how many entries there were to choose from, and how the grid filled.",
+    key=("protocol",),
+    columns={
+        "protocol": PROTOCOL,
+        "dataset": DATASET,
+        "subset": SUBSET,
+        "entries_on_clock": column(pl.Int64, "entries on the protocol's clock: samples and dropped ones", ge=0),
+        "samples": column(pl.Int64, "kept", ge=0),
+        "neighbors": column(pl.Int64, "vehicles in the samples' grids", ge=0),
+        "collisions": column(
+            pl.Int64,
+            "of those within the grids' reach, how many found their cell taken by a nearer one; they moved to the "
+            "nearest free cell of the lane",
+            ge=0,
+        ),
+        "crowded_out": column(pl.Int64, "of the collisions: found no free cell, and stand nowhere", ge=0),
     },
 )
 

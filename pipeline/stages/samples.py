@@ -1,4 +1,4 @@
-"""Samples: prediction origins with maneuvers and neighbors, and every entry dropped by reason."""
+"""Samples: prediction origins with maneuvers, the nearest and the grid's neighbors; every entry dropped by reason."""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +7,21 @@ from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
 from pipeline.settings import Settings
 from pipeline.stages import repair, validate
 from pipeline.stages.base import Job, make_entry, make_job, recordings, upstream
-from pipeline.transforms.samples import draw_samples
-from schemas import MISSING_STARTS, NEIGHBORS, SAMPLE_DROPS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_STARTS
+from pipeline.transforms.samples import TRACK_COLUMNS, draw_samples
+from schemas import (
+    FINDINGS,
+    MISSING_STARTS,
+    NEIGHBORS,
+    SAMPLE_COUNTS,
+    SAMPLE_DROPS,
+    SAMPLES,
+    SUBSET_STATUS,
+    SUBSETS,
+    TRACKS,
+    VEHICLE_STARTS,
+)
 
-VERSION = 1
+VERSION = 2
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
@@ -26,7 +37,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
                 "ingest": recording["fingerprint"],
                 "validate": validated[f"validate/{recording['dataset']}/{recording['recording']}"],
                 "repair": repaired[f"repair/{recording['dataset']}/{recording['recording']}"],
-                "protocol": protocol.digest,
+                "protocol": protocol.sampling_digest,
             },
             inputs={"dataset": recording["dataset"], "subsets": [item["subset"] for item in recording["subsets"]]},
         )
@@ -38,14 +49,15 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Draw the samples of a recording's subsets."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
-    info: dict[str, Any] = {"samples": 0, "collisions": 0, "notes": []}
+    info: dict[str, Any] = {"samples": 0, "notes": []}
     for subset in job.inputs["subsets"]:
         values = {"dataset": dataset, "subset": subset}
         facts = scan(root, manifest, SUBSETS, **values).collect().row(0, named=True)
         drawn = draw_samples(
-            scan(root, manifest, TRACKS, **values).collect(),
+            scan(root, manifest, TRACKS, **values).select(TRACK_COLUMNS).collect(),
             scan(root, manifest, VEHICLE_STARTS, **values).collect(),
             scan(root, manifest, MISSING_STARTS, **values).collect(),
+            scan(root, manifest, FINDINGS, **values).collect(),
             protocol=settings.get_protocol(),
             dataset=dataset,
             subset=subset,
@@ -56,12 +68,12 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         for table, frame in (
             (SAMPLES, drawn.samples),
             (SAMPLE_DROPS, drawn.sample_drops),
+            (SAMPLE_COUNTS, drawn.sample_counts),
             (NEIGHBORS, drawn.neighbors),
         ):
             written = write_table(root, table, frame, values, job.fingerprint, where=subset)
             files.setdefault(table.name, []).extend(written)
         info["samples"] += drawn.samples.height
-        info["collisions"] += drawn.collisions
         if drawn.samples.is_empty():
             reasons = drawn.sample_drops.sort("entries", descending=True)["reason"].to_list()
             info["notes"].append(f"{subset}: no samples ({', '.join(reasons) or 'no entries'})")

@@ -1,12 +1,12 @@
 """Who stands around a vehicle: the 13 x 3 grid, without silent overwriting."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.transforms.threads import map_in_threads
 from schemas.samples import CELLS
 
 ROWS = 13
@@ -20,8 +20,8 @@ CELL_UNITS = 45_720_000
 """4.572 m, 15 feet."""
 REACH_UNITS = 274_320_000
 """27.432 m, 90 feet: a neighbor is nearer than this."""
-CHUNK_ROWS = 1 << 14
-"""Origins whose grids are filled at a time: their 2.5 MB stay in the processor's cache (measured: half the time)."""
+CHUNK_ROWS = 1 << 15
+"""Origins whose pairs are made at a time: their few MB stay in the processor's cache."""
 
 NEIGHBOR_DTYPES: dict[str, pl.DataType] = {
     "vehicle_id": pl.Int32(),
@@ -55,18 +55,20 @@ class _Line:
 
     A (tick, lane) is a stretch of `stretch` units, the lanes of a tick following one another; entries of different
     stretches are never within reach. The lane to the left is one stretch back, the lane to the right one ahead, with
-    an empty stretch on either side of a tick's lanes. A sentinel stands at either end.
+    an empty stretch on either side of a tick's lanes.
     """
 
     stretch: int
     place: Ints
-    """(N + 2,) sorted places."""
-    entry: NDArray[np.int32]
-    """(N + 2,) row of the clock that stands there; -1 for the sentinels."""
+    """(N,) sorted places."""
+    vehicle_id: NDArray[np.int32]
+    """(N,) who stands there."""
     position: NDArray[np.int32]
     """(N,) where on the line each row of the clock stands."""
-    beside: tuple[NDArray[np.int32], NDArray[np.int32]]
-    """(N + 2,) each: the first position in the left and in the right lane that is not behind."""
+    beside: NDArray[np.int32]
+    """(N, 2) position of the first entry within reach of each in the left and in the right lane."""
+    within: NDArray[np.unsignedinteger]
+    """(N, 4) how many are within reach: in the left lane, behind, ahead, in the right lane."""
 
 
 def find_neighbors(clock: pl.DataFrame, origins: NDArray[np.bool_] | None = None) -> Neighborhood:
@@ -96,33 +98,35 @@ def find_neighbors(clock: pl.DataFrame, origins: NDArray[np.bool_] | None = None
 
     line = _lay_out(clock)
     vehicle_id, tick = clock["vehicle_id"].to_numpy(), clock["tick"].to_numpy()
-    tables, collisions, crowded_out = [], 0, 0
-    for start in range(0, rows.size, CHUNK_ROWS):
+
+    def look_around(start: int) -> Neighborhood:
         chunk = rows[start : start + CHUNK_ROWS]
-        grid, contested, own = _fill_grids(line, line.position[chunk].astype(np.int64))
-        if contested.size:
-            collisions += contested.shape[1]
-            crowded_out += _settle(grid, contested, own, line, vehicle_id)
-        filled = np.flatnonzero(grid >= 0)
-        origin = filled // CELLS
-        other = grid[filled]
-        tables.append(
-            pl.DataFrame(
-                {
-                    "vehicle_id": vehicle_id[chunk][origin],
-                    "tick": tick[chunk][origin],
-                    "cell": (filled - origin * CELLS).astype(np.int8),
-                    "neighbor_id": vehicle_id[line.entry[other]],
-                    "dx_m": (_offset(line, other, own, filled) / UNITS_PER_M).astype(np.float32),
-                },
-                schema=NEIGHBOR_DTYPES,
-            )
+        pairs = _pair(line, line.position[chunk])
+        contested = _find_contested(pairs)
+        collisions = _settle(pairs, contested, line.vehicle_id) if contested.size else 0
+        housed = pairs.housed()
+        table = pl.DataFrame(
+            {
+                "vehicle_id": vehicle_id[chunk][housed.origin],
+                "tick": tick[chunk][housed.origin],
+                "cell": housed.row + ROWS * housed.column,
+                "neighbor_id": line.vehicle_id[housed.other],
+                "dx_m": (housed.dx / UNITS_PER_M).astype(np.float32),
+            },
+            schema=NEIGHBOR_DTYPES,
         )
-    return Neighborhood(pl.concat(tables), collisions, crowded_out)
+        return Neighborhood(table, collisions, crowded_out=pairs.row.size - housed.row.size)
+
+    chunks = map_in_threads(look_around, range(0, rows.size, CHUNK_ROWS))
+    return Neighborhood(
+        neighbors=pl.concat(chunk.neighbors for chunk in chunks),
+        collisions=sum(chunk.collisions for chunk in chunks),
+        crowded_out=sum(chunk.crowded_out for chunk in chunks),
+    )
 
 
 def _lay_out(clock: pl.DataFrame) -> _Line:
-    """Sort the entries by (tick, lane, x)."""
+    """Sort the entries by (tick, lane, x) and find whom each can reach."""
     x_m, lane, tick = clock["x_m"].to_numpy(), clock["lane"].to_numpy(), clock["tick"].to_numpy()
     lanes = int(lane.max()) - int(lane.min()) + 3
     stretch = round((float(x_m.max()) - float(x_m.min())) * UNITS_PER_M) + REACH_UNITS + 2
@@ -135,109 +139,133 @@ def _lay_out(clock: pl.DataFrame) -> _Line:
     place *= stretch
     place += np.rint((x_m - x_m.min()) * UNITS_PER_M).astype(np.int64)
 
-    order = np.argsort(place)
+    order = np.argsort(place).astype(np.int32)
     place = place[order]
-    beyond = 2 * stretch
-    place = np.concatenate(([place[0] - beyond], place, [place[-1] + beyond]))
-    position = np.empty(order.size, np.int32)
-    position[order] = np.arange(1, order.size + 1, dtype=np.int32)
-    left, right = (np.searchsorted(place, place + shift).astype(np.int32) for shift in (-stretch, stretch))
-    entry = np.concatenate(([-1], order, [-1])).astype(np.int32)
-    return _Line(stretch=stretch, place=place, entry=entry, position=position, beside=(left, right))
+    position = np.empty_like(order)
+    position[order] = np.arange(order.size, dtype=np.int32)
+    most = int(clock["tick"].value_counts()["count"].to_numpy().max())
+    beside, within = _find_reach(place, stretch, most)
+    vehicle_id = clock["vehicle_id"].to_numpy()[order]
+    return _Line(stretch, place, vehicle_id, position, beside, within)
 
 
-def _fill_grids(line: _Line, at: Ints) -> tuple[NDArray[np.int32], Ints, Ints]:
-    """Put every neighbor of a chunk of origins into its cell, first come first served.
+def _find_reach(place: Ints, stretch: int, most: int) -> tuple[NDArray[np.int32], NDArray[np.unsignedinteger]]:
+    """`_Line.beside` and `_Line.within`, which is to hold numbers up to `most`."""
+    beside = np.empty((place.size, 2), np.int32)
+    within = np.empty((place.size, 4), np.min_scalar_type(most))
 
-    Args:
-        line: all entries.
-        at: (B,) positions of the origins on the line.
+    def look_up(start: int) -> None:
+        chunk = slice(start, start + CHUNK_ROWS)
+        # Searched is only that part of the line that the chunk can reach: it stays in the processor's cache.
+        far = stretch + REACH_UNITS
+        first, end = np.searchsorted(place, (place[chunk][0] - far, place[chunk][-1] + far))
+        near = place[first:end]
+        left, own, right = (
+            (
+                first + np.searchsorted(near, alongside - REACH_UNITS, side="right"),
+                first + np.searchsorted(near, alongside + REACH_UNITS, side="left"),
+            )
+            for alongside in (place[chunk] - stretch, place[chunk], place[chunk] + stretch)
+        )
+        itself = np.arange(start, start + own[0].size)
+        beside[chunk] = np.stack((left[0], right[0]), axis=1)
+        counts = (left[1] - left[0], itself - own[0], own[1] - itself - 1, right[1] - right[0])
+        within[chunk] = np.stack(counts, axis=1)
 
-    Returns:
-        The grids (B * 39,): positions on the line, -1 = empty; those who found their cell taken (2, M): cell, position
-        on the line; the origins' places on the line (B,).
-    """
-    own = line.place[at]
-    grid = np.full(at.size * CELLS, -1, np.int32)
-    taken: list[Ints] = []
-    left, right = line.beside
-    starts = (left[at].astype(np.int64), at, right[at].astype(np.int64))
-    for column, start in enumerate(starts):
-        target = own + (column - COLUMNS // 2) * line.stretch
-        itself = 1 if column == COLUMNS // 2 else 0
-        for side, first in ((1, start + itself), (-1, start - 1)):
-            for origin, other, distance in _sweep(line.place, target, first, side):
-                row = ROWS // 2 + side * ((2 * distance + CELL_UNITS) // (2 * CELL_UNITS))
-                cell = origin * CELLS + (column * ROWS + row)
-                free = grid[cell] < 0
-                grid[cell[free]] = other[free]
-                if not free.all():
-                    taken.append(np.stack((cell[~free], other[~free])))
-    contested = np.concatenate(taken, axis=1) if taken else np.empty(0, np.int64)
-    return grid, contested, own
+    map_in_threads(look_up, range(0, place.size, CHUNK_ROWS))
+    return beside, within
 
 
-def _sweep(place: Ints, target: Ints, first: Ints, side: int) -> Iterator[tuple[Ints, Ints, Ints]]:
-    """Walk from each origin along a lane, one vehicle a step, until nobody has another one within reach.
+@dataclass(frozen=True)
+class _Pairs:
+    """Origins of a chunk and who is around them, by origin, column and dx."""
 
-    Args:
-        place: (N + 2,) the line.
-        target: (B,) the place on the line that lies alongside each origin.
-        first: (B,) where on the line to begin.
-        side: 1 to walk ahead, -1 to walk back.
+    origin: NDArray[np.int32]
+    """(P,) of the chunk."""
+    column: NDArray[np.int8]
+    row: NDArray[np.int8]
+    """(P,) of the cell; -1 = crowded out."""
+    other: NDArray[np.int32]
+    """(P,) position on the line."""
+    dx: Ints
+    """(P,) in units."""
 
-    Yields:
-        origin (index into B), position on the line, distance in units (>= 0).
-    """
-    origin, other = np.arange(target.size), first
-    while origin.size:
-        distance = (place[other] - target[origin]) * side
-        near = distance < REACH_UNITS
-        origin, other = origin[near], other[near]
-        yield origin, other, distance[near]
-        other = other + side
-
-
-def _offset(line: _Line, other: NDArray[np.int32] | Ints, own: Ints, cell: Ints) -> Ints:
-    """Offset (dx) in units of those who stand at `other`, around the origins whose grids hold `cell`."""
-    column = cell // ROWS
-    origin = column // COLUMNS
-    dx: Ints = line.place[other] - own[origin] - (column - (origin * COLUMNS + COLUMNS // 2)) * line.stretch
-    return dx
+    def housed(self) -> "_Pairs":
+        """Those that stand in a cell."""
+        at = self.row >= 0
+        if at.all():
+            return self
+        return _Pairs(self.origin[at], self.column[at], self.row[at], self.other[at], self.dx[at])
 
 
-def _settle(grid: NDArray[np.int32], contested: Ints, own: Ints, line: _Line, vehicle_id: NDArray[np.int32]) -> int:
-    """Give every contested cell to its nearest vehicle and move the others; return how many find no cell.
+def _pair(line: _Line, at: NDArray[np.int32]) -> _Pairs:
+    """Pair a chunk of origins, given by their (B,) positions on the line, with everybody in reach."""
+    # Four runs of positions for each origin, which does not pair with itself: left lane, behind, ahead, right lane.
+    left, right = line.beside[at].T
+    lengths = line.within[at].astype(np.int64)
+    starts = np.stack((left, at - lengths[:, 1], at + 1, right), axis=1).ravel()
+    lengths = lengths.ravel()
+    columns = np.array((0, 1, 1, 2), np.int8)
+    alongside = (line.place[at, None] + (columns - COLUMNS // 2).astype(np.int64) * line.stretch).ravel()
+
+    run = np.repeat(np.arange(lengths.size, dtype=np.int32), lengths)
+    other = (starts - (np.cumsum(lengths) - lengths))[run] + np.arange(run.size)
+    dx = line.place[other] - alongside[run]
+    # Half a cell more, and a unit less behind, where halves are rounded down: floor(..) then counts cells from row 0.
+    row = (2 * dx + (ROWS * CELL_UNITS - (dx < 0))) // (2 * CELL_UNITS)
+    return _Pairs(run // 4, columns[run % 4], row.astype(np.int8), other, dx)
+
+
+def _find_contested(pairs: _Pairs) -> Ints:
+    """Pairs in columns of which a cell has been given twice; in a column dx rises, so such pairs follow one another."""
+    column = pairs.origin * COLUMNS + pairs.column
+    twice = (column[1:] == column[:-1]) & (pairs.row[1:] == pairs.row[:-1])
+    if not twice.any():
+        return np.empty(0, np.int64)
+    crowded = np.zeros(int(column[-1]) + 1, np.bool_)
+    crowded[column[1:][twice]] = True
+    return np.flatnonzero(crowded[column])
+
+
+def _settle(pairs: _Pairs, contested: Ints, vehicle_id: NDArray[np.int32]) -> int:
+    """Give every contested cell to its nearest vehicle and move the others, in place; return how many those are.
 
     A round moves one vehicle in every column that has one to move, so there are at most 12 rounds.
+
+    Args:
+        pairs: of a chunk; `row`, `other` and `dx` of the contested ones are replaced, in the order of their cells.
+        contested: (M,) which pairs; whole columns of an origin's grid, one after the other.
+        vehicle_id: by position on the line.
     """
-    cell, other = contested
-    cells = np.unique(cell)
-    cell, other = np.concatenate((cells, cell)), np.concatenate((grid[cells], other))
-    dx = _offset(line, other, own, cell)
-    order = np.lexsort((vehicle_id[line.entry[other]], np.abs(dx), cell))
-    cell, other, dx = cell[order], other[order], dx[order]
-    keeps = np.diff(cell, prepend=-1) > 0
-    grid[cell[keeps]] = other[keeps]
+    row, other, dx = pairs.row[contested], pairs.other[contested], pairs.dx[contested]
+    column = pairs.origin[contested] * COLUMNS + pairs.column[contested]
+    column = np.cumsum(np.diff(column, prepend=column[:1]) != 0)
+    nearest_first = np.lexsort((vehicle_id[other], np.abs(dx), column))
+    row, other, dx, column = row[nearest_first], other[nearest_first], dx[nearest_first], column[nearest_first]
 
-    cell, other, dx = cell[~keeps], other[~keeps], dx[~keeps]
-    column = cell // ROWS
-    order = np.lexsort((vehicle_id[line.entry[other]], np.abs(dx), column))
-    cell, other, dx, column = cell[order], other[order], dx[order], column[order]
-    begins = np.flatnonzero(np.diff(column, prepend=-1))
-    turn = np.arange(column.size) - np.repeat(begins, np.diff(begins, append=column.size))
+    # Of those in one cell the first keeps it.
+    taken = np.zeros((int(column[-1]) + 1, ROWS), np.bool_)
+    _, keepers = np.unique(column * ROWS + row, return_index=True)
+    taken[column[keepers], row[keepers]] = True
+    moves = np.ones(row.size, np.bool_)
+    moves[keepers] = False
+    movers = np.flatnonzero(moves)
+    begins = np.flatnonzero(np.diff(column[movers], prepend=-1))
+    turn = np.arange(movers.size) - np.repeat(begins, np.diff(begins, append=movers.size))
 
-    rows = np.arange(ROWS)
+    row[movers[turn >= ROWS - 1]] = -1
     blocked = 2 * ROWS
-    moved = 0
     for round_number in range(min(int(turn.max()) + 1, ROWS - 1)):
-        now = turn == round_number
-        cells_of_column = column[now, None] * ROWS + rows
-        steps = cells_of_column - cell[now, None]
+        now = movers[turn == round_number]
+        steps = np.arange(ROWS) - row[now, None]
         preferred = np.where(dx[now, None] >= 0, steps > 0, steps < 0)
-        cost = np.where(grid[cells_of_column] < 0, 2 * np.abs(steps) - preferred, blocked)
+        cost = np.where(taken[column[now]], blocked, 2 * np.abs(steps) - preferred)
         best = cost.argmin(axis=1)
         fits = cost[np.arange(best.size), best] < blocked
-        grid[(column[now] * ROWS + best)[fits]] = other[now][fits]
-        moved += int(fits.sum())
-    return column.size - moved
+        taken[column[now], best] = True
+        row[now] = np.where(fits, best, -1)
+
+    by_cell = np.lexsort((row, column))
+    pairs.row[contested], pairs.other[contested] = row[by_cell], other[by_cell]
+    pairs.dx[contested] = dx[by_cell]
+    return movers.size

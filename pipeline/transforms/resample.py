@@ -42,15 +42,16 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
     is that of the earlier one. Both frames must exist: a gap is never bridged.
 
     Args:
-        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
+        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame. Of y_m, lane
+            and speed_mps those may be left out that the caller does not need.
         first_frame: the recording's first frame, where tick 0 lies (highD 1, NGSIM whatever it is).
         frame_rate_hz: the source's.
         rate_hz: the clock's.
 
     Returns:
-        CLOCK_DTYPES, sorted by vehicle_id, tick; `frame` is null where no source frame falls on the tick. `segment`
-        numbers the gap-free runs of source frames, so that ticks are consecutive within a segment. A track that
-        skips a frame starts a new segment even if the clock would not have used that frame.
+        CLOCK_DTYPES, less what `tracks` leaves out, sorted by vehicle_id, tick; `frame` is null where no source frame
+        falls on the tick. `segment` numbers the gap-free runs of source frames, so that ticks are consecutive within a
+        segment. A track that skips a frame starts a new segment even if the clock would not have used that frame.
 
     Raises:
         ValueError: the clock is faster than the source.
@@ -61,17 +62,13 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
     follows = (pl.col("vehicle_id") == pl.col("vehicle_id").shift(1)) & (
         pl.col("frame") - pl.col("frame").shift(1) == 1
     )
+    given = [name for name in CLOCK_DTYPES if name in tracks.columns]
     entries = tracks.lazy().select(
-        "vehicle_id",
-        "frame",
-        "x_m",
-        "y_m",
-        "lane",
-        "speed_mps",
+        *given,
         tick=(position + frames - 1) // frames,
         segment=(~follows.fill_null(value=False)).cast(pl.Int32).cum_sum(),
     )
-    columns = [pl.col(name).cast(dtype) for name, dtype in CLOCK_DTYPES.items()]
+    columns = [pl.col(name).cast(CLOCK_DTYPES[name]) for name in CLOCK_DTYPES if name in {*given, "tick", "segment"}]
     if ticks == 1:
         on_frame = (pl.col("frame").cast(pl.Int64) - first_frame) % frames == 0
         return entries.filter(on_frame).select(columns).collect()
@@ -89,9 +86,7 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
 
     return (
         entries.with_columns(
-            between("x_m"),
-            between("y_m"),
-            between("speed_mps"),
+            *(between(name) for name in ("x_m", "y_m", "speed_mps") if name in given),
             frame=pl.when(on_frame).then("frame"),
             used=on_frame | ((beyond < ticks) & next_is_adjacent),
         )
@@ -99,6 +94,22 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
         .select(columns)
         .collect()
     )
+
+
+def cut_runs(values: NDArray[np.int32], rows: int) -> list[tuple[int, int]]:
+    """Cut rows into pieces that part no run of equal values.
+
+    Args:
+        values: (N,) segments or ticks; equal ones stand together.
+        rows: of a piece, about; more where a run is longer.
+
+    Returns:
+        First row and end (exclusive) of each piece.
+    """
+    starts = np.flatnonzero(np.diff(values, prepend=-1))
+    runs = np.searchsorted(starts, np.arange(0, values.size, rows), side="right") - 1
+    cuts = [int(start) for start in np.unique(starts[runs])]
+    return list(zip(cuts, [*cuts[1:], values.size], strict=True)) if cuts else []
 
 
 def bound_segments(clock: pl.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

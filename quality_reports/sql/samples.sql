@@ -1,4 +1,4 @@
--- Per protocol and subset: samples, their maneuvers, their neighbors, and entries dropped.
+-- Per protocol and subset: samples, their maneuvers, their neighbors and how the grid filled, and entries dropped.
 WITH kept AS (
     SELECT
         protocol, dataset, subset,
@@ -22,8 +22,11 @@ SELECT
     coalesce(samples, 0) / nullif(coalesce(samples, 0) + coalesce(dropped, 0), 0) AS kept_share,
     coalesce(lane_change_left, 0) AS lane_change_left, coalesce(lane_change_right, 0) AS lane_change_right,
     coalesce(brake, 0) AS brake,
-    coalesce(pairs, 0) / nullif(samples, 0) AS mean_neighbors
+    coalesce(pairs, 0) / nullif(samples, 0) AS mean_neighbors,
+    collisions, crowded_out
 FROM kept
 FULL JOIN dropped USING (protocol, dataset, subset)
 LEFT JOIN around USING (protocol, dataset, subset)
+LEFT JOIN (SELECT protocol, dataset, subset, collisions, crowded_out FROM sample_counts)
+    USING (protocol, dataset, subset)
 ORDER BY protocol, dataset, subset

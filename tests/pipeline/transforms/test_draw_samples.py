@@ -1,5 +1,7 @@
 """Every entry on the clock is a sample or is dropped for one reason, the first that applies."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -7,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.transforms.samples import DROP_REASONS, draw_samples
+from schemas.findings import FINDINGS
 from schemas.missing_starts import MISSING_STARTS
 from schemas.protocols import CSP, Protocol
-from schemas.samples import NEIGHBORS, SAMPLE_DROPS, SAMPLES
+from schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
 
 SHORT = Protocol(name="short", rate_hz=5, history_s=0.4, min_future_s=0.2)
 """Three positions of history, one of future."""
@@ -36,7 +39,15 @@ def make_missing(rows):
     return pl.DataFrame(rows, schema={name: MISSING_STARTS.dtypes[name] for name in names}, orient="row")
 
 
-def draw(entries, *, early=(), missing=(), protocol=SHORT, first_frame=0, frame_rate_hz=10.0, excluded=False):
+def make_findings(rows):
+    """(vehicle_id, severity, first_frame, last_frame) rows."""
+    names = ("vehicle_id", "severity", "first_frame", "last_frame")
+    return pl.DataFrame(rows, schema={name: FINDINGS.dtypes[name] for name in names}, orient="row")
+
+
+def draw(
+    entries, *, early=(), missing=(), findings=(), protocol=SHORT, first_frame=0, frame_rate_hz=10.0, excluded=False
+):
     """Draw, validate, and check that nothing is lost: tables and {reason: entries}."""
     ids = sorted({vehicle for vehicle, *_ in entries})
     starts = pl.DataFrame(
@@ -47,6 +58,7 @@ def draw(entries, *, early=(), missing=(), protocol=SHORT, first_frame=0, frame_
         make_tracks(entries),
         starts,
         make_missing(list(missing)),
+        make_findings(list(findings)),
         protocol=protocol,
         dataset="highd",
         subset="01-upper",
@@ -58,9 +70,17 @@ def draw(entries, *, early=(), missing=(), protocol=SHORT, first_frame=0, frame_
     SAMPLE_DROPS.validate(drawn.sample_drops, where="test")
     NEIGHBORS.validate(drawn.neighbors, where="test")
     drops = dict(drawn.sample_drops.select("reason", "entries").iter_rows())
+    SAMPLE_COUNTS.validate(drawn.sample_counts, where="test")
     assert set(drops) <= set(DROP_REASONS)
-    assert drawn.samples.height + sum(drops.values()) == drawn.entries_on_clock
+    counts = drawn.sample_counts.row(0, named=True)
+    assert counts["samples"] == drawn.samples.height
+    assert counts["neighbors"] == drawn.neighbors.height
+    assert drawn.samples.height + sum(drops.values()) == counts["entries_on_clock"]
     return drawn, drops
+
+
+def count(drawn, name):
+    return drawn.sample_counts[name].item()
 
 
 def drive(vehicle, frames, *, lane=1, x_m=0.0):
@@ -158,18 +178,84 @@ def test_collisions_are_counted_for_samples_only():
     drawn, _ = draw(entries)
     assert drawn.samples.select("vehicle_id", "tick").rows() == [(1, 2)]
     assert drawn.neighbors.select("neighbor_id", "cell").rows() == [(4, 31), (2, 32), (3, 33)]
-    assert (drawn.collisions, drawn.crowded_out) == (2, 0)
+    assert (count(drawn, "collisions"), count(drawn, "crowded_out")) == (2, 0)
+
+
+ERRORS = Protocol(name="errors", rate_hz=5, history_s=0.4, horizon_s=0.6, min_future_s=0.2, drop_error_findings=True)
+"""At 10 Hz the history begins 4 frames before the entry, the horizon ends 6 after it."""
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "dropped"),
+    [
+        (20, 20, range(14, 25, 2)),
+        (21, 21, range(16, 26, 2)),
+        (19, 22, range(14, 27, 2)),
+        (0, 90, range(4, 39, 2)),
+        (90, 95, ()),
+    ],
+)
+def test_findings_of_errors_drop_what_they_touch_where_the_protocol_says_so(first, last, dropped):
+    """Samples at frames 4 to 38: dropped where [frame - 4, frame + 6] and the finding have a frame in common."""
+    findings = [(1, "error", first, last)]
+    kept = [frame for frame in range(4, 39, 2) if frame not in dropped]
+    drawn, drops = draw(drive(1, range(41)), findings=findings, protocol=ERRORS)
+    assert drawn.samples["frame"].to_list() == kept
+    assert drops.get("error_finding", 0) == len(dropped)
+    ignoring, _ = draw(drive(1, range(41)), findings=findings, protocol=replace(ERRORS, drop_error_findings=False))
+    assert ignoring.samples.height == 18
+
+
+def test_findings_of_others_and_of_less_than_errors_drop_nothing():
+    tracks = [*drive(1, range(41)), *drive(INT32_MAX, range(41), lane=2)]
+    drawn, drops = draw(
+        tracks, findings=[(0, "error", 0, 40), (1, "warning", 0, 40), (2, "error", 0, 40)], protocol=ERRORS
+    )
+    assert drawn.samples.height == 36
+    assert "error_finding" not in drops
+    drawn, drops = draw(tracks, findings=[(INT32_MAX, "error", 0, 40), (INT32_MAX, "error", 3, 3)], protocol=ERRORS)
+    assert drawn.samples["vehicle_id"].unique().to_list() == [1]
+    assert drops["error_finding"] == 18
+    assert drawn.neighbors["neighbor_id"].unique().to_list() == [INT32_MAX]  # its track stays
+
+
+@pytest.mark.parametrize(
+    ("frame", "ticks"), [(33, range(7, 16)), (34, range(7, 16)), (35, range(8, 16)), (36, range(8, 17))]
+)
+def test_a_tick_between_two_frames_is_made_of_both(frame, ticks):
+    """25 Hz on 10 Hz: tick k lies at frame 1 + 2.5 k, the window is [k - 2, k + 6]; frames 33 and 34 make tick 13."""
+    protocol = Protocol(name="errors", rate_hz=10, history_s=0.2, horizon_s=0.6, drop_error_findings=True)
+    drawn, drops = draw(
+        drive(1, range(1, 102)),
+        findings=[(1, "error", frame, frame)],
+        protocol=protocol,
+        first_frame=1,
+        frame_rate_hz=25.0,
+    )
+    assert [tick for tick in range(2, 39) if tick not in drawn.samples["tick"].to_list()] == list(ticks)
+    assert drops["error_finding"] == len(ticks)
+
+
+def test_the_future_lasts_at_least_as_long_as_asked_for():
+    """0.5 s at 5 Hz are three ticks, for two are too few; what is a whole number of ticks but for rounding stays it."""
+    assert [Protocol("p", min_future_s=seconds).min_future_ticks for seconds in (0.01, 0.2, 0.5, 0.6, 5.0)] == [
+        1,
+        1,
+        3,
+        3,
+        25,
+    ]
 
 
 def test_no_entries_and_one_entry():
     drawn, drops = draw([])
-    assert (drawn.entries_on_clock, drops) == (0, {})
+    assert (count(drawn, "entries_on_clock"), drops) == (0, {})
     for excluded in (False, True):
         assert draw([], excluded=excluded)[0].samples.is_empty()
     _, drops = draw([(INT32_MAX, 0, 5.0, 0)])
     assert drops == {"short_history": 1}
     drawn, drops = draw([(1, 1, 5.0, 0)])  # not on the clock
-    assert (drawn.entries_on_clock, drops) == (0, {})
+    assert (count(drawn, "entries_on_clock"), drops) == (0, {})
 
 
 def test_the_default_protocol():

@@ -139,6 +139,14 @@ def test_all_in_one_cell():
     assert (found.collisions, found.crowded_out) == (14, 2)
 
 
+def test_more_on_one_spot_than_a_byte_counts():
+    """Around the first are 299: one keeps the cell, twelve find another, the rest none."""
+    entries = [(vehicle, 0, 7.0, 2) for vehicle in range(300)]
+    found = find_neighbors(make_clock(entries), np.arange(300) == 0)
+    assert found.neighbors.sort("neighbor_id")["neighbor_id"].to_list() == list(range(1, 14))
+    assert (found.collisions, found.crowded_out) == (298, 286)
+
+
 def test_origins_limit_whose_neighbors_are_found_not_who_is_one():
     clock = make_clock([(1, 0, 0.0, 2), (1, 1, 1.0, 2), (2, 0, 5.0, 2), (2, 1, 6.0, 2)])
     found = find_neighbors(clock, np.array([False, True, False, False])).neighbors

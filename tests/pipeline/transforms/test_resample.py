@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, find_stride, put_on_clock
+from pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, cut_runs, find_stride, put_on_clock
 
 INT32_MAX = 2**31 - 1
 
@@ -155,3 +155,23 @@ def test_agrees_with_a_loop_over_ticks(recording, rates):
     for (_segment,), run in clock.group_by("segment"):
         assert run["vehicle_id"].n_unique() == 1
         assert (np.diff(run["tick"]) == 1).all()
+
+
+def test_columns_that_are_left_out_are_left_out():
+    tracks = make_tracks([(7, frame, float(frame), 2) for frame in range(1, 12)])
+    full = put_on_clock(tracks, first_frame=1, frame_rate_hz=25.0, rate_hz=10)
+    part = put_on_clock(tracks.drop("speed_mps", "lane"), first_frame=1, frame_rate_hz=25.0, rate_hz=10)
+    assert_frame_equal(part, full.drop("speed_mps", "lane"))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(1, 6), max_size=12), st.integers(1, 9))
+def test_runs_are_cut_whole_and_in_order(lengths, rows):
+    values = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
+    pieces = cut_runs(values, rows)
+    assert [row for start, end in pieces for row in range(start, end)] == list(range(values.size))
+    for start, end in pieces:
+        assert end > start
+        assert start == 0 or values[start] != values[start - 1]
+        # A piece ends with the run that begins in its last place or before.
+        assert end - start < rows + max(lengths) or len(set(values[start:end])) == 1
