@@ -1,0 +1,82 @@
+"""Files of an export: all of them in their place, or none."""
+
+import shutil
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.lake.manifest import sync
+
+
+class ExportError(ValueError):
+    """An export cannot be made as asked; the message says why and what to do."""
+
+
+def refuse_taken(out: Path, names: Sequence[str], *, force: bool, lake: Path) -> None:
+    """Refuse a place where the export would spoil something, before any work is done for it.
+
+    Args:
+        out: the folder; it may hold other things.
+        names: of the files.
+        force: whether files of these names may be replaced.
+        lake: in which nothing but the lake's own files stands.
+
+    Raises:
+        ExportError: a file, the lake, or a folder that holds one of the names.
+    """
+    if out.exists() and not out.is_dir():
+        raise ExportError(f"{out}: is a file; the export needs a folder. Name another with --out.")
+    if out.resolve().is_relative_to(lake.resolve()):
+        raise ExportError(f"{out}: lies in the lake, which sweeps what is not its own. Name another folder with --out.")
+    taken = [name for name in names if (out / name).exists()]
+    if taken and not force:
+        raise ExportError(f"{out}: holds {', '.join(taken)}. Name another folder with --out, or replace them: --force.")
+
+
+def write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) -> None:
+    """Write files aside and move them into a folder when all are complete.
+
+    A new folder appears with all of them in one step. In one that is there, which may hold other things or be a disk of
+    its own, they are renamed one after the other; if that fails, what stood there is put back.
+
+    Args:
+        out: the folder, made where it is missing.
+        names: of the files that `write` makes.
+        write: fills the folder it is given.
+    """
+    out = out.resolve()
+    there = out.is_dir()
+    if not there:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    aside = (out if there else out.parent) / f".{out.name}.{uuid.uuid4().hex}.tmp"
+    aside.mkdir()
+    try:
+        write(aside)
+        for name in names:
+            sync(aside / name)
+        if there:
+            _move_in(aside, out, names)
+        else:
+            aside.replace(out)
+        sync(out)
+        sync(out.parent)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _move_in(aside: Path, out: Path, names: Sequence[str]) -> None:
+    before = aside / "before"
+    before.mkdir()
+    try:
+        for name in names:
+            if (out / name).exists():
+                (out / name).replace(before / name)
+            (aside / name).replace(out / name)
+    except BaseException:
+        # How far it came is seen from where the files are.
+        for name in names:
+            if (before / name).exists():
+                (before / name).replace(out / name)
+            elif not (aside / name).exists():
+                (out / name).unlink(missing_ok=True)
+        raise
