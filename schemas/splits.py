@@ -1,4 +1,4 @@
-"""`splits` and `split_balance`: which subset trains, which evaluates, and how alike the parts are."""
+"""`splits`, what they are made by, and how alike the parts are: who trains, who evaluates, who does neither."""
 
 import polars as pl
 
@@ -6,14 +6,17 @@ from schemas.columns import DATASET, PARTS, SUBSET, Table, column
 
 SPLITS = Table(
     "splits",
-    "One row per (split, subset, block): where its samples go.",
+    "One row per (split, subset, block): where the entries of its frames and vehicles go. An entry within no row is in "
+    "no part; nor is one of a vehicle in `split_left_out`, but in train.",
     key=("split", "dataset", "subset", "block"),
     partition=(),
     columns={
         "split": column(pl.String, "the split's name"),
         "dataset": DATASET,
         "subset": SUBSET,
-        "block": column(pl.Int32, "0 where the subset stands undivided", ge=0),
+        "block": column(
+            pl.Int32, "counted from 0 in each subset; what is seen around a sample never lies beyond its block", ge=0
+        ),
         "first_frame": column(pl.Int32, "of the block"),
         "last_frame": column(pl.Int32, "of the block"),
         "first_vehicle_id": column(pl.Int32, "lowest id of the part; null = all", nullable=True),
@@ -48,5 +51,38 @@ SPLIT_BALANCE = Table(
             "True where the lake is too small to meet every constraint of the split",
         ),
         "relaxed_reason": column(pl.String, "which constraint, and by how much", nullable=True),
+    },
+)
+
+
+SPLIT_LEFT_OUT = Table(
+    "split_left_out",
+    "One row per (split, vehicle) with entries in two parts: it gives no samples and no context to val and eval.",
+    key=("split", "dataset", "subset", "vehicle_id"),
+    partition=(),
+    columns={
+        "split": column(pl.String, "the split's name"),
+        "dataset": DATASET,
+        "subset": SUBSET,
+        "vehicle_id": column(pl.Int32, "in two parts", ge=0),
+        "parts": column(pl.String, "in which it has entries, in the order train, val, eval"),
+        "entries": column(pl.Int64, "of it in val and eval, which go into no part", ge=1),
+    },
+)
+
+
+SPLIT_RECIPES = Table(
+    "split_recipes",
+    "One row per split: what it is made by.",
+    key=("split",),
+    partition=(),
+    columns={
+        "split": column(pl.String, "the split's name"),
+        "meaning": column(pl.String, "how it divides"),
+        "claims_no_leakage": column(pl.Boolean, "whether `tracklake split` fails where its parts share anything"),
+        "trains": column(pl.Boolean, "whether tensors are made of it"),
+        "window_s": column(pl.Float64, "history and future of a sample together", unit="s", gt=0),
+        "digest": column(pl.String, "first 12 hex digits of the sha256 of the parameters"),
+        "parameters": column(pl.String, "every one, as JSON"),
     },
 )

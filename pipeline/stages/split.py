@@ -1,4 +1,4 @@
-"""Split: which subsets train and which evaluate."""
+"""Split: which subsets train and which evaluate, by every recipe that is asked for, and what the parts share."""
 
 from pathlib import Path
 
@@ -8,10 +8,24 @@ from pipeline.lake import Entry, Manifest, load, scan, write_table
 from pipeline.settings import Settings
 from pipeline.stages import samples
 from pipeline.stages.base import Job, make_entry, make_job, upstream
-from pipeline.transforms.splits import allocate_flow_balanced
-from schemas import SAMPLES, SPLIT_BALANCE, SPLITS, SUBSET_STATUS, SUBSETS
+from pipeline.stages.leakage import Leakage, measure, open_tables, refuse_leaks
+from pipeline.stages.split_makers import Made, Material, make_split
+from schemas import (
+    SAMPLES,
+    SPLIT_BALANCE,
+    SPLIT_CONTEXT,
+    SPLIT_LEAKAGE,
+    SPLIT_LEFT_OUT,
+    SPLIT_RECIPES,
+    SPLIT_SHIFTS,
+    SPLITS,
+    SUBSET_STATUS,
+    SUBSETS,
+)
+from schemas.protocols import Protocol
+from schemas.split_recipes import MEANINGS, SplitRecipe
 
-VERSION = 1
+VERSION = 2
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
@@ -19,6 +33,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     drawn = upstream(samples.plan, root, manifest, settings)
     if not drawn:
         return []
+    recipes = settings.get_split_recipes()
     return [
         make_job(
             "split",
@@ -26,6 +41,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
             made_of={
                 "samples": drawn,
                 "protocol": settings.get_protocol().digest,
+                "splits": {recipe.name: recipe.digest for recipe in recipes},
                 "validation_part": settings.validation_part,
                 "seed": settings.split_seed,
             },
@@ -35,33 +51,105 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
-    """Allocate the subsets that are not excluded, weighted by their kept samples."""
+    """Divide the subsets that are not excluded by every recipe, and measure what the parts share.
+
+    Raises:
+        StageError: a split that claims to be free of leakage is not.
+    """
     manifest, protocol = load(root), settings.get_protocol()
+    subsets = gather_subsets(root, manifest, protocol)
+    material = Material(root, manifest, subsets, protocol)
+    made = {recipe: make_split(recipe, material) for recipe in settings.get_split_recipes()}
+    measured = _measure_all(material, made)
+    refuse_leaks(measured)
+    frames = [
+        (SPLITS, [split.allocation.splits for split in made.values()]),
+        (SPLIT_BALANCE, [split.allocation.balance for split in made.values()]),
+        (SPLIT_LEFT_OUT, [split.left_out for split in made.values()]),
+        (SPLIT_RECIPES, [_describe(made, protocol)]),
+        (SPLIT_LEAKAGE, [found.leakage for found in measured.values()]),
+        (SPLIT_CONTEXT, [found.context for found in measured.values()]),
+        (SPLIT_SHIFTS, [found.shifts for found in measured.values()]),
+    ]
+    files = {
+        table.name: write_table(root, table, pl.concat(parts).sort(table.key), {}, job.fingerprint, where="split")
+        for table, parts in frames
+    }
+    notes = [note for recipe, split in made.items() for note in _tell(recipe, split, measured[recipe])]
+    return make_entry(job, files, {"notes": notes, "subsets": subsets.height})
+
+
+def gather_subsets(root: Path, manifest: Manifest, protocol: Protocol) -> pl.DataFrame:
+    """The freeway subsets that are not excluded, with their kept samples.
+
+    Returns:
+        What `allocate_flow_balanced` reads, and recording, lanes, frame_rate_hz.
+    """
     kept = (
         scan(root, manifest, SAMPLES)
         .filter(pl.col("protocol") == protocol.name)
         .group_by("dataset", "subset")
         .agg(weight=pl.len().cast(pl.Int64))
     )
-    subsets = (
+    shown = ("dataset", "subset", "recording", "site", "direction", "lanes", "frame_rate_hz", "vehicles", "weight")
+    return (
         scan(root, manifest, SUBSETS)
         .filter(pl.col("freeway"))
         .join(scan(root, manifest, SUBSET_STATUS).select("dataset", "subset", "excluded"), on=["dataset", "subset"])
         .filter(~pl.col("excluded"))
         .join(kept, on=["dataset", "subset"], how="left")
         .with_columns(pl.col("weight").fill_null(0))
-        .select("dataset", "subset", "site", "direction", "vehicles", "weight", "flow", "first_frame", "last_frame")
+        .select(*shown, "flow", "first_frame", "last_frame")
         .collect()
     )
-    allocation = allocate_flow_balanced(
-        subsets, split=protocol.split, validation=settings.validation_part, seed=settings.split_seed
-    )
-    files = {
-        table.name: write_table(root, table, frame, {}, job.fingerprint, where=f"split {protocol.split}")
-        for table, frame in ((SPLITS, allocation.splits), (SPLIT_BALANCE, allocation.balance))
-    }
-    notes = [
-        f"split {protocol.split} of {dataset} is relaxed: {reason}"
-        for dataset, reason in sorted(allocation.relaxations.items())
+
+
+def _measure_all(material: Material, made: dict[SplitRecipe, Made]) -> dict[SplitRecipe, Leakage]:
+    places = material.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
+    with open_tables(material.root, material.manifest) as connection:
+        return {
+            recipe: measure(
+                connection,
+                split.allocation.splits,
+                split.left_out,
+                places,
+                recipe=recipe,
+                protocol=material.protocol.name,
+                flows=split.flows,
+            )
+            for recipe, split in made.items()
+        }
+
+
+def _describe(made: dict[SplitRecipe, Made], protocol: Protocol) -> pl.DataFrame:
+    """Rows of `split_recipes`."""
+    rows = [
+        {
+            "split": recipe.name,
+            "meaning": MEANINGS[recipe.name],
+            "claims_no_leakage": recipe.claims_no_leakage,
+            "trains": recipe.name == protocol.split,
+            "window_s": recipe.window_s,
+            "digest": recipe.digest,
+            "parameters": recipe.parameters,
+        }
+        for recipe in made
     ]
-    return make_entry(job, files, {"notes": notes, "subsets": allocation.splits.height})
+    return pl.DataFrame(rows, schema=SPLIT_RECIPES.dtypes)
+
+
+def _tell(recipe: SplitRecipe, made: Made, measured: Leakage) -> list[str]:
+    """What the user should know of a split: constraints that were relaxed, vehicles left out, leakage."""
+    notes = [
+        f"split {recipe.name} of {dataset} is relaxed: {reason}"
+        for dataset, reason in sorted(made.allocation.relaxations.items())
+    ]
+    counted = made.left_out.group_by("dataset").agg(vehicles=pl.len(), entries=pl.col("entries").sum()).sort("dataset")
+    notes += [
+        f"split {recipe.name} of {dataset}: {vehicles:,} vehicle(s) in two parts give no samples and no context to val "
+        f"and eval ({entries:,} entries)"
+        for dataset, vehicles, entries in counted.iter_rows()
+    ]
+    if measured.find_leaks(recipe.window_s):
+        notes.append(f"split {recipe.name}, made for comparison, leaks: {'; '.join(measured.sum_up())}")
+    return notes

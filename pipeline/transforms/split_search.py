@@ -17,6 +17,9 @@ EXHAUSTIVE_STATES = 2**18
 MAX_SWAPS = 50_000
 """Swaps looked at in one step of the search; more (beyond about 500 subsets) are sampled."""
 
+KICKS, KICKED = 2, 12
+"""After the random starts: descents from the best allocation with the parts of so many subsets exchanged."""
+
 TIE = 1e-8
 """Differences of flow (veh/lane/s) closer than this are equal; sums of squares carry no more digits."""
 
@@ -158,10 +161,26 @@ def _try_all(problem: Problem) -> Indices:
 
 
 def _search(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
-    """The best allocation that `restarts` descents from random ones find: (n,) parts."""
+    """The best allocation that descents find: (n,) parts.
+
+    `restarts` begin at random ones, and KICKS times as many near the best of those. The latter are short, so that many
+    fit into the time; each goes on from the best that is known by then.
+    """
     ends = np.stack([_descend(problem, _random_start(problem, random), random) for _ in range(max(1, restarts))])
-    best: Indices = ends[_score(problem, sum_facts(problem, ends), _uncovered(problem, ends)).best()]
-    return best
+    best = ends[_best_of(problem, ends)]
+    for _ in range(KICKS * restarts):
+        start = best.copy()
+        moved = random.permutation(problem.subsets)[:KICKED]
+        start[moved] = best[random.permutation(moved)]
+        pair = np.stack([best, _descend(problem, start, random)])
+        best = pair[_best_of(problem, pair)]
+    found: Indices = best
+    return found
+
+
+def _best_of(problem: Problem, part: Indices) -> int:
+    """Position of the best of allocations (M, n)."""
+    return _score(problem, sum_facts(problem, part), _uncovered(problem, part)).best()
 
 
 def _random_start(problem: Problem, random: np.random.Generator) -> Indices:

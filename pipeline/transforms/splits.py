@@ -6,51 +6,18 @@ deviation of flow differ as little as can be.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
 
 from pipeline.transforms.split_search import FILLED, TOLERANCE, VEHICLES, Indices, Problem, allocate, sum_facts
-from schemas.splits import SPLIT_BALANCE, SPLITS
+from pipeline.transforms.split_tables import COLUMNS, Allocation, complete, tabulate
 
 TWO_PARTS = {"train": 800, "eval": 200}
 """Shares of the vehicles, in thousandths (whole numbers, so that a share is met or missed exactly)."""
 
 THREE_PARTS = {"train": 700, "val": 100, "eval": 200}
 """The same with a validation part."""
-
-COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "dataset": pl.String,
-    "subset": pl.String,
-    "site": pl.String,
-    "direction": pl.String,
-    "vehicles": pl.Int64,
-    "weight": pl.Int64,
-    "flow": pl.Float64,
-    "first_frame": pl.Int32,
-    "last_frame": pl.Int32,
-}
-"""What `allocate_flow_balanced` reads: one row per freeway subset that is not excluded."""
-
-
-@dataclass(frozen=True)
-class Allocation:
-    """A split and how alike its parts are.
-
-    Args:
-        splits: rows of `schemas.splits.SPLITS`.
-        balance: rows of `schemas.splits.SPLIT_BALANCE`; a part without subsets stands there with zeros.
-    """
-
-    splits: pl.DataFrame
-    balance: pl.DataFrame
-
-    @property
-    def relaxations(self) -> dict[str, str]:
-        """By dataset: which constraints could not be met, and by how much."""
-        relaxed = self.balance.filter(pl.col("relaxed")).unique("dataset", maintain_order=True)
-        return dict(relaxed.select("dataset", "relaxed_reason").iter_rows())
 
 
 def allocate_flow_balanced(
@@ -71,42 +38,44 @@ def allocate_flow_balanced(
     differences of the weighted mean and of the weighted standard deviation (of the population) of flow; among equals
     the larger standard deviation in eval.
 
+    Subsets may be given in blocks; then everything here is said of blocks.
+
     Up to 18 subsets (11 with a validation part) every allocation is tried: the optimum. Beyond, a local search: from
     `restarts` random allocations of about the right shares, the best of all flips (one subset to another part) and
-    swaps (two subsets of different parts) is taken until none improves. The sums behind the two moments are additive
-    over subsets, so a step over all moves is a few array operations. Why it suffices: with flows of spread s a swap
-    shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and there are about n^2 / 6 swaps, so a
-    descent in the plane of the two moments ends about 12 s / n^2 from the target and the best of R descents about
-    12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6.
+    swaps (two subsets of different parts) is taken until none improves; then again twice as often from the best of
+    these with a dozen subsets exchanged, which halves what three parts still differ. The sums behind the two moments
+    are additive over subsets, so a step over all moves is a few array operations. Why it suffices: with flows of spread
+    s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and there are about n^2 / 6 swaps, so
+    a descent in the plane of the two moments ends about 12 s / n^2 from the target and the best of R descents about 12
+    s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No allocation has a difference below 0, which bounds
+    from below what any other search could find: the difference found is also the most that it can lie above the least.
 
     Args:
-        subsets: one row per freeway subset that is not excluded, the columns of `COLUMNS`, in any order. `weight` is
-            the kept samples (before there are any: the entries). A subset whose flow is null or whose weight is 0 takes
-            part in the shares and in the coverage, and not in the moments of flow.
+        subsets: one row per freeway subset that is not excluded, the columns of `split_tables.COLUMNS` (and `block`,
+            where a subset has several rows), in any order. `weight` is the kept samples (before there are any: the
+            entries). A subset whose flow is null or whose weight is 0 takes part in the shares and in the coverage, and
+            not in the moments of flow.
         split: the name to write into the tables.
         validation: whether there is a third part, `val`.
         seed: of the search's random starts; the result depends on nothing else (not on other datasets either).
-        restarts: how many.
+        restarts: how many random starts.
 
     Raises:
-        ValueError: a column is missing, a subset stands in two rows, or a count is null or negative.
+        ValueError: a column is missing, a subset (or block) stands in two rows, or a count is null or negative.
 
     Source: DESIGN section 8.
     """
     table = _check(subsets)
     shares = THREE_PARTS if validation else TWO_PARTS
-    splits, balances = [SPLITS.empty()], [SPLIT_BALANCE.empty()]
+    allocated = [table.with_columns(part=pl.lit(None, pl.String)).clear()]
+    reasons: dict[str, str | None] = {}
     for (dataset,), rows in sorted(table.group_by("dataset"), key=lambda item: str(item[0][0])):
         problem = _pose(rows, shares)
         part = allocate(problem, np.random.default_rng([seed, *str(dataset).encode()]), restarts)
         names = pl.Series("part", [list(shares)[position] for position in part], dtype=pl.String)
-        allocated = rows.with_columns(names)
-        splits.append(_split_rows(allocated, split))
-        balances.append(_balance_rows(allocated, split, shares, _explain(allocated, problem, part, shares)))
-    return Allocation(
-        splits=pl.concat(splits).sort(SPLITS.key),
-        balance=pl.concat(balances).sort(SPLIT_BALANCE.key),
-    )
+        allocated.append(rows.with_columns(names))
+        reasons[str(dataset)] = _explain(allocated[-1], problem, part, shares)
+    return tabulate(pl.concat(allocated), split=split, parts=list(shares), reasons=reasons)
 
 
 def _check(subsets: pl.DataFrame) -> pl.DataFrame:
@@ -117,7 +86,9 @@ def _check(subsets: pl.DataFrame) -> pl.DataFrame:
             f"the table of subsets lacks the column(s) {', '.join(missing)}: expected {', '.join(COLUMNS)}, "
             f"got {', '.join(subsets.columns)}"
         )
-    table = subsets.select(pl.col(name).cast(dtype) for name, dtype in COLUMNS.items())
+    table = complete(subsets).select(
+        *(pl.col(name).cast(dtype) for name, dtype in COLUMNS.items()), pl.col("block").cast(pl.Int32)
+    )
     bad = table.filter(
         pl.any_horizontal(pl.exclude("flow").is_null())
         | (pl.col("vehicles") < 0)
@@ -130,10 +101,10 @@ def _check(subsets: pl.DataFrame) -> pl.DataFrame:
             "a subset needs a site, a direction, frames, a flow that is null or not negative, and counts that are not "
             f"negative: got {bad.row(0, named=True)} ({bad.height} such row(s))"
         )
-    twice = table.filter(pl.struct("dataset", "subset").is_duplicated())
+    twice = table.filter(pl.struct("dataset", "subset", "block").is_duplicated())
     if twice.height:
         raise ValueError(f"the subset {twice['dataset'][0]}/{twice['subset'][0]} stands in more than one row")
-    return table.with_columns(pl.col("flow").fill_nan(None)).sort("dataset", "site", "direction", "subset")
+    return table.with_columns(pl.col("flow").fill_nan(None)).sort("dataset", "site", "direction", "subset", "block")
 
 
 def _pose(rows: pl.DataFrame, shares: dict[str, int]) -> Problem:
@@ -180,50 +151,3 @@ def _explain(rows: pl.DataFrame, problem: Problem, part: Indices, shares: dict[s
                 f"+- {TOLERANCE / 1000:.3f}"
             )
     return "; ".join(reasons) or None
-
-
-def _split_rows(rows: pl.DataFrame, split: str) -> pl.DataFrame:
-    """Rows of `splits`: each subset undivided."""
-    return SPLITS.conform(
-        rows.lazy().with_columns(
-            split=pl.lit(split),
-            block=pl.lit(0),
-            first_vehicle_id=pl.lit(None, dtype=pl.Int32),
-            last_vehicle_id=pl.lit(None, dtype=pl.Int32),
-        )
-    ).collect()
-
-
-def _balance_rows(rows: pl.DataFrame, split: str, shares: dict[str, int], reason: str | None) -> pl.DataFrame:
-    """Rows of `split_balance`: one per part, those without subsets included."""
-    total = max(1, int(rows["vehicles"].sum()))
-    balance: list[dict[str, object]] = []
-    for part in shares:
-        members = rows.filter(pl.col("part") == part)
-        mean, std = _moments(members)
-        balance.append(
-            {
-                "split": split,
-                "dataset": rows["dataset"][0],
-                "part": part,
-                "subsets": members.height,
-                "vehicles": members["vehicles"].sum(),
-                "vehicle_share": members["vehicles"].sum() / total,
-                "samples": members["weight"].sum(),
-                "flow_mean": mean,
-                "flow_std": std,
-                "relaxed": reason is not None,
-                "relaxed_reason": reason,
-            }
-        )
-    return pl.DataFrame(balance, schema=SPLIT_BALANCE.dtypes)
-
-
-def _moments(members: pl.DataFrame) -> tuple[float, float] | tuple[None, None]:
-    """Weighted mean and population standard deviation of flow, in two passes (these are the figures published)."""
-    known = members.filter(pl.col("flow").is_not_null())
-    weight, flow = known["weight"].to_numpy().astype(np.float64), known["flow"].to_numpy()
-    if weight.sum() == 0:
-        return None, None
-    mean = float(np.average(flow, weights=weight))
-    return mean, float(np.sqrt(np.average((flow - mean) ** 2, weights=weight)))

@@ -1,0 +1,91 @@
+"""highD's subsets as its metadata describe them, to plan a split before any track has been read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from pipeline.sources.base import RawFile, SourceError
+from pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, RECORDING, VEHICLES, gather_sets, read_metadata
+from pipeline.transforms.split_tables import COLUMNS
+
+
+@dataclass(frozen=True)
+class Announcement:
+    """What metadata say of the subsets.
+
+    Args:
+        subsets: one row per carriageway with vehicles: the columns of `split_tables.COLUMNS`, `recording`, `lanes`
+            and `seconds`. `weight` is the sum of numFrames.
+        refusals: messages about recordings that cannot be planned with.
+    """
+
+    subsets: pl.DataFrame
+    refusals: tuple[str, ...]
+
+
+def announce_subsets(files: Sequence[RawFile]) -> Announcement:
+    """Read recordingMeta and tracksMeta of every recording; tracks are not opened, and need not be there.
+
+    Args:
+        files: recognised as highD's.
+
+    Raises:
+        SourceError: none of them is a recordingMeta or tracksMeta file.
+    """
+    wanted = [file for file in files if file.dialect in (RECORDING, VEHICLES)]
+    if not wanted:
+        raise SourceError(
+            "no metadata of highD there. Expected NN_recordingMeta.csv and NN_tracksMeta.csv with the headers as "
+            f"shipped, got {len(files)} other file(s) of highD. Give the folder with the downloads, unpacked or not."
+        )
+    sets, refusals = gather_sets(wanted, lambda file: file.folder)
+    rows: list[dict[str, object]] = []
+    seen: set[str] = set()
+    for (_, digits), found in sorted(sets, key=lambda each: each[0][::-1]):
+        recording = f"{int(digits):02d}"
+        kinds = {RECORDING: "recordingMeta", VEHICLES: "tracksMeta"}
+        missing = [f"{digits}_{kind}.csv" for dialect, kind in kinds.items() if dialect not in found]
+        there = ", ".join(file.name for file in found.values())
+        if missing:
+            refusals.append(
+                f"recording {recording}: {missing[0]} missing beside {there}. A plan needs both files in one folder; "
+                "put the missing one there and run again."
+            )
+        elif recording in seen:
+            refusals.append(f"recording {recording}: a second set of files ({there}); the first was taken.")
+        else:
+            try:
+                rows += _describe(found, recording)
+                seen.add(recording)
+            except SourceError as damage:
+                refusals.append(str(damage))
+    schema = {**COLUMNS, "recording": pl.String, "lanes": pl.Int64, "seconds": pl.Float64}
+    return Announcement(pl.DataFrame(rows, schema=schema), tuple(refusals))
+
+
+def _describe(files: dict[str, RawFile], recording: str) -> list[dict[str, object]]:
+    """One row per carriageway of a recording."""
+    meta, lanes, vehicles = read_metadata(files, recording)
+    rows: list[dict[str, object]] = []
+    for direction, side in CARRIAGEWAYS.items():
+        own = vehicles.filter(pl.col("drivingDirection") == direction)
+        if own.is_empty():
+            continue
+        rows.append(
+            {
+                "dataset": "highd",
+                "subset": f"{recording}-{side}",
+                "site": f"location-{meta['locationId']}",
+                "direction": side,
+                "vehicles": own.height,
+                "weight": own["numFrames"].cast(pl.Int64).sum(),
+                "flow": own.height / lanes[direction] / meta["duration"],
+                "first_frame": FIRST_FRAME,
+                "last_frame": own["finalFrame"].max() or FIRST_FRAME,
+                "recording": recording,
+                "lanes": lanes[direction],
+                "seconds": meta["duration"],
+            }
+        )
+    return rows

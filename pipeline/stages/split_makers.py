@@ -1,0 +1,138 @@
+"""How each split of `schemas.split_recipes` is made from what is in the lake."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from pipeline.lake import Manifest, scan
+from pipeline.transforms.split_comparisons import divide_by_id, divide_by_recording
+from pipeline.transforms.split_tables import Allocation
+from pipeline.transforms.splits import allocate_flow_balanced
+from pipeline.transforms.time_blocks import (
+    BLOCKS,
+    VISITS,
+    count_samples,
+    cut_blocks,
+    describe_blocks,
+    find_left_out,
+    find_visits,
+)
+from schemas import SAMPLES, SPLIT_LEFT_OUT, TRACKS, VEHICLES
+from schemas.protocols import Protocol
+from schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCED, TIME_BLOCKS, SplitRecipe
+
+
+@dataclass(frozen=True)
+class Material:
+    """What splits are made from.
+
+    Args:
+        root: the lake.
+        manifest: of it.
+        subsets: the freeway subsets that are not excluded: the columns of `split_tables.COLUMNS`, and recording,
+            lanes, frame_rate_hz.
+        protocol: whose samples count.
+    """
+
+    root: Path
+    manifest: Manifest
+    subsets: pl.DataFrame
+    protocol: Protocol
+
+
+@dataclass(frozen=True)
+class Made:
+    """A split.
+
+    Args:
+        allocation: its rows of `splits` and `split_balance`.
+        left_out: its rows of `split_left_out`.
+        flows: dataset, subset, block, flow where blocks have a flow of their own; else None.
+    """
+
+    allocation: Allocation
+    left_out: pl.DataFrame
+    flows: pl.DataFrame | None = None
+
+
+def make_split(recipe: SplitRecipe, material: Material) -> Made:
+    """Make one split of the lake's subsets."""
+    return _MAKERS[recipe.name](recipe, material)
+
+
+def _make_flow_balanced(recipe: SplitRecipe, material: Material) -> Made:
+    allocation = allocate_flow_balanced(
+        material.subsets,
+        split=recipe.name,
+        validation=recipe.validation,
+        seed=recipe.seed,
+        restarts=recipe.restarts,
+    )
+    return Made(allocation, SPLIT_LEFT_OUT.empty())
+
+
+def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
+    blocks = cut_blocks(material.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
+    visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema={**_BLOCK_KEY, "weight": pl.Int64})]
+    for facts in material.subsets.sort("dataset", "subset").iter_rows(named=True):
+        values = {"dataset": facts["dataset"], "subset": facts["subset"]}
+        own = blocks.filter(pl.col("dataset") == facts["dataset"], pl.col("subset") == facts["subset"])
+        tracks = scan(material.root, material.manifest, TRACKS, **values).select("vehicle_id", "frame").collect()
+        visits.append(find_visits(tracks, own))
+        samples = scan(material.root, material.manifest, SAMPLES, **values)
+        stride = facts["frame_rate_hz"] / recipe.rate_hz
+        weights.append(
+            count_samples(
+                samples.filter(pl.col("protocol") == material.protocol.name).select("tick").collect(),
+                own,
+                stride=stride,
+                first_frame=facts["first_frame"],
+                history=round(recipe.history_s * recipe.rate_hz) * stride,
+                future=recipe.min_future_ticks * stride,
+            )
+        )
+    units = describe_blocks(blocks, material.subsets, pl.concat(visits), pl.concat(weights))
+    allocation = allocate_flow_balanced(
+        units, split=recipe.name, validation=recipe.validation, seed=recipe.seed, restarts=recipe.restarts
+    )
+    left_out = find_left_out(pl.concat(visits), allocation.splits)
+    return Made(allocation, left_out, units.select("dataset", "subset", "block", "flow"))
+
+
+_BLOCK_KEY = {name: BLOCKS[name] for name in ("dataset", "subset", "block")}
+
+
+def _make_csp(recipe: SplitRecipe, material: Material) -> Made:
+    kept = (
+        scan(material.root, material.manifest, SAMPLES)
+        .filter(pl.col("protocol") == material.protocol.name)
+        .group_by("dataset", "subset", "vehicle_id")
+        .agg(weight=pl.len().cast(pl.Int64))
+    )
+    vehicles = (
+        scan(material.root, material.manifest, VEHICLES)
+        .select("dataset", "subset", "vehicle_id")
+        .join(material.subsets.lazy().select("dataset", "subset"), on=["dataset", "subset"], how="semi")
+        .join(kept, on=["dataset", "subset", "vehicle_id"], how="left")
+        .with_columns(pl.col("weight").fill_null(0))
+        .collect()
+        .sort("dataset", "subset", "vehicle_id")
+    )
+    return Made(divide_by_id(material.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
+
+
+def _make_by_recording(recipe: SplitRecipe, material: Material) -> Made:
+    allocation = divide_by_recording(
+        material.subsets, split=recipe.name, validation=recipe.validation, seed=recipe.seed
+    )
+    return Made(allocation, SPLIT_LEFT_OUT.empty())
+
+
+_MAKERS: dict[str, Callable[[SplitRecipe, Material], Made]] = {
+    FLOW_BALANCED: _make_flow_balanced,
+    TIME_BLOCKS: _make_time_blocks,
+    CSP_2018: _make_csp,
+    BY_RECORDING: _make_by_recording,
+}

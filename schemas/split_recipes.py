@@ -1,0 +1,77 @@
+"""Recipes of splits: what each is made by, every parameter of it, and a hash of them all."""
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Literal, get_args
+
+SplitName = Literal["flow-balanced", "time-blocks", "csp-2018", "by-recording-random"]
+SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)
+FLOW_BALANCED, TIME_BLOCKS, CSP_2018, BY_RECORDING = SPLIT_NAMES
+
+MEANINGS: Mapping[str, str] = {
+    FLOW_BALANCED: "whole carriageways, chosen so that flow is distributed alike in all parts",
+    TIME_BLOCKS: "stretches of time of a carriageway with a purge between them, allocated by the rule of flow-balanced",
+    CSP_2018: "every carriageway cut at 70 and 80 % of its highest vehicle id, as conv-social-pooling's code does; for "
+    "comparison with published tables only",
+    BY_RECORDING: "whole recordings drawn at random; for comparison",
+}
+
+LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
+"""Splits that claim that nothing of one part is reachable from another."""
+
+
+@dataclass(frozen=True)
+class SplitRecipe:
+    """What a split is made by.
+
+    Args:
+        name: of SPLIT_NAMES.
+        validation: whether there is a part `val`; csp-2018 has one whatever this says.
+        seed: of all that is random.
+        restarts: of the search.
+        block_s: length of a block of time.
+        purge_s: time between two blocks that belongs to none.
+        rate_hz: of the samples' clock.
+        history_s: what a sample needs before it, within its block.
+        horizon_s: how far it looks ahead.
+        min_future_s: what it needs after it, within its block.
+    """
+
+    name: SplitName
+    validation: bool = False
+    seed: int = 0
+    restarts: int = 200
+    block_s: float = 120.0
+    purge_s: float = 8.0
+    rate_hz: int = 5
+    history_s: float = 3.0
+    horizon_s: float = 5.0
+    min_future_s: float = 0.2
+
+    @property
+    def claims_no_leakage(self) -> bool:
+        """Whether the run fails where parts share anything."""
+        return self.name in LEAKAGE_FREE
+
+    @property
+    def window_s(self) -> float:
+        """History and future: two samples farther apart in time have no moment in common."""
+        return self.history_s + self.horizon_s
+
+    @property
+    def min_future_ticks(self) -> int:
+        """Positions after the sample that must exist, as `Protocol.min_future_ticks`."""
+        return max(1, math.ceil(self.min_future_s * self.rate_hz - 1e-9))
+
+    @property
+    def parameters(self) -> str:
+        """Every parameter, as JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @property
+    def digest(self) -> str:
+        """First 12 hex digits of the sha256 of every parameter."""
+        return hashlib.sha256(self.parameters.encode()).hexdigest()[:12]

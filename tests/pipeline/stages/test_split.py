@@ -1,0 +1,214 @@
+"""The split stage over a small lake, with every recipe; a leak planted in it stops the stage."""
+
+import itertools
+from dataclasses import replace
+
+import polars as pl
+import pytest
+
+from pipeline.lake import Entry, connect, load, open_for_writing, write_table
+from pipeline.settings import Settings
+from pipeline.stages import split
+from pipeline.stages.base import Job, StageError
+from schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
+from schemas.split_recipes import SPLIT_NAMES, SplitRecipe
+
+SECONDS, RATE_HZ, ON_ROAD_S = 60, 5, 4
+"""Each vehicle is on the road for so long, and a new one comes every second."""
+
+
+def fill(table, rows):
+    frame = pl.DataFrame([{**dict.fromkeys(table.dtypes), **row} for row in rows], schema=table.dtypes)
+    return frame.sort(table.key)
+
+
+def put_recording(root, number):
+    """Two carriageways; frames count from 1, at 5 Hz, so that a tick is a frame. Neighbors: who comes next."""
+    for side in ("upper", "lower"):
+        where = {"dataset": "highd", "subset": f"{number}-{side}"}
+        tracks, vehicles, samples, neighbors = [], [], [], []
+        for vehicle in range(1, SECONDS - ON_ROAD_S + 1):
+            first = 1 + (vehicle - 1) * RATE_HZ
+            last = first + ON_ROAD_S * RATE_HZ - 1
+            vehicles.append({**where, "vehicle_id": vehicle, "source_vehicle_id": vehicle, "class": "car",
+                             "length_m": 4.0, "width_m": 2.0, "first_frame": first, "last_frame": last,
+                             "entries": last - first + 1, "start_x_m": 0.0, "end_x_m": 100.0, "start_lane": 1,
+                             "lane_changes": 0, "mean_speed_mps": 25.0})  # fmt: skip
+            for frame in range(first, last + 1):
+                tracks.append({**where, "vehicle_id": vehicle, "frame": frame, "time_s": (frame - 1) / RATE_HZ,
+                               "x_m": 5.0 * (frame - first), "y_m": 2.0, "lane": 1,
+                               "speed_mps": 20.0 + vehicle % 7})  # fmt: skip
+                if frame - first >= 15 and frame < last:
+                    at = {**where, "protocol": "csp", "vehicle_id": vehicle, "tick": frame - 1}
+                    samples.append({**at, "frame": frame, "lane": 1, "lateral_maneuver": "keep",
+                                    "longitudinal_maneuver": "normal"})  # fmt: skip
+                    if vehicle < SECONDS - ON_ROAD_S:
+                        neighbors.append({**at, "cell": 19, "neighbor_id": vehicle + 1, "dx_m": 25.0})
+        facts = {**where, "recording": number, "site": "1", "direction": side, "freeway": True, "frame_rate_hz": 5.0,
+                 "lanes": 2, "seconds": float(SECONDS), "first_frame": 1, "last_frame": SECONDS * RATE_HZ,
+                 "vehicles": len(vehicles), "entries": len(tracks), "flow": len(vehicles) / 2 / SECONDS, "ids_split": 0,
+                 "on_ramp_lanes": [], "columns_missing": [],
+                 "source_files": [{"file": "x", "sha256": "0"}]}  # fmt: skip
+        status = {**where, "backward_vehicles": 0, "excluded": (number, side) == ("02", "upper")}
+        tables = ((TRACKS, tracks), (VEHICLES, vehicles), (SAMPLES, samples), (NEIGHBORS, neighbors),
+                  (SUBSETS, [facts]), (SUBSET_STATUS, [status]))  # fmt: skip
+        with open_for_writing(root) as writer:
+            for table, rows in tables:
+                files = write_table(root, table, fill(table, rows), where, "0" * 16, where="test")
+                writer.commit(Entry(f"{table.name}/highd/{where['subset']}", "0" * 16, {table.name: files}, info={}))
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("splits") / "lake"
+    for number in ("01", "02"):
+        put_recording(folder, number)
+    return folder
+
+
+SETTINGS = Settings(split_block_s=10)
+JOB = Job("split", "1" * 16)
+
+
+@pytest.fixture(scope="module")
+def ask(root):
+    entry = split.build(root, JOB, SETTINGS)
+    with open_for_writing(root) as writer:
+        writer.commit(entry)
+    with connect(root) as connection:
+        yield lambda query: connection.sql(query).fetchall()
+
+
+def test_every_split_is_there_by_name_with_its_parameters(ask):
+    recipes = {recipe.name: recipe for recipe in SETTINGS.get_split_recipes()}
+    assert {row[0] for row in ask("SELECT DISTINCT split FROM splits")} == set(SPLIT_NAMES) == set(recipes)
+    told = ask("SELECT split, digest, parameters, trains, claims_no_leakage, window_s FROM split_recipes")
+    for name, digest, parameters, trains, claims, window_s in told:
+        assert (digest, parameters) == (recipes[name].digest, recipes[name].parameters)
+        assert (trains, claims, window_s) == (name == "flow-balanced", name != "csp-2018", 8.0)
+    assert len({digest for _, digest, *_ in told}) == 4
+
+
+def test_excluded_subsets_stand_in_no_split(ask):
+    for (name,) in ask("SELECT DISTINCT split FROM splits"):
+        found = {row[0] for row in ask(f"SELECT DISTINCT subset FROM splits WHERE split = '{name}'")}
+        assert found == {"01-upper", "01-lower", "02-lower"}, name
+
+
+def test_shares_add_up_in_every_split(ask):
+    rows = ask("SELECT split, sum(vehicle_share), sum(samples) FROM split_balance GROUP BY split ORDER BY split")
+    assert [row[0] for row in rows] == sorted(SPLIT_NAMES)
+    for name, share, samples in rows:
+        assert share == pytest.approx(1.0)
+        # Four samples of each of 56 vehicles in three subsets; blocks lose those whose history they cut.
+        assert samples == 4 * 56 * 3 or (name == "time-blocks" and 0 < samples < 4 * 56 * 3)
+
+
+def test_time_blocks_are_apart_and_share_nothing(ask):
+    rows = ask("SELECT subset, block, first_frame, last_frame FROM splits WHERE split = 'time-blocks' ORDER BY ALL")
+    for one, other in itertools.pairwise(rows):
+        assert one[0] != other[0] or other[2] - one[3] == 8 * RATE_HZ + 1
+    assert len(rows) == 3 * 4
+    (measured,) = ask("SELECT vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
+                      "FROM split_leakage WHERE split = 'time-blocks'")  # fmt: skip
+    assert measured[:4] == (0, 0, 0, 0)
+    assert measured[4] is None or measured[4] >= 8
+    # A vehicle stays for 4 s, half as long as a purge: none is in two parts.
+    assert ask("SELECT count(*) FROM split_left_out") == [(0,)]
+
+
+def test_csp_2018_shares_the_frames_at_its_cuts(ask):
+    """Ids in order of appearance: the 39th of 56 still trains, the 45th is the last in val; each stays for 20 frames.
+
+    The next one comes 5 frames later.
+    """
+    rows = ask("SELECT part, first_vehicle_id, last_vehicle_id FROM splits WHERE split = 'csp-2018'"
+               " AND subset = '01-lower'"
+               " ORDER BY block")  # fmt: skip
+    assert rows == [("train", 1, 39), ("val", 40, 45), ("eval", 46, 56)]
+    found = ask("SELECT part, other_part, vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
+                "FROM split_leakage WHERE split = 'csp-2018' ORDER BY ALL")  # fmt: skip
+    # Train ends with 39 at frame 210, eval begins with 46 at 226, 16 frames later. Val's 40 begins at 196.
+    # A sample's neighbor comes next: that of 39 is in val, that of 45 in eval, four samples each.
+    assert found == [
+        ("train", "eval", 0, 0, 0, 0, 16 / 5),
+        ("train", "val", 0, 15 * 3, 0, 4 * 3, 0.0),
+        ("val", "eval", 0, 15 * 3, 0, 4 * 3, 0.0),
+    ]
+
+
+def test_notes_say_what_leaks_and_what_is_relaxed(root):
+    notes = split.build(root, JOB, SETTINGS).info["notes"]
+    # In three subsets each: frames 196 to 240 of 40 to 45, and 226 to 295 of 46 to 56; four samples of each but 56,
+    # whom nobody follows.
+    assert notes[-1] == (
+        "split csp-2018, made for comparison, leaks: highd: train has 45 of val's 135 frames (12 of its 72 neighbors "
+        "are cut off) and 0 of eval's 210 frames (0 of its 120 neighbors are cut off)"
+    )
+    assert not any("time-blocks, made" in note or "flow-balanced, made" in note for note in notes)
+
+
+def plant(monkeypatch, change):
+    """Let the splits come out of their makers changed."""
+    real = split.make_split
+
+    def make(recipe, material):
+        made = real(recipe, material)
+        return replace(made, allocation=replace(made.allocation, splits=change(made.allocation.splits)))
+
+    monkeypatch.setattr(split, "make_split", make)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        # A subset of train stands in eval as well.
+        ("flow-balanced", lambda rows: pl.concat([rows.head(1).with_columns(block=pl.lit(1, pl.Int32), part=pl.lit(p))
+                                                  for p in ("train", "eval")] + [rows.tail(-1)]), "56 vehicles"),
+        # The purges are gone: what follows a block of another part begins right behind it.
+        ("time-blocks", lambda rows: rows.with_columns(
+            first_frame=pl.when(pl.col("block") > 0).then(pl.col("first_frame") - 40).otherwise(pl.col("first_frame")),
+            part=pl.when(pl.col("block") == 1).then(pl.lit("eval")).otherwise(pl.lit("train"))), "entries 0.2 s apart"),
+        # A subset of eval trains as well, in its last 100 frames.
+        ("by-recording-random", lambda rows: pl.concat([rows, rows.filter(part="eval").head(1).with_columns(
+            block=pl.lit(1, pl.Int32), first_frame=pl.lit(201, pl.Int32), part=pl.lit("train"))]), "frames"),
+    ],
+)  # fmt: skip
+def test_a_planted_leak_stops_the_stage(monkeypatch, root, name, change, told):
+    plant(monkeypatch, change)
+    before = load(root).entries.keys()
+    with pytest.raises(StageError, match=f"split {name} claims that its parts share nothing, but highd: .*{told}"):
+        split.build(root, JOB, Settings(split=name, splits=[name], split_block_s=10))
+    assert load(root).entries.keys() == before
+
+
+def test_a_split_that_claims_nothing_may_leak(monkeypatch, root):
+    again = {"block": pl.lit(9, pl.Int32), "part": pl.lit("eval")}
+    plant(monkeypatch, lambda rows: pl.concat([rows, rows.head(1).with_columns(**again)]))
+    entry = split.build(root, JOB, Settings(split="csp-2018", splits=["csp-2018"]))
+    assert "csp-2018, made for comparison, leaks: highd: train has 45" in entry.info["notes"][-1]
+    assert entry.files["split_leakage"][0].rows == 3
+
+
+def test_settings_name_the_splits_that_are_made():
+    assert [recipe.name for recipe in Settings().get_split_recipes()] == list(SPLIT_NAMES)
+    chosen = Settings(split="time-blocks", splits=["csp-2018", "time-blocks"], split_seed=3, validation_part=True)
+    assert chosen.get_protocol().split == "time-blocks"
+    assert chosen.get_split_recipes() == [
+        SplitRecipe("time-blocks", validation=True, seed=3),
+        SplitRecipe("csp-2018", validation=True, seed=3),
+    ]
+    assert chosen.get_protocol().sampling_digest == Settings().get_protocol().sampling_digest
+    assert chosen.get_protocol().digest != Settings().get_protocol().digest
+    with pytest.raises(ValueError, match="expected 'flow-balanced' among them"):
+        Settings(splits=["csp-2018"])
+    with pytest.raises(ValueError, match="expected 8 or more, history and future"):
+        Settings(split_purge_s=7.9)
+
+
+def test_the_digest_covers_every_parameter():
+    plain = SplitRecipe("time-blocks")
+    changed = [replace(plain, **{name: value}) for name, value in
+               {"name": "csp-2018", "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0,
+                "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}.items()]  # fmt: skip
+    assert len({plain.digest, *(recipe.digest for recipe in changed)}) == 1 + len(SplitRecipe.__dataclass_fields__)
