@@ -42,6 +42,7 @@ bench: install
 
 docs: install
 	$(BIN)/python -m schemas.markdown > docs/tables.md
+	$(BIN)/python -m schemas.tensors_markdown > docs/tensors.md
 	$(BIN)/python -m quality_reports.markdown > docs/rules.md
 
 clean:

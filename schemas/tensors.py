@@ -1,45 +1,137 @@
-"""The files under `tensors/<split>/<fingerprint>/`: flat arrays and an index of samples, declared once."""
+"""The files under `tensors/<split>/<fingerprint>/`: flat arrays and an index of samples, declared once.
+
+Two files. `arrays.safetensors` holds every array of ARRAYS in the safetensors layout: the header's length (8 bytes,
+little-endian), the header (JSON: dtype, shape and place of each array), then the arrays one after the other, so that
+any reader of that format can open it, memory-mapped. `index.json` says what they are: INDEX_KEYS.
+"""
 
 from dataclasses import dataclass
+
+ARRAYS_FILE = "arrays.safetensors"
+INDEX_FILE = "index.json"
+
+TENSORS_VERSION = 2
+"""Counts changes of the two files that older readers cannot read."""
+
+POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
+
+STORAGE = """\
+How positions are stored. As int16 they are whole steps from the subset's centre (the median of each axis): along the
+road decimetres or centimetres (these reach 327 m either way: longer roads are refused), across it millimetres."""
+
+STEPS_M = {"int16-decimetres": (0.1, 0.001), "int16-centimetres": (0.01, 0.001)}
+"""Of int16 positions: metres per step along and across the road."""
+
+SAFETENSORS_DTYPES = {
+    "float32": "F32",
+    "int64": "I64",
+    "int32": "I32",
+    "int16": "I16",
+    "int8": "I8",
+    "uint8": "U8",
+}
+"""What the format calls NumPy's dtypes, of those used here."""
 
 
 @dataclass(frozen=True)
 class Array:
-    """One `.npy` file of a tensor folder.
+    """One array of a tensor folder.
 
     Args:
-        name: the file is `<name>.npy`.
-        dtype: NumPy's name of it.
-        shape: letters: N entries on the clock, S samples, K (sample, neighbor) pairs.
+        name: its key in the file.
+        dtype: NumPy's name of it; `position` = float32 or int16, as the index's `storage` says.
+        shape: a letter for each axis, or a number: N rows (entries on the clock), R runs, S samples, K (sample,
+            neighbor) pairs, C scenes, M vehicles in scenes. `S+1` is one more.
         meaning: unit, order and sign included.
+        counts: the letter of what its values number: they shift when subsets are joined.
     """
 
     name: str
     dtype: str
-    shape: str
+    shape: tuple[str, ...]
     meaning: str
+    counts: str = ""
+
+    def sizes(self, letters: dict[str, int]) -> tuple[int, ...]:
+        """The shape in numbers."""
+        axes = (axis.partition("+") for axis in self.shape)
+        return tuple(letters[name] + int(more or 0) if name.isalpha() else int(name) for name, _, more in axes)
+
+    def stored_as(self, storage: str) -> str:
+        """NumPy's name of the dtype under one of POSITION_STORAGES."""
+        return self.dtype if self.dtype != "position" else storage.partition("-")[0]
 
 
+# Wider elements first: each array then begins at a multiple of its element's size, as memory-mapping wants it.
 ARRAYS = (
-    Array("x_m", "float32", "N", "front centre along the direction of travel, m"),
-    Array("y_m", "float32", "N", "front centre from the carriageway's left edge, positive to the right, m"),
-    Array("speed_mps", "float32", "N", "recorded speed along the direction of travel, m/s"),
-    Array("lane", "int16", "N", "1 is the driver's leftmost; 0 where the source has none"),
-    Array("subset", "int32", "N", "position in index.json's `subsets`"),
-    Array("vehicle_id", "int32", "N", "unique within the subset"),
-    Array("tick", "int32", "N", "time_s = tick / rate_hz"),
-    Array("segment_first", "int64", "N", "first row of the gap-free run of ticks that the row stands in"),
-    Array("segment_last", "int64", "N", "last row of the gap-free run of ticks that the row stands in"),
-    Array("sample_row", "int64", "S", "the row of each sample's origin, increasing"),
-    Array("sample_part", "uint8", "S", "position in schemas.columns.PARTS"),
-    Array("sample_lateral", "uint8", "S", "position in schemas.columns.LATERAL_MANEUVERS"),
-    Array("sample_longitudinal", "uint8", "S", "position in schemas.columns.LONGITUDINAL_MANEUVERS"),
-    Array("neighbor_offset", "int64", "S+1", "pairs of sample s are [neighbor_offset[s], neighbor_offset[s + 1])"),
-    Array("neighbor_row", "int64", "K", "the neighbor's row at the sample's tick"),
-    Array("neighbor_cell", "int8", "K", "13 * column + row of the 13 x 3 grid"),
+    Array("run_first_row", "int64", ("R+1",), "rows of run r are [run_first_row[r], run_first_row[r + 1])", "N"),
+    Array(
+        "neighbor_offset", "int64", ("S+1",), "pairs of sample s are [neighbor_offset[s], neighbor_offset[s + 1])", "K"
+    ),
+    Array("scene_offset", "int64", ("C+1",), "vehicles of scene c are [scene_offset[c], scene_offset[c + 1])", "M"),
+    Array("speed_mps", "float32", ("N",), "recorded speed along the direction of travel, m/s"),
+    Array("run_vehicle_id", "int32", ("R",), "unique within the subset"),
+    Array("run_first_tick", "int32", ("R",), "tick of the run's first row; time_s = tick / rate_hz"),
+    Array("run_subset", "int32", ("R",), "position in the index's `subsets`"),
+    Array("sample_row", "int32", ("S",), "the row of each sample's origin, increasing", "N"),
+    Array("neighbor_row", "int32", ("K",), "the neighbor's row at the sample's tick", "N"),
+    Array("scene_row", "int32", ("M",), "the vehicle's row at the scene's tick, increasing within a scene", "N"),
+    Array(
+        "scene_sample", "int32", ("M",), "the number of the sample that the vehicle is there; -1 where it is none", "S"
+    ),
+    Array(
+        "position_m",
+        "position",
+        ("N", "2"),
+        "front centre: along the direction of travel, and from the carriageway's left edge, positive to the right; m "
+        "(int16: steps of STEPS_M from the subset's `centre_m`)",
+    ),
+    Array("lane", "int16", ("N",), "1 is the driver's leftmost; 0 where the source has none"),
+    Array("sample_part", "uint8", ("S",), "position in schemas.columns.PARTS"),
+    Array("sample_lateral", "uint8", ("S",), "position in schemas.columns.LATERAL_MANEUVERS"),
+    Array("sample_longitudinal", "uint8", ("S",), "position in schemas.columns.LONGITUDINAL_MANEUVERS"),
+    Array("sample_future", "uint8", ("S",), "ticks of the future that are known, 1 to F"),
+    Array("neighbor_cell", "int8", ("K",), "13 * column + row of the 13 x 3 grid, increasing within a sample"),
+    Array(
+        "neighbor_known", "uint8", ("K",), "ticks of the neighbor's history that are known, its last included: 1 to H"
+    ),
+    Array("scene_part", "uint8", ("C",), "position in schemas.columns.PARTS"),
 )
-"""Rows are sorted by (subset, vehicle_id, tick). Beside them stands `index.json`: version, split, protocol (its
-parameters and digest), subsets (dataset, subset, frame_rate_hz), blocks (the split's rows), the sizes N, S, K, and
-samples_by_part."""
 
-TENSORS_VERSION = 1
+ORDER = """\
+A run is a gap-free stretch of one vehicle's ticks inside one block of the split; rows are sorted by (subset,
+vehicle_id, tick), runs stand in that order and one after the other. Pairs are sorted by (sample, cell). A scene is
+every vehicle of one (subset, block, tick) at which one of them at least is a sample; scenes are sorted by those three.
+"""
+
+MOST_TICKS = 255
+"""H and F are at most this: known ticks are stored in a byte."""
+
+INDEX_KEYS = (
+    "version",
+    "split",
+    "protocol",
+    "storage",
+    "max_error_m",
+    "rms_error_m",
+    "subsets",
+    "blocks",
+    "sizes",
+    "samples_by_part",
+)
+
+INDEX_MEANING = """\
+What `index.json` holds: the version; the split's name; the protocol's parameters and digest; how positions are stored;
+the greatest and the root-mean-square rounding error of positions in m, along and across the road, as measured on
+writing; the subsets in their order, each with the keys below; the split's rows; the sizes by letter; and the number of
+samples in each part."""
+
+SUBSET_KEYS = ("dataset", "subset", "frame_rate_hz", "centre_m", "lane_markings_m", "last_lane", "width_m")
+
+SUBSET_MEANING = """\
+Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,
+null where unknown; last_lane, the rightmost lane (by the markings, else the highest that any entry has); width_m of the
+carriageway (the last marking, else 12 ft a lane)."""
+
+NOMINAL_LANE_M = 3.6576
+"""12 ft: taken for a lane's width where no markings are known, and only to mirror positions."""

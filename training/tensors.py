@@ -1,8 +1,8 @@
 """Tensor folders: opened memory-mapped, checked against their declaration, gathered in batches by indexing."""
 
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,54 +11,16 @@ import numpy.typing as npt
 
 from schemas.columns import PARTS
 from schemas.protocols import Protocol
-from schemas.tensors import ARRAYS, TENSORS_VERSION
+from schemas.tensors import STEPS_M
+from training.batches import Batch, Bytes, Floats, Integers, SceneBatch
+from training.drawing import draw_numbers
+from training.opening import TensorError, map_arrays, read_index, read_protocol
+from training.scenes import Lanes, find_lanes, gather_scenes
+from training.windows import Masks, Windows, check_numbers, place, spread, subtract
 
-Floats = npt.NDArray[np.float32]
-Integers = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+__all__ = ["Batch", "SceneBatch", "TensorError", "TensorFolder"]
 
-
-class TensorError(ValueError):
-    """A tensor folder is absent, unfinished or not what its index says."""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Samples as arrays. B samples, K neighbors of all of them together, H ticks of history, F of future.
-
-    Positions are in m, float32, and relative to the sample's last known position (that at its own tick):
-    `[..., 0]` along the direction of travel (x_m), `[..., 1]` across it, positive to the driver's right (y_m).
-
-    Args:
-        sample: (B,) which samples of the folder these are.
-        history: (B, H, 2) the sample's own positions; the last one is (0, 0).
-        future: (B, F, 2) its positions at 1, 2, ... ticks; where masked, its last known future position again.
-        future_mask: (B, F) True where the position is known.
-        neighbor_history: (K, H, 2) relative to the SAMPLE's last position; where masked (the neighbor's track began
-            later), its earliest known position again.
-        neighbor_mask: (K, H) True where the position is known; the last one always is.
-        neighbor_sample: (K,) position in the batch, 0 to B - 1, increasing.
-        neighbor_cell: (K,) cell 0 to 38 of the grid, increasing within a sample.
-        lateral: (B,) the maneuver's position in `schemas.columns.LATERAL_MANEUVERS`.
-        longitudinal: (B,) likewise in `LONGITUDINAL_MANEUVERS`.
-        origin: (B, 2) the sample's last position on the carriageway; adding it makes positions absolute.
-    """
-
-    sample: Integers
-    history: Floats
-    future: Floats
-    future_mask: Flags
-    neighbor_history: Floats
-    neighbor_mask: Flags
-    neighbor_sample: Integers
-    neighbor_cell: npt.NDArray[np.int8]
-    lateral: npt.NDArray[np.uint8]
-    longitudinal: npt.NDArray[np.uint8]
-    origin: Floats
-
-    def __len__(self) -> int:
-        """B."""
-        return len(self.sample)
+Int32s = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -68,40 +30,78 @@ class TensorFolder:
     Args:
         path: the folder.
         index: what `index.json` holds.
-        protocol: whose samples these are.
+        protocol: whose samples these are; gives H and F.
     """
 
     path: Path
     index: dict[str, Any]
     protocol: Protocol
-    x_m: Floats
-    y_m: Floats
-    segment_first: Integers
-    segment_last: Integers
-    sample_row: Integers
-    sample_part: npt.NDArray[np.uint8]
-    sample_lateral: npt.NDArray[np.uint8]
-    sample_longitudinal: npt.NDArray[np.uint8]
+    run_first_row: Integers
     neighbor_offset: Integers
-    neighbor_row: Integers
+    scene_offset: Integers
+    speed_mps: Floats
+    run_vehicle_id: Int32s
+    run_first_tick: Int32s
+    run_subset: Int32s
+    sample_row: Int32s
+    neighbor_row: Int32s
+    scene_row: Int32s
+    scene_sample: Int32s
+    position_m: npt.NDArray[Any]
+    lane: npt.NDArray[np.int16]
+    sample_part: Bytes
+    sample_lateral: Bytes
+    sample_longitudinal: Bytes
+    sample_future: Bytes
     neighbor_cell: npt.NDArray[np.int8]
-    subset: npt.NDArray[np.int32]
+    neighbor_known: Bytes
+    scene_part: Bytes
 
     @classmethod
     def open(cls, path: Path) -> Self:
         """Map a folder that the pipeline's tensors stage wrote.
 
         Raises:
-            TensorError: the folder or its index is absent, of another version or unreadable; or an array is absent or
-                not of the dtype and size declared.
+            TensorError: the folder, its index or its arrays are absent, of another version, unreadable or cut short;
+                or an array is not of the dtype and shape declared.
         """
-        index = _read_index(path)
-        protocol = _read_protocol(path, index)
-        arrays = {array.name: _map_array(path, array.name, array.dtype, array.shape, index) for array in ARRAYS}
-        wanted = {field.name for field in fields(cls)}
-        return cls(
-            path=path, index=index, protocol=protocol, **{name: arrays[name] for name in arrays if name in wanted}
-        )
+        index = read_index(path)
+        return cls(path=path, index=index, protocol=read_protocol(path, index), **map_arrays(path, index))
+
+    @cached_property
+    def step_m(self) -> tuple[float, float] | None:
+        """Metres per step of int16 positions, along and across the road; None where they are float32."""
+        return STEPS_M.get(self.index["storage"])
+
+    @cached_property
+    def centre_m(self) -> npt.NDArray[np.float64]:
+        """(subsets, 2) what int16 positions count from."""
+        return np.array([subset["centre_m"] for subset in self.index["subsets"]], dtype=np.float64).reshape(-1, 2)
+
+    @cached_property
+    def lanes(self) -> Lanes:
+        """Where the lanes of each subset lie."""
+        return find_lanes(self.index["subsets"])
+
+    @cached_property
+    def histories(self) -> Windows:
+        """Every run of H positions."""
+        return Windows(self.position_m, self.protocol.history_ticks)
+
+    @cached_property
+    def futures(self) -> Windows:
+        """Every run of F positions."""
+        return Windows(self.position_m, self.protocol.horizon_ticks)
+
+    @cached_property
+    def history_masks(self) -> Masks:
+        """The last ticks of H are known."""
+        return Masks(self.protocol.history_ticks, from_end=True)
+
+    @cached_property
+    def future_masks(self) -> Masks:
+        """The first ticks of F are known."""
+        return Masks(self.protocol.horizon_ticks, from_end=False)
 
     @property
     def split(self) -> str:
@@ -114,126 +114,130 @@ class TensorFolder:
         Raises:
             ValueError: no such part.
         """
-        if part not in PARTS:
-            raise ValueError(f"unknown part `{part}`: expected one of {', '.join(PARTS)}")
-        return np.flatnonzero(self.sample_part == PARTS.index(part)).astype(np.int64)
+        return np.flatnonzero(self.sample_part == find_part(part)).astype(np.int64)
+
+    def scenes_of(self, part: str) -> Integers:
+        """(C_part,) numbers of the scenes of one part, increasing.
+
+        Raises:
+            ValueError: no such part.
+        """
+        return np.flatnonzero(self.scene_part == find_part(part)).astype(np.int64)
+
+    def runs_of(self, row: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
+        """The run that each row stands in."""
+        return np.searchsorted(self.run_first_row, row, side="right") - 1
+
+    def subset_of(self, samples: npt.ArrayLike) -> Int32s:
+        """(B,) position of each sample's subset in the index's `subsets`."""
+        return self.run_subset[self.runs_of(self.sample_row[np.asarray(samples, dtype=np.intp)])]
 
     def subsets_of(self, part: str) -> set[str]:
         """Subsets (`dataset/subset`) that have samples in a part."""
-        present = np.unique(self.subset[self.sample_row[self.samples_of(part)]])
+        present = np.unique(self.subset_of(self.samples_of(part)))
         return {f"{named['dataset']}/{named['subset']}" for named in (self.index["subsets"][i] for i in present)}
 
-    def batches(self, part: str, batch_size: int, *, shuffle_seed: int | None = None) -> Iterator[Batch]:
+    def batches(
+        self,
+        part: str,
+        batch_size: int,
+        *,
+        shuffle_seed: int | None = None,
+        shuffle_block: int | None = None,
+        absolute: bool = False,
+    ) -> Iterator[Batch]:
         """Every sample of a part once; the last batch may be smaller.
 
         Args:
             part: train, val or eval.
             batch_size: B.
             shuffle_seed: draws the order; None = the samples' own.
+            shuffle_block: shuffle within blocks of so many samples, see `training.drawing.draw_numbers`.
+            absolute: see `Batch`.
         """
-        samples = self.samples_of(part)
-        if shuffle_seed is not None:
-            samples = np.random.default_rng(shuffle_seed).permutation(samples)
-        for start in range(0, len(samples), batch_size):
-            yield self.gather(samples[start : start + batch_size])
+        order = {"shuffle_seed": shuffle_seed, "shuffle_block": shuffle_block}
+        for samples in draw_numbers(self.sample_part, find_part(part), batch_size, **order):
+            yield self.gather(samples, absolute=absolute)
 
-    def gather(self, samples: npt.ArrayLike) -> Batch:
-        """Read samples by their numbers (B,), in any order; no sample is looked at by itself."""
-        sample = np.asarray(samples, dtype=np.int64)
-        row = self.sample_row[sample]
-        x_m, y_m = self.x_m[row], self.y_m[row]
+    def scene_batches(
+        self,
+        part: str,
+        batch_size: int,
+        *,
+        shuffle_seed: int | None = None,
+        shuffle_block: int | None = None,
+        absolute: bool = False,
+    ) -> Iterator[SceneBatch]:
+        """Every scene of a part once, `batch_size` at a time; otherwise as `batches`."""
+        order = {"shuffle_seed": shuffle_seed, "shuffle_block": shuffle_block}
+        for scenes in draw_numbers(self.scene_part, find_part(part), batch_size, **order):
+            yield self.gather_scenes(scenes, absolute=absolute)
 
-        # A sample's history is gap-free by definition; its future ends with the run of rows it stands in.
-        history_rows = row[:, None] + np.arange(1 - self.protocol.history_ticks, 1)
-        last_row = self.segment_last[row][:, None]
-        future_rows = row[:, None] + np.arange(1, self.protocol.horizon_ticks + 1)
-        future_mask = future_rows <= last_row
+    def gather(self, samples: npt.ArrayLike, *, absolute: bool = False) -> Batch:
+        """Read samples by their numbers (B,), in any order; no sample is looked at by itself.
 
-        pair_first = self.neighbor_offset[sample]
-        pairs = self.neighbor_offset[sample + 1] - pair_first
-        neighbor_sample = np.repeat(np.arange(len(sample)), pairs)
-        pair = np.arange(len(neighbor_sample)) + np.repeat(pair_first - (np.cumsum(pairs) - pairs), pairs)
-        neighbor_row = self.neighbor_row[pair]
-        neighbor_rows = neighbor_row[:, None] + np.arange(1 - self.protocol.history_ticks, 1)
-        first_row = self.segment_first[neighbor_row][:, None]
-        neighbor_mask = neighbor_rows >= first_row
+        Raises:
+            IndexError: a number below 0, or not below S.
+        """
+        sample = check_numbers(samples, len(self.sample_row), "sample")
+        row = self.sample_row[sample].astype(np.intp)
+        future_known = self.sample_future[sample]
+        pair, neighbor_sample = spread(self.neighbor_offset, sample)
+        neighbor_row = self.neighbor_row[pair].astype(np.intp)
+        neighbor_known = self.neighbor_known[pair]
 
+        back, ahead = self.protocol.history_ticks - 1, self.protocol.horizon_ticks
+        whole = np.zeros(len(row), dtype=np.bool_)  # a sample's history is complete by definition
+        history = self.histories.take(row - back, row, row, whole)
+        future = self.futures.take(row + 1, row, row + future_known, future_known < ahead)
+        neighbor_history = self.histories.take(
+            neighbor_row - back, neighbor_row + 1 - neighbor_known, neighbor_row, neighbor_known <= back
+        )
+        origin = self.position_m[row]
+        centre = self.centre_m[self.subset_of(sample)] if self.step_m is not None else self.centre_m[:0]
+        if absolute:
+            around = centre[neighbor_sample] if self.step_m is not None else centre
+            history, future, neighbor_history = (
+                place(history, centre, self.step_m),
+                place(future, centre, self.step_m),
+                place(neighbor_history, around, self.step_m),
+            )
+        else:
+            history, future, neighbor_history = (
+                subtract(history, origin, self.step_m),
+                subtract(future, origin, self.step_m),
+                subtract(neighbor_history, origin[neighbor_sample], self.step_m),
+            )
         return Batch(
             sample=sample,
-            history=self._positions(history_rows, x_m, y_m),
-            future=self._positions(np.minimum(future_rows, last_row), x_m, y_m),
-            future_mask=future_mask,
-            neighbor_history=self._positions(
-                np.maximum(neighbor_rows, first_row), x_m[neighbor_sample], y_m[neighbor_sample]
-            ),
-            neighbor_mask=neighbor_mask,
+            history=history,
+            future=future,
+            future_mask=self.future_masks.take(future_known),
+            neighbor_history=neighbor_history,
+            neighbor_mask=self.history_masks.take(neighbor_known),
             neighbor_sample=neighbor_sample,
             neighbor_cell=self.neighbor_cell[pair],
             lateral=self.sample_lateral[sample],
             longitudinal=self.sample_longitudinal[sample],
-            origin=np.stack([x_m, y_m], axis=-1),
+            origin=place(origin[:, None, :], centre, self.step_m)[:, 0],
+            absolute=absolute,
         )
 
-    def _positions(self, rows: Integers, x_m: Floats, y_m: Floats) -> Floats:
-        """(M, T, 2) positions of rows (M, T) relative to origins (M,)."""
-        positions = np.empty((*rows.shape, 2), dtype=np.float32)
-        np.subtract(self.x_m[rows], x_m[:, None], out=positions[..., 0])
-        np.subtract(self.y_m[rows], y_m[:, None], out=positions[..., 1])
-        return positions
+    def gather_scenes(self, scenes: npt.ArrayLike, *, absolute: bool = False) -> SceneBatch:
+        """Read scenes by their numbers (B,), in any order.
+
+        Raises:
+            IndexError: a number below 0, or not below C.
+        """
+        return gather_scenes(self, check_numbers(scenes, len(self.scene_part), "scene"), absolute=absolute)
 
 
-def _read_index(path: Path) -> dict[str, Any]:
-    """`index.json`, of a version and with the keys that are read here."""
-    file = path / "index.json"
-    if not file.is_file():
-        raise TensorError(f"{path}: no tensors here (no index.json); run `tracklake tensors`")
-    try:
-        index = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as broken:
-        raise TensorError(f"{file}: not readable as JSON ({broken}); run `tracklake tensors` again") from broken
-    if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
-        found = index.get("version") if isinstance(index, dict) else type(index).__name__
-        raise TensorError(
-            f"{file}: expected version {TENSORS_VERSION} of tensors, got {found}; run `tracklake tensors` again"
-        )
-    missing = [key for key in ("split", "protocol", "subsets", "blocks", "sizes") if key not in index]
-    if missing:
-        raise TensorError(f"{file}: lacks {', '.join(missing)}; run `tracklake tensors` again")
-    return index
+def find_part(part: str) -> int:
+    """The part's position in PARTS.
 
-
-def _read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
-    """The protocol whose parameters the index holds."""
-    parameters = {name: value for name, value in index["protocol"].items() if name != "digest"}
-    known = {field.name for field in fields(Protocol)}
-    if set(parameters) != known:
-        raise TensorError(
-            f"{path / 'index.json'}: expected a protocol of {', '.join(sorted(known))}, "
-            f"got {', '.join(sorted(parameters))}; run `tracklake tensors` again"
-        )
-    protocol = Protocol(**parameters)
-    if protocol.digest != index["protocol"].get("digest"):
-        raise TensorError(
-            f"{path / 'index.json'}: the protocol's digest is {index['protocol'].get('digest')}, its parameters give "
-            f"{protocol.digest}; run `tracklake tensors` again"
-        )
-    return protocol
-
-
-def _map_array(path: Path, name: str, dtype: str, shape: str, index: dict[str, Any]) -> npt.NDArray[Any]:
-    """One array, mapped read-only, of the declared dtype and size."""
-    file = path / f"{name}.npy"
-    letter, _, more = shape.partition("+")
-    expected = (int(index["sizes"][letter]) + int(more or 0),)
-    try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, EOFError, ValueError) as broken:
-        raise TensorError(f"{file}: cannot be read ({broken}); run `tracklake tensors` again") from broken
-    if array.dtype != np.dtype(dtype) or array.shape != expected:
-        raise TensorError(
-            f"{file}: expected {dtype} of shape {expected}, got {array.dtype} of shape {array.shape}; "
-            "run `tracklake tensors` again"
-        )
-    # A plain view: indexing np.memmap itself runs Python code for every result.
-    plain: npt.NDArray[Any] = array.view(np.ndarray)
-    return plain
+    Raises:
+        ValueError: no such part.
+    """
+    if part not in PARTS:
+        raise ValueError(f"unknown part `{part}`: expected one of {', '.join(PARTS)}")
+    return PARTS.index(part)

@@ -1,21 +1,30 @@
 """Tensors: the split's tracks, samples and neighbors as flat arrays."""
 
+import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from pipeline.lake import Entry, Manifest, load, scan, write_folder
+from pipeline.lake import Entry, Manifest, free_path, load, scan, write_folder
 from pipeline.lake.files import TENSORS
 from pipeline.settings import Settings
 from pipeline.stages import split
 from pipeline.stages.base import Job, StageError, make_entry, make_job, upstream
 from pipeline.tensor_files import write_tensors
 from pipeline.transforms.resample import put_on_clock
-from pipeline.transforms.tensors import build_subset_arrays, concatenate, describe_tensors
-from schemas import NEIGHBORS, SAMPLES, SPLITS, SUBSETS, TRACKS
+from pipeline.transforms.tensors import SubsetTensors, build_subset_tensors
+from schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS
+from schemas.protocols import Protocol
+from schemas.tensors import INDEX_FILE
 
-VERSION = 1
+VERSION = 2
+
+TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane", "speed_mps")
+SAMPLE_COLUMNS = ("protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver")
+NEIGHBOR_COLUMNS = ("protocol", "vehicle_id", "tick", "cell", "neighbor_id")
+"""Of these tables, what tensors are made of; the others may be wide."""
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
@@ -24,45 +33,88 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     if not made:
         return []
     protocol = settings.get_protocol()
-    made_of = {**made, "protocol": protocol.digest}
+    made_of = {**made, "protocol": protocol.digest, "positions": settings.tensor_positions}
     return [make_job(TENSORS, version_of_stage=VERSION, made_of=made_of, inputs={"split": protocol.split})]
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Build the arrays subset by subset, in the split's order, and put the folder into the lake at once."""
-    manifest, protocol = load(root), settings.get_protocol()
-    splits = scan(root, manifest, SPLITS).filter(pl.col("split") == protocol.split).collect()
-    subsets = scan(root, manifest, SUBSETS).collect()
-    arrays: list[dict[str, Any]] = []
-    included: list[dict[str, Any]] = []
-    for dataset, subset in splits.select("dataset", "subset").unique(maintain_order=True).iter_rows():
-        values = {"dataset": dataset, "subset": subset}
-        samples = scan(root, manifest, SAMPLES, **values).collect()
-        if samples.is_empty():
-            continue
-        facts = subsets.row(by_predicate=(pl.col("dataset") == dataset) & (pl.col("subset") == subset), named=True)
-        where = {"first_frame": facts["first_frame"], "frame_rate_hz": facts["frame_rate_hz"]}
-        clock = put_on_clock(scan(root, manifest, TRACKS, **values).collect(), rate_hz=protocol.rate_hz, **where)
-        arrays.append(
-            build_subset_arrays(
-                clock,
-                samples,
-                scan(root, manifest, NEIGHBORS, **values).collect(),
-                splits.filter((pl.col("dataset") == dataset) & (pl.col("subset") == subset)),
-                subset_index=len(included),
-                protocol=protocol,
-                **where,
-            )
-        )
-        included.append({"dataset": dataset, "subset": subset, "frame_rate_hz": facts["frame_rate_hz"]})
+    manifest, protocol, storage = load(root), settings.get_protocol(), settings.tensor_positions
+    splits, left_out = read_split(root, manifest, protocol)
+    included = list(_sampled_subsets(root, manifest, splits, protocol))
     if not included:
         return make_entry(job, {}, {"notes": ["no subset gives samples: no tensors"], "path": None, "samples": 0})
-    joined = concatenate(arrays)
-    index = describe_tensors(joined, pl.DataFrame(included), splits, protocol)
-    path = f"{TENSORS}/{protocol.split}/{job.fingerprint}"
-    files = write_folder(root, path, lambda folder: write_tensors(folder, joined, index))
+
+    def tensors_of() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
+        for facts in included:
+            here = (pl.col("dataset") == facts["dataset"]) & (pl.col("subset") == facts["subset"])
+            vehicles = left_out.filter(here)["vehicle_id"]
+            yield facts, build_one(root, manifest, facts, splits.filter(here), vehicles, protocol, storage)
+
+    def write(folder: Path) -> None:
+        write_tensors(folder, tensors_of(), splits, protocol, storage=storage)
+
+    path = free_path(root, f"{TENSORS}/{protocol.split}/{job.fingerprint}")
+    files = write_folder(root, path, write)
+    index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}
     return make_entry(job, {TENSORS: files}, info)
+
+
+def read_split(root: Path, manifest: Manifest, protocol: Protocol) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Which part each entry belongs to under the protocol's split: rows of `splits`, and of `split_left_out`."""
+    named = pl.col("split") == protocol.split
+    return (
+        scan(root, manifest, SPLITS).filter(named).collect(),
+        scan(root, manifest, SPLIT_LEFT_OUT).filter(named).collect(),
+    )
+
+
+def build_one(
+    root: Path,
+    manifest: Manifest,
+    facts: dict[str, Any],
+    blocks: pl.DataFrame,
+    left_out: pl.Series,
+    protocol: Protocol,
+    storage: str,
+) -> SubsetTensors:
+    """Read a subset's tables and build its arrays.
+
+    Args:
+        root: the lake.
+        manifest: its live files.
+        facts: the subset's row of `subsets`.
+        blocks: the split's rows for it.
+        left_out: vehicles of it that the split leaves out of all parts but `train`.
+        protocol: of the samples.
+        storage: of positions.
+    """
+    values = {"dataset": facts["dataset"], "subset": facts["subset"]}
+    where = {"first_frame": facts["first_frame"], "frame_rate_hz": facts["frame_rate_hz"]}
+    tracks = scan(root, manifest, TRACKS, **values).select(TRACK_COLUMNS).collect()
+    return build_subset_tensors(
+        put_on_clock(tracks, rate_hz=protocol.rate_hz, **where),
+        scan(root, manifest, SAMPLES, **values).select(SAMPLE_COLUMNS).collect(),
+        scan(root, manifest, NEIGHBORS, **values).select(NEIGHBOR_COLUMNS).collect(),
+        blocks,
+        protocol=protocol,
+        storage=storage,
+        left_out=left_out,
+        **where,
+    )
+
+
+def _sampled_subsets(
+    root: Path, manifest: Manifest, splits: pl.DataFrame, protocol: Protocol
+) -> Iterator[dict[str, Any]]:
+    """Facts of the split's subsets that have samples, in the split's order."""
+    subsets = scan(root, manifest, SUBSETS).collect()
+    for dataset, subset in splits.select("dataset", "subset").unique(maintain_order=True).iter_rows():
+        samples = scan(root, manifest, SAMPLES, dataset=dataset, subset=subset)
+        if samples.filter(pl.col("protocol") == protocol.name).head(1).collect().height:
+            named = (pl.col("dataset") == dataset) & (pl.col("subset") == subset)
+            yield subsets.row(by_predicate=named, named=True)
 
 
 def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:

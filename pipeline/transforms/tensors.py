@@ -4,25 +4,46 @@ The tables that go in name vehicles and ticks; the arrays that come out name row
 but indexing. Every history and future is a run of consecutive rows.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from pipeline.transforms.positions import store_positions
+from pipeline.transforms.scenes import find_scenes
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from schemas.protocols import Protocol
-from schemas.tensors import ARRAYS, TENSORS_VERSION
+from schemas.tensors import ARRAYS, MOST_TICKS, POSITION_STORAGES, Array
 
 Arrays = dict[str, np.ndarray]
-"""One NumPy array per name of `schemas.tensors.ARRAYS`, of its dtype."""
+"""One NumPy array per name of `schemas.tensors.ARRAYS`, of its dtype and shape."""
 
 Integers = npt.NDArray[np.int64]
 
-_ROW_ARRAYS = ("segment_first", "segment_last", "sample_row", "neighbor_row")
-"""Arrays that hold row numbers, which shift when arrays are joined."""
+MOST_ROWS = 2**31 - 1
+"""Rows and samples are numbered by Int32."""
+
+
+@dataclass(frozen=True)
+class SubsetTensors:
+    """The tensors of one subset; rows, samples and subsets are numbered from 0.
+
+    Args:
+        arrays: see `schemas.tensors.ARRAYS`.
+        centre_m: what stored positions count from: along, across.
+        max_error_m: greatest rounding error of the stored positions: along, across; 0 without rows.
+        squared_error_m2: sums of the squared rounding errors.
+        last_lane: the highest lane of any entry; 0 where no lane is known.
+    """
+
+    arrays: Arrays
+    centre_m: tuple[float, float]
+    max_error_m: tuple[float, float]
+    squared_error_m2: tuple[float, float]
+    last_lane: int
 
 
 @dataclass(frozen=True)
@@ -56,17 +77,18 @@ class _Runs:
         return np.repeat(self.first_row, lengths), np.repeat(self.last_row, lengths)
 
 
-def build_subset_arrays(
+def build_subset_tensors(
     clock: pl.DataFrame,
     samples: pl.DataFrame,
     neighbors: pl.DataFrame,
     blocks: pl.DataFrame,
     *,
-    subset_index: int,
     first_frame: int,
     frame_rate_hz: float,
     protocol: Protocol,
-) -> Arrays:
+    storage: str = POSITION_STORAGES[0],
+    left_out: pl.Series | None = None,
+) -> SubsetTensors:
     """Build the arrays of one subset that stands in the split.
 
     Only entries inside a block of the split are kept, and no history, future or pair of neighbors crosses a block's
@@ -76,28 +98,29 @@ def build_subset_arrays(
     Args:
         clock: the subset's entries on the protocol's clock, sorted by (vehicle_id, tick): vehicle_id, tick, x_m, y_m,
             lane (null becomes 0), speed_mps, segment (a gap-free stretch of a track).
-        samples: rows of `schemas.samples.SAMPLES` of this subset; other protocols' rows are passed by.
-        neighbors: rows of `schemas.samples.NEIGHBORS` of this subset; likewise.
+        samples: of `schemas.samples.SAMPLES` protocol, vehicle_id, tick and the maneuvers, for this subset; other
+            protocols' rows are passed by.
+        neighbors: of `schemas.samples.NEIGHBORS` protocol, vehicle_id, tick, cell, neighbor_id; likewise.
         blocks: the split's rows of `schemas.splits.SPLITS` for this subset; blocks do not overlap.
-        subset_index: the subset's position in the index's `subsets`.
         first_frame: the subset's first frame, where tick 0 lies.
         frame_rate_hz: of the source; tick k lies at frame first_frame + k * frame_rate_hz / protocol.rate_hz. A tick
             between two frames belongs to a block only if both do.
         protocol: whose clock, samples and neighbors these are.
-
-    Returns:
-        One array per name of `schemas.tensors.ARRAYS`.
+        storage: of positions, one of `schemas.tensors.POSITION_STORAGES`.
+        left_out: ids of vehicles (`schemas.splits.SPLIT_LEFT_OUT`) whose entries outside `train` are in no part.
 
     Raises:
-        ValueError: blocks overlap; the clock is not sorted; or samples and neighbors name entries or a history that the
-            clock does not have (they were made from other tracks).
+        ValueError: blocks overlap; the clock is not sorted; samples and neighbors name entries or a history that the
+            clock does not have (they were made from other tracks); or positions do not fit their storage.
 
     Source: DESIGN section 9.
     """
-    where = f"{blocks['dataset'][0]}/{blocks['subset'][0]}" if blocks.height else f"subset {subset_index}"
-    samples = samples.filter(pl.col("protocol") == protocol.name).sort("vehicle_id", "tick")
-    neighbors = neighbors.filter(pl.col("protocol") == protocol.name).sort("vehicle_id", "tick", "cell")
+    where = f"{blocks['dataset'][0]}/{blocks['subset'][0]}" if blocks.height else "a subset in no block"
+    samples = _sort(samples.filter(pl.col("protocol") == protocol.name))
+    neighbors = _sort(neighbors.filter(pl.col("protocol") == protocol.name))
     _check_order(clock, where)
+    if max(protocol.history_ticks, protocol.horizon_ticks) > MOST_TICKS:
+        raise ValueError(f"protocol {protocol.name}: tensors hold at most {MOST_TICKS} ticks of history and of future")
 
     tick = clock["tick"].to_numpy().astype(np.int64)
     vehicle_id = clock["vehicle_id"].to_numpy().astype(np.int64)
@@ -108,9 +131,13 @@ def build_subset_arrays(
 
     # All rows below count the whole clock; `new_row` turns them into rows of what the blocks keep of it.
     block = _block_of(first_frame + tick * (frame_rate_hz / protocol.rate_hz), vehicle_id, blocks, where)
+    part_of_block = _codes(blocks["part"], PARTS)
+    if left_out is not None and len(left_out):
+        block[np.isin(vehicle_id, left_out.to_numpy()) & (part_of_block[block] != PARTS.index("train"))] = -1
     kept = block >= 0
-    new_row = np.cumsum(kept) - 1
-    first, last = _find_runs(vehicle_id, tick, segment, block).bounds()
+    new_row = np.cumsum(kept, dtype=np.int32) - np.int32(1)
+    cut = _find_runs(vehicle_id, tick, segment, block)
+    first, last = cut.bounds()
     usable = (
         kept[origin]
         & (origin - first[origin] >= protocol.history_ticks - 1)
@@ -119,79 +146,99 @@ def build_subset_arrays(
     together = usable[pair_sample] & (block[pair_row] == block[origin[pair_sample]])
     number = np.cumsum(usable) - 1
     pairs_of = np.bincount(number[pair_sample[together]], minlength=int(usable.sum()))
+    pair_row, own = pair_row[together], origin[usable]
 
-    part_of_block = _codes(blocks["part"], PARTS)
+    sample_of_row = np.full(len(tick), -1, dtype=np.int64)
+    sample_of_row[own] = np.arange(len(own))
+    scenes = find_scenes(tick[kept], block[kept], sample_of_row[kept])
+    run_kept = kept[cut.first_row]
+    stored = store_positions(clock["x_m"].to_numpy()[kept], clock["y_m"].to_numpy()[kept], storage=storage, where=where)
+    lane = clock["lane"].fill_null(0).to_numpy()[kept]
     arrays: dict[str, npt.ArrayLike] = {
-        "x_m": clock["x_m"].to_numpy()[kept],
-        "y_m": clock["y_m"].to_numpy()[kept],
+        "position_m": stored.steps,
         "speed_mps": clock["speed_mps"].to_numpy()[kept],
-        "lane": clock["lane"].fill_null(0).to_numpy()[kept],
-        "subset": np.full(int(kept.sum()), subset_index),
-        "vehicle_id": vehicle_id[kept],
-        "tick": tick[kept],
-        "segment_first": new_row[first[kept]],
-        "segment_last": new_row[last[kept]],
-        "sample_row": new_row[origin[usable]],
-        "sample_part": part_of_block[block[origin[usable]]],
+        "lane": lane,
+        "run_first_row": np.append(new_row[cut.first_row[run_kept]], kept.sum()),
+        "run_vehicle_id": vehicle_id[cut.first_row[run_kept]],
+        "run_first_tick": tick[cut.first_row[run_kept]],
+        "run_subset": np.zeros(int(run_kept.sum())),
+        "sample_row": new_row[own],
+        "sample_part": part_of_block[block[own]],
         "sample_lateral": _codes(samples["lateral_maneuver"], LATERAL_MANEUVERS)[usable],
         "sample_longitudinal": _codes(samples["longitudinal_maneuver"], LONGITUDINAL_MANEUVERS)[usable],
+        "sample_future": np.minimum(last[own] - own, protocol.horizon_ticks),
         "neighbor_offset": np.concatenate([[0], np.cumsum(pairs_of)]),
-        "neighbor_row": new_row[pair_row[together]],
+        "neighbor_row": new_row[pair_row],
         "neighbor_cell": neighbors["cell"].to_numpy()[together],
+        "neighbor_known": np.minimum(pair_row - first[pair_row] + 1, protocol.history_ticks),
+        "scene_offset": scenes.offset,
+        "scene_row": scenes.row,
+        "scene_sample": scenes.sample,
+        "scene_part": part_of_block[scenes.block],
     }
-    return {array.name: np.ascontiguousarray(arrays[array.name], dtype=array.dtype) for array in ARRAYS}
+    return SubsetTensors(
+        arrays={
+            array.name: np.ascontiguousarray(arrays[array.name], dtype=array.stored_as(storage)) for array in ARRAYS
+        },
+        centre_m=stored.centre_m,
+        max_error_m=stored.max_error_m,
+        squared_error_m2=stored.squared_error_m2,
+        last_lane=int(lane.max(initial=0)),
+    )
 
 
-def concatenate(parts: Sequence[Arrays]) -> Arrays:
-    """Join subsets' arrays in the given order; row numbers and offsets shift accordingly.
-
-    Args:
-        parts: what `build_subset_arrays` returned, by increasing `subset_index`. None at all gives arrays without
-            rows, samples and pairs.
-    """
-    first_rows = np.cumsum([0, *(len(part["x_m"]) for part in parts)])
-    first_pairs = np.cumsum([0, *(len(part["neighbor_row"]) for part in parts)])
-    joined: Arrays = {}
-    for array in ARRAYS:
-        pieces = [part[array.name] for part in parts]
-        if array.name in _ROW_ARRAYS:
-            pieces = [piece + first for piece, first in zip(pieces, first_rows, strict=False)]
-        elif array.name == "neighbor_offset":
-            # Each part's offsets end where the next part's begin: the first one of each but the first is left out.
-            pieces = [piece[1:] + first for piece, first in zip(pieces, first_pairs, strict=False)]
-            pieces = [np.zeros(1, dtype=np.int64), *pieces]
-        joined[array.name] = np.concatenate([np.empty(0, dtype=array.dtype), *pieces]).astype(array.dtype, copy=False)
-    return joined
+def count_sizes(arrays: Arrays) -> dict[str, int]:
+    """The sizes by letter; see `schemas.tensors.Array`."""
+    return {
+        "N": len(arrays["lane"]),
+        "R": len(arrays["run_subset"]),
+        "S": len(arrays["sample_row"]),
+        "K": len(arrays["neighbor_row"]),
+        "C": len(arrays["scene_part"]),
+        "M": len(arrays["scene_row"]),
+    }
 
 
-def describe_tensors(arrays: Arrays, subsets: pl.DataFrame, splits: pl.DataFrame, protocol: Protocol) -> dict[str, Any]:
-    """What `index.json` says of the arrays beside it.
+def join_after(arrays: Arrays, before: Mapping[str, int], subset_index: int) -> Arrays:
+    """What a subset's arrays add to those of the subsets before it.
 
     Args:
-        arrays: of the whole split.
-        subsets: dataset, subset, frame_rate_hz, in the order of `subset_index`.
-        splits: the split's rows of `schemas.splits.SPLITS`; they let an evaluation prove that a model was trained on
-            other data.
-        protocol: of the samples.
+        arrays: of `build_subset_tensors`.
+        before: sizes of all subsets before, by letter.
+        subset_index: how many subsets there are before.
 
     Returns:
-        version, split, protocol (parameters and digest), subsets, blocks, sizes (N, S, K) and samples by part.
+        Arrays to be put behind those before: row, sample and pair numbers shifted; the first value of offsets is left
+        out where the ones before end with it (unless this is the first subset).
+
+    Raises:
+        ValueError: rows, samples or pairs are too many for their numbers.
     """
-    by_part = np.bincount(arrays["sample_part"], minlength=len(PARTS))
-    split = splits["split"].unique().sort()
-    return {
-        "version": TENSORS_VERSION,
-        "split": split[0] if len(split) == 1 else protocol.split,
-        "protocol": {**asdict(protocol), "digest": protocol.digest},
-        "subsets": subsets.select("dataset", "subset", "frame_rate_hz").to_dicts(),
-        "blocks": splits.drop("split").sort("dataset", "subset", "block").to_dicts(),
-        "sizes": {
-            "N": len(arrays["x_m"]),
-            "S": len(arrays["sample_row"]),
-            "K": len(arrays["neighbor_row"]),
-        },
-        "samples_by_part": {part: int(count) for part, count in zip(PARTS, by_part, strict=True)},
-    }
+    sizes = count_sizes(arrays)
+    if max(before["N"] + sizes["N"], before["S"] + sizes["S"]) > MOST_ROWS:
+        raise ValueError(f"more than {MOST_ROWS:,} rows or samples in one split: exclude recordings from it")
+    return {array.name: _shift(array, arrays[array.name], before, subset_index) for array in ARRAYS}
+
+
+def _shift(array: Array, values: np.ndarray, before: Mapping[str, int], subset_index: int) -> np.ndarray:
+    """One array of `join_after`."""
+    if array.name == "run_subset":
+        return np.full_like(values, subset_index)
+    if not array.counts:
+        return values
+    shift = values.dtype.type(before[array.counts])
+    if array.shape[0].endswith("+1") and subset_index:
+        values = values[1:]
+    shifted: np.ndarray = np.where(values < 0, values, values + shift)  # a negative number stands for none
+    return shifted
+
+
+def _sort(frame: pl.DataFrame) -> pl.DataFrame:
+    """Rows by vehicle, tick and, where there is one, cell; as they are where they stand so, as the lake's tables do."""
+    step = np.diff(_key(frame, "vehicle_id"))
+    by = [name for name in ("vehicle_id", "tick", "cell") if name in frame.columns]
+    again = np.diff(frame["cell"].to_numpy()) < 0 if "cell" in by else np.zeros(len(step), dtype=np.bool_)
+    return frame.sort(by) if ((step < 0) | ((step == 0) & again)).any() else frame
 
 
 def _key(frame: pl.DataFrame, vehicle: str) -> Integers:

@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.tensor_files import write_tensors
-from pipeline.transforms.tensors import build_subset_arrays, concatenate, describe_tensors
+from pipeline.transforms.tensors import build_subset_tensors
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from schemas.protocols import Protocol
 from schemas.samples import NEIGHBORS, SAMPLES
@@ -63,7 +63,7 @@ def sample_everything(draw, clock, *, dataset, subset, protocol=TINY):
         if any(present.get((vehicle_id, t)) != segment for t in reach) or draw.random() < 0.2:
             continue
         lateral, longitudinal = draw.choice(LATERAL_MANEUVERS), draw.choice(LONGITUDINAL_MANEUVERS)
-        samples.append((protocol.name, dataset, subset, vehicle_id, tick, frame, lane, lateral, longitudinal))
+        samples.append((protocol.name, dataset, subset, vehicle_id, tick, frame, lane, lateral, longitudinal, None))
         others = [v for v, t in present if t == tick and v != vehicle_id and draw.random() < 0.7]
         cells = sorted(draw.choice(39, size=len(others), replace=False))
         for cell, other in zip(cells, draw.permutation(others), strict=True):
@@ -80,36 +80,31 @@ def split_row(subset, part, *, block=0, first_frame=0, last_frame=10_000, ids=(N
     return pl.DataFrame([row], schema=SPLITS.dtypes, orient="row")
 
 
-def build(tables, splits, *, protocol=TINY):
-    """Arrays and index of (subset, clock, samples, neighbors) tables; tick k lies at frame 1 + 5 k."""
-    names = [table[0] for table in tables]
-    arrays = concatenate(
-        [
-            build_subset_arrays(
+def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=None):
+    """Facts and tensors of (subset, clock, samples, neighbors) tables; tick k lies at frame 1 + 5 k."""
+    rate = 5.0 * protocol.rate_hz
+    for subset, clock, samples, neighbors in tables:
+        facts = {"dataset": "highd", "subset": subset, "frame_rate_hz": rate, "lane_markings_m": markings}
+        yield (
+            facts,
+            build_subset_tensors(
                 clock,
                 samples,
                 neighbors,
                 splits.filter(pl.col("subset") == subset),
-                subset_index=position,
                 first_frame=1,
-                frame_rate_hz=5.0 * protocol.rate_hz,
+                frame_rate_hz=rate,
                 protocol=protocol,
-            )
-            for position, (subset, clock, samples, neighbors) in enumerate(tables)
-        ]
-    )
-    subsets = pl.DataFrame(
-        {"dataset": ["highd"] * len(names), "subset": names, "frame_rate_hz": [5.0 * protocol.rate_hz] * len(names)},
-        schema={"dataset": pl.String, "subset": pl.String, "frame_rate_hz": pl.Float64},
-    )
-    return arrays, describe_tensors(arrays, subsets, splits, protocol)
+                storage=storage,
+            ),
+        )
 
 
-def write(folder, tables, splits, *, protocol=TINY):
+def write(folder, tables, splits, *, protocol=TINY, storage="float32", markings=None):
     """The same as a tensor folder."""
-    arrays, index = build(tables, splits, protocol=protocol)
     folder.mkdir(parents=True, exist_ok=True)
-    write_tensors(folder, arrays, index)
+    subsets = build_subsets(tables, splits, protocol=protocol, storage=storage, markings=markings)
+    write_tensors(folder, subsets, splits, protocol, storage=storage)
     return folder
 
 

@@ -26,7 +26,7 @@ def track(vehicle_id, points):
 
 
 def sample_at(vehicle_id, tick, *, subset):
-    row = ("tiny", "highd", subset, vehicle_id, tick, 1 + 5 * tick, 1, "keep", "normal")
+    row = ("tiny", "highd", subset, vehicle_id, tick, 1 + 5 * tick, 1, "keep", "normal", None)
     return pl.DataFrame([row], schema=SAMPLES.dtypes, orient="row")
 
 

@@ -1,99 +1,19 @@
 """Batches equal those of a literal per-sample loop over the tables, value for value."""
 
-import json
-from types import SimpleNamespace
+import itertools
 
 import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensor_tables import TINY, build, drive, random_clock, sample_everything, split_row, write
+from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, F, H, loop_over_samples, random_tables
+from tensor_tables import CLOCK, drive, sample_everything, split_row, write
 
-from pipeline.transforms.tensors import concatenate
-from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
-from schemas.tensors import ARRAYS
-from training.tensors import TensorError, TensorFolder
-
-H, F = TINY.history_ticks, TINY.horizon_ticks
-
-
-def block_of(vehicle_id, frame, blocks):
-    """The block of an entry, by looking at each."""
-    for row in blocks.iter_rows(named=True):
-        low, high = row["first_vehicle_id"], row["last_vehicle_id"]
-        if (
-            row["first_frame"] <= frame <= row["last_frame"]
-            and (low is None or vehicle_id >= low)
-            and (high is None or vehicle_id <= high)
-        ):
-            return row["block"], row["part"]
-    return None
-
-
-def loop_over_samples(tables, splits):
-    """Every sample as plain values, straight from the tables: what the tensors must say."""
-    expected = []
-    for subset, clock, samples, neighbors in tables:
-        blocks = splits.filter(pl.col("subset") == subset)
-        # (vehicle, tick) -> (x, y, what it may be joined with: same segment and same block)
-        entries = {}
-        for vehicle_id, tick, frame, x_m, y_m, _, _, segment in clock.iter_rows():
-            block = block_of(vehicle_id, frame, blocks)
-            if block is not None:
-                entries[vehicle_id, tick] = (np.float32(x_m), np.float32(y_m), segment, block)
-        for sample in samples.iter_rows(named=True):
-            own, tick = sample["vehicle_id"], sample["tick"]
-            if (own, tick) not in entries:
-                continue
-            x0, y0, segment, block = entries[own, tick]
-
-            def at(vehicle_id, when, like, origin=(x0, y0), entries=entries):
-                entry = entries.get((vehicle_id, when))
-                if entry is None or entry[2:] != like:
-                    return None
-                return entry[0] - origin[0], entry[1] - origin[1]
-
-            history = [at(own, tick - H + 1 + h, (segment, block)) for h in range(H)]
-            future = [at(own, tick + f, (segment, block)) for f in range(1, F + 1)]
-            for f in range(1, F):  # once lost, lost: a track that comes back after a gap is not the same run
-                if future[f - 1] is None:
-                    future[f] = None
-            if None in history or future[0] is None:
-                continue
-            last_known = [position for position in future if position is not None][-1]
-            around = []
-            rows = neighbors.filter((pl.col("vehicle_id") == own) & (pl.col("tick") == tick)).sort("cell")
-            for row in rows.iter_rows(named=True):
-                other = row["neighbor_id"]
-                if (other, tick) not in entries or entries[other, tick][3] != block:
-                    continue
-                like = entries[other, tick][2:]
-                positions, known = [], []
-                for back in range(H):
-                    position = at(other, tick - back, like)
-                    if position is None or (known and not known[0]):
-                        positions.insert(0, positions[0])
-                        known.insert(0, False)
-                    else:
-                        positions.insert(0, position)
-                        known.insert(0, True)
-                around.append((row["cell"], positions, known))
-            expected.append(
-                SimpleNamespace(
-                    subset=subset,
-                    key=(subset, own, tick),
-                    part=block[1],
-                    origin=(x0, y0),
-                    history=history,
-                    future=[last_known if position is None else position for position in future],
-                    future_mask=[position is not None for position in future],
-                    around=around,
-                    lateral=LATERAL_MANEUVERS.index(sample["lateral_maneuver"]),
-                    longitudinal=LONGITUDINAL_MANEUVERS.index(sample["longitudinal_maneuver"]),
-                )
-            )
-    return expected
+from schemas.columns import PARTS
+from schemas.samples import NEIGHBORS, SAMPLES
+from training.drawing import draw_numbers
+from training.tensors import TensorFolder
 
 
 def assert_batch_equals(batch, expected):
@@ -112,35 +32,6 @@ def assert_batch_equals(batch, expected):
     np.testing.assert_array_equal(batch.neighbor_cell, [pair[1] for pair in pairs])
     np.testing.assert_array_equal(batch.neighbor_history, array([pair[2] for pair in pairs], np.float32, H, 2))
     np.testing.assert_array_equal(batch.neighbor_mask, array([pair[3] for pair in pairs], bool, H))
-
-
-def random_tables(seed, subsets=("a", "b", "c")):
-    draw = np.random.default_rng(seed)
-    tables = []
-    for subset in subsets:
-        clock = random_clock(draw, vehicles=int(draw.integers(0, 7)))
-        tables.append((subset, clock, *sample_everything(draw, clock, dataset="highd", subset=subset)))
-    return tables
-
-
-UNDIVIDED = pl.concat([split_row("a", "train"), split_row("b", "eval"), split_row("c", "train")])
-IN_TIME = pl.concat(
-    [
-        split_row("a", "train", block=0, first_frame=0, last_frame=30),
-        split_row("a", "eval", block=1, first_frame=36, last_frame=70),
-        split_row("b", "val"),
-        split_row("c", "eval", block=0, first_frame=20, last_frame=45),
-    ]
-)
-BY_VEHICLE = pl.concat(
-    [
-        split_row("a", "train", block=0, ids=(None, 15)),
-        split_row("a", "val", block=1, ids=(16, 25)),
-        split_row("a", "eval", block=2, ids=(26, None)),
-        split_row("b", "train"),
-        split_row("c", "eval", block=0, ids=(10, 30)),
-    ]
-)
 
 
 @settings(max_examples=60, deadline=None)
@@ -170,32 +61,110 @@ def test_batches_equal_a_literal_loop(tmp_path_factory, seed, splits, batch_size
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_arrays_are_as_declared_and_rows_are_sorted(seed):
+@given(seed=st.integers(0, 10_000), splits=st.sampled_from([UNDIVIDED, BY_VEHICLE]))
+def test_absolute_positions_are_those_of_the_tables(tmp_path_factory, seed, splits):
     tables = random_tables(seed)
-    arrays, index = build(tables, UNDIVIDED)
-    sizes = index["sizes"]
-    lengths = {"N": sizes["N"], "S": sizes["S"], "K": sizes["K"], "S+1": sizes["S"] + 1}
-    assert {a.name: (str(arrays[a.name].dtype), arrays[a.name].shape) for a in ARRAYS} == {
-        a.name: (a.dtype, (lengths[a.shape],)) for a in ARRAYS
+    folder = TensorFolder.open(write(tmp_path_factory.mktemp("tensors"), tables, splits))
+    expected = loop_over_samples(tables, splits, absolute=True)
+    batch = folder.gather(np.arange(len(expected)), absolute=True)
+    assert batch.absolute
+    assert_batch_equals(batch, expected)
+    np.testing.assert_array_equal(batch.history[:, -1], batch.origin)
+
+
+def one_vehicle(ticks, *, vehicle_id=7, x0=0.0):
+    rows = [(vehicle_id, tick, 1 + 5 * tick, x0 + 10.0 * tick, 4.0, 1, 20.0, vehicle_id) for tick in ticks]
+    return pl.DataFrame(rows, schema=CLOCK, orient="row")
+
+
+def sample_of(*origins):
+    rows = [("tiny", "highd", "a", vehicle, tick, None, 1, "left", "brake", None) for vehicle, tick in origins]
+    return pl.DataFrame(rows, schema=SAMPLES.dtypes, orient="row")
+
+
+def neighbor_of(*pairs):
+    rows = [("tiny", "highd", "a", *pair, 0.0) for pair in pairs]
+    return pl.DataFrame(rows, schema=NEIGHBORS.dtypes, orient="row")
+
+
+def open_one(folder, clock, samples, neighbors):
+    return TensorFolder.open(write(folder, [("a", clock, samples, neighbors)], split_row("a", "eval")))
+
+
+def test_one_sample_without_neighbors_and_with_a_masked_future_by_hand(tmp_path):
+    # Five positions, fewer than a history and a future together: 0, 10, 20 m, then 30 and 40 of four wanted.
+    folder = open_one(tmp_path, one_vehicle(range(5)), sample_of((7, 2)), neighbor_of())
+    (batch,) = folder.batches("eval", 8)
+    assert batch.history.tolist() == [[[-20, 0], [-10, 0], [0, 0]]]
+    assert batch.future.tolist() == [[[10, 0], [20, 0], [20, 0], [20, 0]]]
+    assert batch.future_mask.tolist() == [[True, True, False, False]]
+    assert batch.origin.tolist() == [[20, 4]]
+    assert (batch.neighbor_history.shape, batch.neighbor_mask.shape) == ((0, H, 2), (0, H))
+    assert (batch.lateral.tolist(), batch.longitudinal.tolist()) == ([1], [1])
+    assert list(folder.batches("train", 8)) == [], "a part without samples"
+
+
+def test_neighbors_that_came_late_by_hand(tmp_path):
+    # Vehicle 9 appears one tick before the sample's, vehicle 8 at it.
+    clock = pl.concat(
+        [one_vehicle(range(5)), one_vehicle([2, 3], vehicle_id=8, x0=5), one_vehicle([1, 2], vehicle_id=9)]
+    )
+    around = neighbor_of((7, 2, 30, 8), (7, 2, 4, 9))
+    batch = open_one(tmp_path, clock, sample_of((7, 2)), around).gather([0])
+    assert batch.neighbor_cell.tolist() == [4, 30], "by cell, not as they were listed"
+    assert batch.neighbor_mask.tolist() == [[False, True, True], [False, False, True]]
+    assert batch.neighbor_history[..., 0].tolist() == [[-10, -10, 0], [5, 5, 5]]
+
+
+def test_fewer_rows_than_a_window(tmp_path):
+    folder = open_one(tmp_path, one_vehicle(range(4)), sample_of((7, 2)), neighbor_of())
+    assert len(folder.lane) == F  # the future's window fits exactly once, and begins behind the sample
+    assert folder.gather([0]).future[..., 0].tolist() == [[10, 10, 10, 10]]
+    shorter = open_one(tmp_path / "b", one_vehicle(range(4)).head(3), sample_of((7, 2)).clear(), neighbor_of())
+    assert len(list(shorter.batches("eval", 3))) == 0
+    assert shorter.gather_scenes([]).history.shape == (0, H, 2)
+
+
+def test_the_last_batch_is_what_is_left(tmp_path):
+    clock = one_vehicle(range(12))
+    folder = open_one(tmp_path, clock, sample_of(*((7, tick) for tick in range(2, 11))), neighbor_of())
+    assert [len(batch) for batch in folder.batches("eval", 4)] == [4, 4, 1]
+    assert [len(batch) for batch in folder.batches("eval", 4, shuffle_seed=1, shuffle_block=3)] == [4, 4, 1]
+
+
+@given(
+    parts=st.lists(st.integers(0, 2), max_size=60),
+    size=st.integers(1, 9),
+    seed=st.none() | st.integers(0, 5),
+    block=st.none() | st.integers(1, 70),
+)
+def test_every_number_of_a_part_is_drawn_once(parts, size, seed, block):
+    drawn = list(draw_numbers(np.array(parts, dtype=np.uint8), 1, size, shuffle_seed=seed, shuffle_block=block))
+    wanted = [number for number, part in enumerate(parts) if part == 1]
+    assert [len(batch) for batch in drawn] == [len(wanted[i : i + size]) for i in range(0, len(wanted), size)]
+    numbers = list(itertools.chain.from_iterable(batch.tolist() for batch in drawn))
+    assert sorted(numbers) == wanted
+    if seed is None:
+        assert numbers == wanted
+
+
+def test_a_shuffle_by_blocks_stays_inside_them_and_follows_its_seed():
+    parts = np.zeros(100, dtype=np.uint8)
+    draw = {
+        seed: np.concatenate(list(draw_numbers(parts, 0, 10, shuffle_seed=seed, shuffle_block=20))) for seed in (1, 2)
     }
-    assert sizes["N"] == sum(table[1].height for table in tables)
-    keys = list(zip(arrays["subset"], arrays["vehicle_id"], arrays["tick"], strict=True))
-    assert keys == sorted(set(keys))
-    assert (np.diff(arrays["sample_row"]) > 0).all()
-    assert json.loads(json.dumps(index)) == index
+    assert all(len(set(numbers // 20)) == 1 for numbers in draw[1].reshape(5, 20))
+    assert draw[1].tolist() != sorted(draw[1])
+    assert draw[1].tolist() != draw[2].tolist()
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        draw_numbers(parts, 0, 0)
 
 
-def test_order_of_the_input_rows_of_samples_and_neighbors_does_not_matter():
-    tables = random_tables(5)
-    shuffled = [
-        (subset, clock, *(table.sample(fraction=1.0, shuffle=True, seed=1) for table in rest))
-        for subset, clock, *rest in tables
-    ]
-    wanted, _ = build(tables, UNDIVIDED)
-    got, _ = build(shuffled, UNDIVIDED)
-    for name, array in wanted.items():
-        np.testing.assert_array_equal(got[name], array)
+def test_numbers_that_are_no_sample_are_refused(tmp_path):
+    folder = open_one(tmp_path, one_vehicle(range(5)), sample_of((7, 2)), neighbor_of())
+    for wrong in ([-1], [1]):
+        with pytest.raises(IndexError, match="samples are numbered 0 to 0, got"):
+            folder.gather(wrong)
 
 
 def test_a_shuffle_is_fixed_by_its_seed(tmp_path):
@@ -216,7 +185,7 @@ def test_no_samples_still_open_and_gather_nothing(tmp_path):
     assert list(folder.batches("train", 8)) == []
     batch = folder.gather([])
     assert (batch.history.shape, batch.future.shape, batch.neighbor_history.shape) == ((0, H, 2), (0, F, 2), (0, H, 2))
-    assert {name: len(array) for name, array in concatenate([]).items() if len(array)} == {"neighbor_offset": 1}
+    assert folder.neighbor_offset.tolist() == [0]
 
 
 def test_unknown_part(tmp_path):
@@ -225,57 +194,26 @@ def test_unknown_part(tmp_path):
         folder.samples_of("test")
 
 
-def break_index(**changes):
-    def change(folder):
-        file = folder / "index.json"
-        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (
-            lambda folder: (folder / "index.json").unlink(),
-            "no tensors here \\(no index.json\\); run `tracklake tensors`",
-        ),
-        (lambda folder: (folder / "index.json").write_text("{"), "index.json: not readable as JSON"),
-        (lambda folder: (folder / "index.json").write_text("[]"), "expected version 1 of tensors, got list"),
-        (break_index(version=99), "expected version 1 of tensors, got 99"),
-        (break_index(protocol={"name": "x"}), "expected a protocol of history_s, .*, got name"),
-        (lambda folder: (folder / "x_m.npy").unlink(), "x_m.npy: cannot be read"),
-        (lambda folder: (folder / "x_m.npy").write_bytes(b""), "x_m.npy: cannot be read"),
-        (
-            lambda folder: np.save(folder / "lane.npy", np.zeros(3, dtype=np.int64)),
-            "lane.npy: expected int16 of shape \\(\\d+,\\), got int64 of shape \\(3,\\)",
-        ),
-        (
-            lambda folder: np.save(folder / "neighbor_offset.npy", np.zeros(1, dtype=np.int64)),
-            "neighbor_offset.npy: expected int64 of shape",
-        ),
-    ],
-)
-def test_a_damaged_folder_is_refused_with_what_and_where(tmp_path, damage, message):
-    write(tmp_path, random_tables(1), UNDIVIDED)
-    damage(tmp_path)
-    with pytest.raises(TensorError, match=message):
-        TensorFolder.open(tmp_path)
-
-
-def test_a_protocol_that_was_tampered_with_is_refused(tmp_path):
-    write(tmp_path, random_tables(1), UNDIVIDED)
-    index = json.loads((tmp_path / "index.json").read_text())
-    index["protocol"]["history_s"] = 0.5
-    (tmp_path / "index.json").write_text(json.dumps(index))
-    with pytest.raises(TensorError, match="digest"):
-        TensorFolder.open(tmp_path)
-
-
-def test_folders_are_opened_without_being_read(tmp_path):
-    draw = np.random.default_rng(0)
-    clock = drive(draw, vehicles=5, ticks=20)
-    tables = [("a", clock, *sample_everything(draw, clock, dataset="highd", subset="a"))]
-    folder = TensorFolder.open(write(tmp_path, tables, split_row("a", "train")))
-    assert isinstance(folder.x_m.base, np.memmap)
-    assert not folder.x_m.flags.writeable
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), storage=st.sampled_from(["int16-decimetres", "int16-centimetres"]))
+def test_int16_batches_differ_by_the_rounding_and_no_more(tmp_path_factory, seed, storage):
+    tables = random_tables(seed)
+    exact = TensorFolder.open(write(tmp_path_factory.mktemp("exact"), tables, IN_TIME))
+    small = TensorFolder.open(write(tmp_path_factory.mktemp("small"), tables, IN_TIME, storage=storage))
+    assert small.position_m.dtype == np.int16
+    step = np.array([0.1 if storage == "int16-decimetres" else 0.01, 0.001])
+    everything = np.arange(len(exact.sample_row))
+    for absolute in (False, True):
+        wanted, got = exact.gather(everything, absolute=absolute), small.gather(everything, absolute=absolute)
+        most = step * (0.5 if absolute else 1.0) + 1e-4  # a difference of two rounded positions errs twice
+        for name in ("history", "future", "neighbor_history"):
+            assert (np.abs(getattr(got, name) - getattr(wanted, name)) <= most).all(), name
+            if not absolute:  # whole steps, exactly: nothing is left of where the centre lies
+                steps = getattr(got, name) / step
+                np.testing.assert_allclose(steps, np.round(steps), atol=2e-3)
+        assert (np.abs(got.origin - wanted.origin) <= step / 2 + 1e-4).all()
+        np.testing.assert_array_equal(got.future_mask, wanted.future_mask)
+        np.testing.assert_array_equal(got.neighbor_mask, wanted.neighbor_mask)
+    errors = small.index["max_error_m"]
+    assert all(0 <= error <= most for error, most in zip(errors, step / 2 + 1e-4, strict=True))
+    assert small.index["rms_error_m"][0] <= errors[0]

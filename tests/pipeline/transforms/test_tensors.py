@@ -1,14 +1,18 @@
 """Arrays of one subset by hand: rows, runs, blocks and neighbors. (Batches against a loop: tests/training.)"""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
 
 from pipeline.tensor_files import write_tensors
-from pipeline.transforms.tensors import build_subset_arrays, concatenate, describe_tensors
+from pipeline.transforms.tensors import build_subset_tensors, count_sizes, join_after
 from schemas.protocols import Protocol
 from schemas.samples import NEIGHBORS, SAMPLES
 from schemas.splits import SPLITS
+from schemas.tensors import INDEX_KEYS, SUBSET_KEYS
 
 P = Protocol(name="p", rate_hz=2, history_s=0.5, horizon_s=1.0, min_future_s=0.5)  # 2 positions of history, 2 of future
 TOP = 2**31 - 1
@@ -39,7 +43,7 @@ CLOCK = pl.DataFrame(
 
 
 def samples(*origins, protocol="p", lateral="right", longitudinal="brake"):
-    rows = [(protocol, "highd", "a", vehicle, tick, None, 1, lateral, longitudinal) for vehicle, tick in origins]
+    rows = [(protocol, "highd", "a", vehicle, tick, None, 1, lateral, longitudinal, None) for vehicle, tick in origins]
     return pl.DataFrame(rows, schema=SAMPLES.dtypes, orient="row")
 
 
@@ -56,35 +60,49 @@ WHOLE = blocks((0, 1, 100, None, None, "eval"))
 SAMPLED = samples((3, 1), (TOP, 3))
 
 
-def build(sampled=SAMPLED, around=None, split=WHOLE, clock=CLOCK, subset_index=4):
+def build_tensors(sampled=SAMPLED, around=None, split=WHOLE, clock=CLOCK, **more):
     # 25 Hz on a 2 Hz clock: tick k lies at frame 1 + 12.5 k
-    return build_subset_arrays(
-        clock,
-        sampled,
-        neighbors() if around is None else around,
-        split,
-        subset_index=subset_index,
-        first_frame=1,
-        frame_rate_hz=25.0,
-        protocol=P,
-    )
+    around = neighbors() if around is None else around
+    return build_subset_tensors(clock, sampled, around, split, first_frame=1, frame_rate_hz=25.0, protocol=P, **more)
+
+
+def build(**changes):
+    return build_tensors(**changes).arrays
+
+
+def ticks_of(arrays):
+    """The tick of every row."""
+    lengths = np.diff(arrays["run_first_row"])
+    return np.repeat(arrays["run_first_tick"], lengths) + np.concatenate([np.arange(n) for n in lengths])
 
 
 def test_rows_runs_and_samples_by_hand():
     arrays = build(around=neighbors((3, 1, 20, TOP), (TOP, 3, 0, 3)).head(1))
-    assert arrays["segment_first"].tolist() == [0, 0, 0, 3, 3, 5, 5, 7, 7, 7]
-    assert arrays["segment_last"].tolist() == [2, 2, 2, 4, 4, 6, 6, 9, 9, 9]
+    assert arrays["run_first_row"].tolist() == [0, 3, 5, 7, 10]
+    assert arrays["run_vehicle_id"].tolist() == [3, 3, TOP, TOP]
+    assert arrays["run_first_tick"].tolist() == [0, 4, 0, 2]
+    assert arrays["run_subset"].tolist() == [0] * 4
     assert arrays["sample_row"].tolist() == [1, 8]
     assert arrays["sample_part"].tolist() == [2, 2]
     assert arrays["sample_lateral"].tolist() == [2, 2]
     assert arrays["sample_longitudinal"].tolist() == [1, 1]
+    assert arrays["sample_future"].tolist() == [1, 1]
     assert arrays["neighbor_offset"].tolist() == [0, 1, 1]
     assert arrays["neighbor_row"].tolist() == [6]
     assert arrays["neighbor_cell"].tolist() == [20]
-    assert arrays["subset"].tolist() == [4] * 10
-    assert arrays["vehicle_id"].tolist() == [3] * 5 + [TOP] * 5
+    assert arrays["neighbor_known"].tolist() == [2]
     assert arrays["lane"].tolist() == [1, 1, 1, 1, 1, 2, 0, 2, 2, 2]
-    assert arrays["x_m"].tolist() == [10, 11, 12, 14, 15, 20, 21, 22, 23, 24]
+    assert arrays["position_m"].tolist() == [[x, 1.5] for x in (10, 11, 12, 14, 15, 20, 21, 22, 23, 24)]
+    assert arrays["speed_mps"].tolist() == [2] * 10
+
+
+def test_scenes_by_hand():
+    # Samples at ticks 1 and 3: at tick 1 both vehicles are there, at tick 3 vehicle TOP alone.
+    arrays = build()
+    assert arrays["scene_offset"].tolist() == [0, 2, 3]
+    assert arrays["scene_row"].tolist() == [1, 6, 8]
+    assert arrays["scene_sample"].tolist() == [0, -1, 1]
+    assert arrays["scene_part"].tolist() == [2, 2]
 
 
 def test_a_block_cuts_rows_histories_futures_and_neighbors():
@@ -94,18 +112,28 @@ def test_a_block_cuts_rows_histories_futures_and_neighbors():
     arrays = build(sampled=samples((3, 1), (TOP, 3), (TOP, 4)), around=around, split=split)
     # Vehicle TOP's rows at ticks 2 | 3, 4 are cut apart: its sample at tick 3 has lost its history, that at tick 4 has
     # no future. Vehicle 3's last entry (frame 63.5) stands in no block.
-    assert arrays["tick"].tolist() == [0, 1, 2, 4, 0, 1, 2, 3, 4]
-    assert arrays["segment_first"].tolist() == [0, 0, 0, 3, 4, 4, 6, 7, 7]
-    assert arrays["segment_last"].tolist() == [2, 2, 2, 3, 5, 5, 6, 8, 8]
+    assert ticks_of(arrays).tolist() == [0, 1, 2, 4, 0, 1, 2, 3, 4]
+    assert arrays["run_first_row"].tolist() == [0, 3, 4, 6, 7, 9]
     assert arrays["sample_row"].tolist() == [1]
     assert arrays["sample_part"].tolist() == [0]
     assert arrays["neighbor_row"].tolist() == [5]
+    assert arrays["scene_row"].tolist() == [1, 5]
 
 
 def test_a_tick_between_two_frames_stands_in_a_block_only_if_both_do():
     # Tick 1 lies at frame 13.5.
     split = blocks((0, 1, 13, None, None, "train"), (1, 14, 60, None, None, "eval"))
-    assert 1 not in build(sampled=samples(), split=split)["tick"]
+    assert 1 not in ticks_of(build(sampled=samples(), split=split))
+
+
+def test_a_vehicle_left_out_keeps_what_trains_and_nothing_else():
+    # Vehicle 3 has ticks 0 to 2 in train and 4 in eval; TOP has 0 to 2 in train and 3, 4 in eval.
+    split = blocks((0, 1, 26, None, None, "train"), (1, 27, 70, None, None, "eval"))
+    arrays = build(sampled=samples((3, 1)), split=split, left_out=pl.Series([TOP, 77], dtype=pl.Int32))
+    assert ticks_of(arrays).tolist() == [0, 1, 2, 4, 5, 0, 1, 2]
+    assert arrays["sample_part"].tolist() == [0]
+    everything = build(sampled=samples((3, 1)), split=split)
+    assert ticks_of(everything).tolist() == [0, 1, 2, 4, 5, 0, 1, 2, 3, 4]
 
 
 def test_blocks_by_vehicle_keep_neighbors_of_other_parts_away():
@@ -124,27 +152,54 @@ def test_samples_of_other_protocols_are_passed_by():
 
 
 def test_joined_subsets_shift_rows_and_offsets():
-    one = build(around=neighbors((3, 1, 20, TOP)), subset_index=0)
-    two = build(around=neighbors((3, 1, 7, TOP), (3, 1, 8, TOP)), subset_index=1)
-    joined = concatenate([one, two])
+    one = build(around=neighbors((3, 1, 20, TOP)))
+    two = build(around=neighbors((3, 1, 7, TOP), (3, 1, 8, TOP)))
+    nothing = dict.fromkeys("NRSKCM", 0)
+    first = join_after(one, nothing, 0)
+    second = join_after(two, count_sizes(one), 1)
+    assert count_sizes(one) == {"N": 10, "R": 4, "S": 2, "K": 1, "C": 2, "M": 3}
+    joined = {name: np.concatenate([first[name], second[name]]) for name in first}
     assert joined["sample_row"].tolist() == [1, 8, 11, 18]
     assert joined["neighbor_offset"].tolist() == [0, 1, 1, 3, 3]
     assert joined["neighbor_row"].tolist() == [6, 16, 16]
     assert joined["neighbor_cell"].tolist() == [20, 7, 8]
-    assert joined["segment_last"][10:].tolist() == [12, 12, 12, 14, 14, 16, 16, 19, 19, 19]
-    assert joined["subset"].tolist() == [0] * 10 + [1] * 10
+    assert joined["run_first_row"].tolist() == [0, 3, 5, 7, 10, 13, 15, 17, 20]
+    assert joined["run_subset"].tolist() == [0] * 4 + [1] * 4
+    assert joined["scene_offset"].tolist() == [0, 2, 3, 5, 6]
+    assert joined["scene_row"].tolist() == [1, 6, 8, 11, 16, 18]
+    assert joined["scene_sample"].tolist() == [0, -1, 1, 2, -1, 3]
+    assert {name: array.dtype for name, array in joined.items()} == {name: array.dtype for name, array in one.items()}
 
 
-def test_the_index_names_protocol_subsets_blocks_and_sizes():
-    subsets = pl.DataFrame({"dataset": ["highd"], "subset": ["a"], "frame_rate_hz": [25.0], "more": [1]})
-    index = describe_tensors(build(), subsets, WHOLE, P)
+def test_more_rows_than_their_numbers_hold_are_refused():
+    with pytest.raises(ValueError, match="more than 2,147,483,647 rows or samples"):
+        join_after(build(), dict.fromkeys("NRSKCM", 2**31 - 5), 1)
+
+
+FACTS = {"dataset": "highd", "subset": "a", "frame_rate_hz": 25.0, "lane_markings_m": None, "more": 1}
+
+
+def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
+    marked = FACTS | {"subset": "b", "lane_markings_m": [0.0, 4.0, 8.0, 12.0]}
+    index = write_tensors(tmp_path, [(FACTS, build_tensors()), (marked, build_tensors())], WHOLE, P, storage="float32")
+    assert json.loads((tmp_path / "index.json").read_text()) == index
+    assert set(index) == set(INDEX_KEYS)
     assert index["split"] == "s"
     assert index["protocol"]["name"] == "p"
     assert index["protocol"]["digest"] == P.digest
-    assert index["subsets"] == [{"dataset": "highd", "subset": "a", "frame_rate_hz": 25.0}]
+    unmarked = {
+        "dataset": "highd", "subset": "a", "frame_rate_hz": 25.0, "centre_m": [0, 0], "lane_markings_m": None,
+        "last_lane": 2, "width_m": 7.3152,
+    }  # fmt: skip
+    assert index["subsets"][0] == unmarked
+    assert index["subsets"][1] == unmarked | {
+        "subset": "b", "lane_markings_m": [0, 4, 8, 12], "last_lane": 3, "width_m": 12,
+    }  # fmt: skip
+    assert set(unmarked) == set(SUBSET_KEYS)
     assert index["blocks"][0]["part"] == "eval"
-    assert index["sizes"] == {"N": 10, "S": 2, "K": 0}
-    assert index["samples_by_part"] == {"train": 0, "val": 0, "eval": 2}
+    assert index["sizes"] == {"N": 20, "R": 8, "S": 4, "K": 0, "C": 4, "M": 6}
+    assert index["samples_by_part"] == {"train": 0, "val": 0, "eval": 4}
+    assert (index["max_error_m"], index["rms_error_m"]) == ([0, 0], [0, 0])
 
 
 @pytest.mark.parametrize(
@@ -167,23 +222,31 @@ def test_tables_that_disagree_are_refused(change, message):
         build(**change)
 
 
+def test_a_history_longer_than_a_byte_counts_is_refused():
+    long = Protocol(name="p", rate_hz=10, history_s=30.0)
+    with pytest.raises(ValueError, match="at most 255 ticks"):
+        build_subset_tensors(CLOCK, SAMPLED, neighbors(), WHOLE, first_frame=1, frame_rate_hz=25.0, protocol=long)
+
+
 def test_an_empty_clock_gives_empty_arrays():
     arrays = build(sampled=samples(), clock=CLOCK.clear())
-    assert {name: len(array) for name, array in arrays.items() if len(array)} == {"neighbor_offset": 1}
-
-
-def test_files_are_written_with_their_index(tmp_path):
-    arrays = build()
-    write_tensors(tmp_path, arrays, {"version": 1})
-    written = sorted(path.name for path in tmp_path.iterdir())
-    assert written == sorted([f"{name}.npy" for name in arrays] + ["index.json"])
-    np.testing.assert_array_equal(np.load(tmp_path / "x_m.npy"), arrays["x_m"])
+    assert {name: array.tolist() for name, array in arrays.items() if len(array)} == {
+        "run_first_row": [0], "neighbor_offset": [0], "scene_offset": [0],
+    }  # fmt: skip
 
 
 def test_arrays_of_another_kind_are_not_written(tmp_path):
-    arrays = build()
-    with pytest.raises(ValueError, match="array `lane`: expected int16, got int64"):
-        write_tensors(tmp_path, arrays | {"lane": arrays["lane"].astype(np.int64)}, {})
-    with pytest.raises(ValueError, match="array `tick`: expected int32, got nothing"):
-        write_tensors(tmp_path, {name: array for name, array in arrays.items() if name != "tick"}, {})
-    assert list(tmp_path.iterdir()) == []
+    tensors = build_tensors()
+    wrong = (
+        (tensors.arrays | {"lane": tensors.arrays["lane"].astype(np.int64)}, "`lane`: expected int16 of .*got int64"),
+        ({name: values for name, values in tensors.arrays.items() if name != "run_subset"}, "`run_subset` is missing"),
+        (tensors.arrays | {"sample_part": np.zeros(5, np.uint8)}, r"`sample_part`: expected uint8 of shape \(2,\)"),
+    )
+    for arrays, message in wrong:
+        with pytest.raises(ValueError, match=message):
+            write_tensors(tmp_path, [(FACTS, replace(tensors, arrays=arrays))], WHOLE, P, storage="float32")
+
+
+def test_nothing_but_the_two_files_is_left(tmp_path):
+    write_tensors(tmp_path, [(FACTS, build_tensors())], WHOLE, P, storage="float32")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["arrays.safetensors", "index.json"]

@@ -1,0 +1,48 @@
+"""The tensor folder as Markdown, from its declaration: `python -m schemas.tensors_markdown > docs/tensors.md`."""
+
+from schemas import tensors
+from schemas.protocols import CSP
+from schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
+
+LETTERS = {
+    "N": "rows: entries on the protocol's clock that stand in a block of the split",
+    "R": "runs: gap-free stretches of one vehicle's ticks inside one block",
+    "S": "samples",
+    "K": "(sample, neighbor) pairs",
+    "C": "scenes: moments at which somebody is a sample",
+    "M": "vehicles in scenes",
+}
+
+HEAD = f"""# Tensors
+
+Derived from `schemas/tensors.py`; do not edit (`make docs` writes it). Version {TENSORS_VERSION}.
+
+`tracklake tensors` writes a folder of two files, which `training.tensors.TensorFolder.open` maps into memory and
+checks: `{tensors.ARRAYS_FILE}`, every array in the safetensors layout, and `{tensors.INDEX_FILE}`, what they are.
+
+Shapes, order and units of the batches gathered from them (numpy, torch, or on a device) are those of
+`training.batches.Batch` and `SceneBatch`. Under the protocol `{CSP.name}` a history has H = \
+{CSP.history_ticks} positions, a future F = {CSP.horizon_ticks}.
+
+## Sizes
+"""
+
+
+def write_tensors_page() -> str:
+    """The whole page."""
+    lines = [HEAD, *(f"- {letter}: {meaning}" for letter, meaning in LETTERS.items())]
+    lines += ["", "## Arrays", "", "| array | dtype | shape | meaning |", "| --- | --- | --- | --- |"]
+    for array in ARRAYS:
+        dtype = "float32 or int16" if array.dtype == "position" else array.dtype
+        lines.append(f"| `{array.name}` | {dtype} | ({', '.join(array.shape)}) | {array.meaning} |")
+    lines += ["", tensors.ORDER.strip(), "", "## Positions as int16", "", tensors.STORAGE, ""]
+    lines += ["| storage | m per step along | m per step across |", "| --- | --- | --- |"]
+    lines += [f"| {storage} | {along:g} | {across:g} |" for storage, (along, across) in STEPS_M.items()]
+    lines += ["", "## The index", "", tensors.INDEX_MEANING, ""]
+    lines += [f"Keys: {', '.join(f'`{key}`' for key in INDEX_KEYS)}.", "", tensors.SUBSET_MEANING, ""]
+    lines += [f"Keys: {', '.join(f'`{key}`' for key in SUBSET_KEYS)}.", ""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(write_tensors_page(), end="")  # noqa: T201 - it is what the module is for

@@ -1,0 +1,243 @@
+"""Batches as torch tensors: streamed from the mapped folder, drawn by a sampler, or gathered on the device itself."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import islice
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from training.batches import Batch
+from training.drawing import draw_numbers
+from training.tensors import TensorFolder, find_part
+
+
+@dataclass(frozen=True)
+class TorchBatch:
+    """The arrays of `training.batches.Batch` as tensors of the same names, shapes, dtypes and units."""
+
+    sample: Tensor
+    history: Tensor
+    future: Tensor
+    future_mask: Tensor
+    neighbor_history: Tensor
+    neighbor_mask: Tensor
+    neighbor_sample: Tensor
+    neighbor_cell: Tensor
+    lateral: Tensor
+    longitudinal: Tensor
+    origin: Tensor
+    absolute: bool = False
+
+    @classmethod
+    def of(cls, batch: Batch) -> Self:
+        """The same values, not copied."""
+        return cls(**{own.name: _as_tensor(getattr(batch, own.name)) for own in fields(cls)})
+
+    def __len__(self) -> int:
+        """B."""
+        return len(self.sample)
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> Self:
+        """On a device; from pinned memory with `non_blocking` the copy runs beside what is computed."""
+        return self._each(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Self:
+        """In page-locked memory (DataLoader calls this for `pin_memory=True`); needs an accelerator."""
+        return self._each(Tensor.pin_memory)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
+        values = {own.name: getattr(self, own.name) for own in fields(self)}
+        changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **changed)
+
+
+def _as_tensor(value: Any) -> Any:  # noqa: ANN401  (arrays become tensors, what is none stays)
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+
+
+class BatchStream(IterableDataset[TorchBatch]):
+    """All samples of a part, batch by batch; each pass in an order of its own.
+
+    For `DataLoader(stream, batch_size=None)`, or to iterate as it is: gathering needs no workers. With several, every
+    batch is yielded by one of them.
+
+    Args:
+        folder: where from.
+        part: train, val or eval.
+        batch_size: B; the last batch may be smaller.
+        shuffle_seed: of the first pass; the next one takes the next seed. None = the samples' own order.
+        shuffle_block: see `training.drawing.draw_numbers`.
+        absolute: see `Batch`.
+        pin_memory: whether batches stand in page-locked memory; needs an accelerator.
+
+    Raises:
+        ValueError: no such part.
+    """
+
+    def __init__(
+        self,
+        folder: TensorFolder,
+        part: str,
+        batch_size: int,
+        *,
+        shuffle_seed: int | None = None,
+        shuffle_block: int | None = None,
+        absolute: bool = False,
+        pin_memory: bool = False,
+    ) -> None:
+        super().__init__()
+        self.folder, self.part, self.batch_size = folder, find_part(part), batch_size
+        self.shuffle_seed, self.shuffle_block = shuffle_seed, shuffle_block
+        self.absolute, self.pin_memory = absolute, pin_memory
+        self.passes = 0
+
+    def __len__(self) -> int:
+        """Batches of one pass."""
+        return -(-int((self.folder.sample_part == self.part).sum()) // self.batch_size)
+
+    def __iter__(self) -> Iterator[TorchBatch]:
+        """One pass."""
+        seed = None if self.shuffle_seed is None else self.shuffle_seed + self.passes
+        self.passes += 1
+        worker = get_worker_info()
+        drawn = draw_numbers(
+            self.folder.sample_part, self.part, self.batch_size, shuffle_seed=seed, shuffle_block=self.shuffle_block
+        )
+        for samples in drawn if worker is None else islice(drawn, worker.id, None, worker.num_workers):
+            batch = TorchBatch.of(self.folder.gather(samples, absolute=self.absolute))
+            yield batch.pin_memory() if self.pin_memory else batch
+
+
+class SampleDataset(Dataset[TorchBatch]):
+    """Samples of a part by number, for samplers of one's own; a batch is gathered at once.
+
+    For `DataLoader(dataset, batch_size=B, sampler=..., collate_fn=dataset.collate)`.
+
+    Args:
+        folder: where from.
+        part: train, val or eval.
+        absolute: see `Batch`.
+
+    Raises:
+        ValueError: no such part.
+    """
+
+    def __init__(self, folder: TensorFolder, part: str, *, absolute: bool = False) -> None:
+        self.folder, self.absolute = folder, absolute
+        self.numbers = folder.samples_of(part)
+
+    def __len__(self) -> int:
+        """Samples of the part."""
+        return len(self.numbers)
+
+    def __getitem__(self, position: int) -> TorchBatch:
+        """A batch of one sample; `position` counts within the part."""
+        return self.__getitems__([position])[0]
+
+    def __getitems__(self, positions: Sequence[int]) -> list[TorchBatch]:
+        """One batch of several, in the list that DataLoader expects."""
+        chosen = self.numbers[np.asarray(positions, dtype=np.int64)]
+        return [TorchBatch.of(self.folder.gather(chosen, absolute=self.absolute))]
+
+    @staticmethod
+    def collate(batches: list[TorchBatch]) -> TorchBatch:
+        """The one batch of the list: nothing is left to put together."""
+        (batch,) = batches
+        return batch
+
+
+class ResidentTensors:
+    """A whole folder on a device, and batches gathered there: nothing crosses the bus but the samples' numbers.
+
+    Takes what the arrays take: for each sample some 20 bytes, 6 for each of its neighbors, 14 for each entry on the
+    clock (with float32 positions).
+
+    Args:
+        folder: what to load.
+        device: where to.
+    """
+
+    def __init__(self, folder: TensorFolder, device: torch.device | str) -> None:
+        self.folder, self.device = folder, torch.device(device)
+
+        def load(array: np.ndarray) -> Tensor:
+            # A copy first: torch does not know read-only memory.
+            return torch.from_numpy(array.copy()).to(self.device)
+
+        self.position_m = load(folder.position_m)
+        self.sample_row, self.sample_future = load(folder.sample_row), load(folder.sample_future)
+        self.sample_part = load(folder.sample_part)
+        self.lateral, self.longitudinal = load(folder.sample_lateral), load(folder.sample_longitudinal)
+        self.offset, self.neighbor_row = load(folder.neighbor_offset), load(folder.neighbor_row)
+        self.neighbor_cell, self.neighbor_known = load(folder.neighbor_cell), load(folder.neighbor_known)
+        self.run_first_row, self.run_subset = load(folder.run_first_row), load(folder.run_subset)
+        self.centre_m = load(folder.centre_m)
+        step_m = folder.step_m
+        self.step_m = None if step_m is None else torch.tensor(step_m, dtype=torch.float64, device=self.device)
+        self.back = torch.arange(1 - folder.protocol.history_ticks, 1, device=self.device)
+        self.ahead = torch.arange(1, folder.protocol.horizon_ticks + 1, device=self.device)
+
+    def samples_of(self, part: str) -> Tensor:
+        """(S_part,) numbers of the samples of one part, increasing, on the device."""
+        return torch.nonzero(self.sample_part == find_part(part))[:, 0]
+
+    def batches(
+        self, part: str, batch_size: int, *, shuffle_seed: int | None = None, absolute: bool = False
+    ) -> Iterator[TorchBatch]:
+        """Every sample of a part once; the last batch may be smaller. The order is drawn on the device."""
+        samples = self.samples_of(part)
+        if shuffle_seed is not None:
+            random = torch.Generator(self.device).manual_seed(shuffle_seed)
+            samples = samples[torch.randperm(len(samples), generator=random, device=self.device)]
+        for some in torch.split(samples, batch_size):
+            if len(some):  # of no samples at all, split makes one empty batch
+                yield self.gather(some, absolute=absolute)
+
+    def gather(self, samples: Tensor, *, absolute: bool = False) -> TorchBatch:
+        """Read samples by their numbers (B,) int64 on the device: values, masks and order as `TensorFolder.gather`."""
+        row, future_known = self.sample_row[samples].long(), self.sample_future[samples].long()
+        first = self.offset[samples]
+        counts = self.offset[samples + 1] - first
+        around = torch.repeat_interleave(torch.arange(len(samples), device=self.device), counts)
+        before = torch.cumsum(counts, 0) - counts
+        pair = torch.arange(len(around), device=self.device) + (first - before)[around]
+        neighbor_row, neighbor_known = self.neighbor_row[pair].long(), self.neighbor_known[pair].long()
+        neighbor_first = neighbor_row + 1 - neighbor_known
+
+        origin = self.position_m[row]
+        centre = origin if self.step_m is None else self._find_centres(row)
+        history = self._read(row[:, None] + self.back, origin, centre, absolute)
+        future_rows = torch.minimum(row[:, None] + self.ahead, (row + future_known)[:, None])
+        neighbor_rows = torch.maximum(neighbor_row[:, None] + self.back, neighbor_first[:, None])
+        return TorchBatch(
+            sample=samples,
+            history=history,
+            future=self._read(future_rows, origin, centre, absolute),
+            future_mask=self.ahead <= future_known[:, None],
+            neighbor_history=self._read(neighbor_rows, origin[around], centre[around], absolute),
+            neighbor_mask=-self.back < neighbor_known[:, None],
+            neighbor_sample=around,
+            neighbor_cell=self.neighbor_cell[pair],
+            lateral=self.lateral[samples],
+            longitudinal=self.longitudinal[samples],
+            origin=self._read(row[:, None], origin, centre, absolute=True)[:, 0],
+            absolute=absolute,
+        )
+
+    def _find_centres(self, row: Tensor) -> Tensor:
+        """(B, 2) float64: what the int16 positions of rows (B,) count from."""
+        run = torch.searchsorted(self.run_first_row, row, right=True) - 1
+        return self.centre_m[self.run_subset[run].long()]
+
+    def _read(self, rows: Tensor, origin: Tensor, centre: Tensor, absolute: bool) -> Tensor:
+        """(M, T, 2) float32 positions in m of rows (M, T), relative to stored origins (M, 2) or absolute."""
+        positions = self.position_m[rows]
+        if self.step_m is None:
+            return positions if absolute else positions - origin[:, None]
+        if absolute:
+            return (centre[:, None] + positions * self.step_m).float()
+        return (positions.float() - origin[:, None].float()) * self.step_m.float()
