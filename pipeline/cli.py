@@ -4,18 +4,15 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from pipeline import planning
 from pipeline.allocation import keep_freed_memory
-from pipeline.session import DONE, FAILED, carry_out, command, conclude, failure, read_settings
-
-if TYPE_CHECKING:
-    from pipeline.sample import SampleSummary
-    from pipeline.terminal import Terminal
-
-SAMPLE = "sample"
+from pipeline.export.commands import app as export_app
+from pipeline.generated import provide_sample, refuse_mixing, write_generated
+from pipeline.session import DONE, FAILED, carry_out, command, conclude, read_settings
 
 app = typer.Typer(
     name="tracklake",
@@ -25,6 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Exit codes: 0 done, 1 failed, 2 usage, 3 done but some recordings were refused.",
 )
+app.add_typer(export_app, name="export")
 
 LakeOption = Annotated[
     Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
@@ -89,8 +87,8 @@ def run(
         if source is None:
             if prune or rebuild:
                 raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
-            source = str(_provide_sample(settings.lake, minutes, seed, terminal))
-            _refuse_mixing(settings.lake, source)
+            source = str(provide_sample(settings.lake, minutes, seed, terminal))
+            refuse_mixing(settings.lake, source)
         elif minutes is not None or seed is not None:
             raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
         flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
@@ -170,8 +168,28 @@ STAGE_COMMANDS = {
     "report": "Write the quality report.",
 }
 for _name, _meaning in STAGE_COMMANDS.items():
-    if _name != "report":
+    if _name not in ("repair", "split", "report"):
         _add_stage(_name, _meaning)
+
+
+app.command(name="split", help=STAGE_COMMANDS["split"])(planning.split)
+
+
+@app.command(help=STAGE_COMMANDS["repair"])
+def repair(
+    lake: LakeOption = None,
+    assess: Annotated[
+        bool, typer.Option("--assess", help="Measure the estimates on tracks cut on purpose, and report it.")
+    ] = False,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Find late starts, and where asked to measure how good the estimates are."""
+    with command(quiet=quiet, json=json) as terminal:
+        settings = read_settings(lake=lake, workers=workers)
+        steps = ("repair", "assess", "report") if assess else ("repair",)
+        conclude(terminal, settings, carry_out(terminal, settings, steps), headline=False, assess=assess)
 
 
 @app.command(help=STAGE_COMMANDS["report"])
@@ -315,7 +333,7 @@ def sample(
     from pipeline.terminal import command_here
 
     with command(quiet=quiet, json=json) as terminal:
-        summary = _write_sample(out, minutes, seed, terminal, formats=format)
+        summary = write_generated(out, minutes, seed, terminal, formats=format)
         terminal.say(f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)")
         terminal.say(f"Try next:\n  {command_here()} run {out}")
         terminal.give({"out": out, "rows": summary.rows, "recordings": summary.recordings, "seconds": summary.seconds})
@@ -331,58 +349,6 @@ def serve() -> None:
     from pipeline.flows import serve_deployments
 
     serve_deployments()
-
-
-def _provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: "Terminal") -> Path:
-    """The generated sample beside the lake, made where it is not there or asked for otherwise."""
-    out = lake.parent / SAMPLE
-    if minutes is None and seed is None and (out / "truth.parquet").exists():
-        terminal.say(f"the generated sample in {out}", style="dim")
-        return out
-    summary = _write_sample(out, minutes, seed, terminal)
-    terminal.say(f"generated {summary.rows:,} rows of {summary.recordings} recordings in {out}", style="dim")
-    return out
-
-
-def _refuse_mixing(lake: Path, sample: str) -> None:
-    """Keep simulated recordings out of a lake of real ones, which they might even replace."""
-    from pipeline.lake import LakeError, LakeMissingError, load
-    from pipeline.work import INGEST, Order, survey
-
-    try:
-        entries = load(lake).of_stage(INGEST)
-    except LakeMissingError:
-        return
-    order = Order(str(lake.absolute()), (INGEST,), sample)
-    ours = {file.name for _, unit in survey(order).units for file in unit.files}
-    hashes = {file.sha256 for _, unit in survey(order).units for file in unit.files}
-    for source in (source for entry in entries for source in entry.built_from["sources"]):
-        if source["file"] not in ours or source["sha256"] not in hashes:
-            raise LakeError(
-                f"{lake}: holds recordings that are not this generated sample ({source['file']}). Without SOURCE, the "
-                "sample is what is ingested: name your own files as SOURCE, or another lake with --lake."
-            )
-
-
-def _write_sample(
-    out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
-) -> "SampleSummary":
-    from pipeline.sample import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
-
-    if unknown := [name for name in formats or () if name not in ALL_FORMATS]:
-        raise typer.BadParameter(f"--format is one of {', '.join(ALL_FORMATS)}; got {', '.join(unknown)}")
-    try:
-        return write_sample(
-            out,
-            formats=tuple(formats) if formats else DEFAULT_FORMATS,
-            minutes=DEFAULT_MINUTES if minutes is None else minutes,
-            seed=1 if seed is None else seed,
-            progress=lambda text: terminal.say(text, style="dim"),
-        )
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
-    except SumoError as error:
-        raise failure(terminal, str(error)) from None
 
 
 if __name__ == "__main__":

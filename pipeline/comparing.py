@@ -26,7 +26,7 @@ MADE_WITH = (
     "on_ramp_lanes", "protocol", "validation_part", "seed", "model",
 )  # fmt: skip
 """Of what the lake remembers its tables were built from: settings and versions, not inputs."""
-SETTINGS_IN_DIGESTS = ("protocol", "min_future_s")
+SETTINGS_IN_DIGESTS = ("protocol", "min_future_s", "drop_error_findings", "nearest")
 """Settings that the tables remember as a digest only; the report names them."""
 LIBRARIES = ("python", "versions")
 """Of the report's provenance."""
@@ -91,7 +91,7 @@ def _made_with(manifest: Manifest) -> dict[str, Any]:
     """Settings and versions by stage, as the tables remember them."""
     found: dict[str, dict[str, list[Any]]] = {}
     for entry in sorted(manifest.entries.values(), key=lambda entry: entry.key):
-        if entry.stage == "report":
+        if entry.stage in ("pages", "report"):
             continue  # no table
         for name in (name for name in MADE_WITH if name in entry.built_from):
             values = found.setdefault(entry.stage, {}).setdefault(name, [])

@@ -53,6 +53,8 @@ from pipeline.work import (
 from schemas import StructureError
 
 REPORT = "report"
+IN_PLACE = ("pages", REPORT)
+"""Stages whose files are replaced under one name: what a cached record tells of them, others may have overwritten."""
 OUR_FAULTS = (400, 422)
 """Answers of Prefect's API to a request that is wrong in itself."""
 
@@ -130,7 +132,7 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], order: Order, outcom
     settings = order.get_settings().model_dump(mode="json")
 
     def submit(job: Job, *, refresh: bool = False) -> PrefectFuture[Any]:
-        chosen = build.with_options(refresh_cache=True) if refresh else build
+        chosen = build.with_options(refresh_cache=True) if refresh or stage in IN_PLACE else build
         return chosen.submit(stage, job.title, order.lake, writer.manifest.lake_id, asdict(job), settings)
 
     by_key = {job.key: job for job in jobs}
@@ -205,7 +207,7 @@ def _work(order: Order) -> dict[str, Any]:
         if INGEST in order.steps:
             _ingest(writer, order, outcome)
         for stage in order.stages():
-            if outcome.failed and stage.name != REPORT:
+            if outcome.failed and stage.name not in IN_PLACE:
                 continue  # what comes later builds on what failed; the report shows what there is
             if INGEST in order.steps and not writer.manifest.of_stage(INGEST):
                 continue  # everything was refused
@@ -276,8 +278,8 @@ def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]
 
 @flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False, task_runner=FEW_THREADS)
 def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """One stage over what is in the lake."""
-    return _work(Order(lake, (stage,), settings=settings or {}))
+    """One stage over what is in the lake, or several (`repair+assess`)."""
+    return _work(Order(lake, tuple(stage.split("+")), settings=settings or {}))
 
 
 def execute(order: Order) -> Outcome:
@@ -289,7 +291,7 @@ def execute(order: Order) -> Outcome:
         parameters |= {"source": order.source, "dataset": order.dataset}
         parameters |= {"replace": order.replace, "prune": order.prune, "rebuild": order.rebuild}
     else:
-        (parameters["stage"],) = order.steps
+        parameters["stage"] = "+".join(order.steps)
     changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it
     if PREFECT_API_URL.value() is None:
         changed[PREFECT_API_URL] = _embed_server()

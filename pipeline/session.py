@@ -163,9 +163,13 @@ def conclude(
     outcome: "Outcome",
     *,
     headline: bool = True,
+    assess: bool = False,
     compare: Path | None = None,
 ) -> None:
-    """Say what came of an order, and what differs from a lake to compare with; exit with the code that fits."""
+    """Say what came of an order, where asked to how good repair is, or what differs from a lake to compare with.
+
+    Exits with the code that fits.
+    """
     import json
     from dataclasses import asdict
 
@@ -181,11 +185,15 @@ def conclude(
     if usable and headline and (reports / DOCUMENT).exists():
         quality = json.loads((reports / DOCUMENT).read_text(encoding="utf-8"))
         show_headline(terminal, quality, reports / PAGE, settings.lake)
-        record |= {"report": (reports / PAGE).resolve(), "headline": quality["headline"], "scores": quality["scores"]}
+        record |= {"report": (reports / PAGE).resolve(), **{key: quality[key] for key in ("headline", "model_scores")}}
     elif not usable and not outcome.refused:
         terminal.say(f"{settings.lake}: the lake holds no recordings; `tracklake ingest SOURCE` adds some")
     elif outcome.built:
         terminal.say(f"done: {', '.join(f'{stage} {count}' for stage, count in outcome.built.items())}")
+    if assess and usable and not outcome.failed:
+        from pipeline.assessing import show_assessment
+
+        record["assessment"] = show_assessment(terminal, settings.lake)
     if compare is not None and not outcome.failed:
         from pipeline.comparing import compare_lakes
 

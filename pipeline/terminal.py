@@ -128,7 +128,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         "quality": f"{_some(head['vehicles_with_errors'])} vehicles with errors; " + late,
         "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_balance(quality)}",
     }
-    for score in quality["scores"]:
+    for score in quality["model_scores"]:
         rmse = "  ".join(
             f"{row['seconds']} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
         )
@@ -158,10 +158,11 @@ def _some(count: int | None) -> str:
 
 
 def _balance(quality: dict[str, Any]) -> str:
+    beside = {row["split"] for row in quality["splits"]["recipes"] if not row["trains"]}
     parts = [
         f"{row['dataset']} {row['part']} {row['vehicle_share']:.1%}"
         for row in quality["splits"]["balance"]
-        if row["vehicle_share"] is not None
+        if row["vehicle_share"] is not None and row["split"] not in beside
     ]
     return f"; split by vehicles: {', '.join(parts)}" if parts else ""
 

@@ -11,12 +11,12 @@ from pipeline.settings import Settings
 from pipeline.stages import ingest, removal
 from pipeline.stages.base import Job, Stage, pending
 from pipeline.stages.discovery import Digests, Discovery, discover
-from pipeline.stages.registry import STAGE_BY_NAME, STAGES
+from pipeline.stages.registry import STAGES
 from quality_reports.rules import RULES, resolve
 
 INGEST = "ingest"
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
-QUALITY_STEPS = ("validate", "repair", "report")
+QUALITY_STEPS = ("validate", "repair", "assess", "report")
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,9 @@ class Order:
         resolve(RULES, self.get_settings().thresholds)
 
     def stages(self) -> list[Stage]:
-        """The stages after ingestion that are asked for."""
-        return [STAGE_BY_NAME[name] for name in self.steps if name != INGEST]
+        """The stages after ingestion that are asked for; with the report, the pages that it leads to."""
+        wanted = {*self.steps, *({"pages"} if "report" in self.steps else ())}
+        return [stage for stage in STAGES if stage.name in wanted]
 
 
 @dataclass

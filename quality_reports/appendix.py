@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from quality_reports.published import is_comparable
+from quality_reports.rendering import label_sums
 
 Row = dict[str, Any]
 
@@ -29,7 +30,7 @@ def compare_speeds(quality: Row) -> list[Row]:
     published = _by_subset(quality)
     compared = []
     for row in quality["speeds"]["per_second"]:
-        compared.append({**row, "label": _label(row), "is_published": False})
+        compared.append({**label_sums(row), "is_published": False})
         figures = published.get((row["dataset"], row["subset"]))
         if figures is not None:
             told = {name: figures.get(name) for name in FIGURES}
@@ -59,7 +60,7 @@ def count_errors(quality: Row) -> list[Row]:
     rows = []
     for (dataset, subset), counts in sorted(found.items(), key=lambda item: (item[0][0], item[0][1] or "")):
         row = {"dataset": dataset, "subset": subset}
-        rows.append({**row, **counts, "label": _label(row), "is_published": False})
+        rows.append({**label_sums(row), **counts, "is_published": False})
         figures = published.get((dataset, subset))
         if figures is not None:
             rows.append({**_published_row(row), **_published_counts(figures)})
@@ -93,10 +94,6 @@ def _published_counts(figures: Row) -> Row:
 
 def _share(part: int | None, whole: int | None) -> float | None:
     return part / whole if part is not None and whole else None
-
-
-def _label(row: Row) -> str:
-    return row["subset"] if row["subset"] is not None else f"all of {row['dataset']}"
 
 
 def _published_row(row: Row) -> Row:

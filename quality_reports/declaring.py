@@ -1,8 +1,8 @@
 """What a rule is: a declaration from which checks, findings, report rows and documentation follow."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import polars as pl
 
@@ -29,6 +29,25 @@ class Threshold:
 
 
 @dataclass(frozen=True)
+class Case:
+    """A few entries just beyond a rule's thresholds and just within, worked out by hand: its example and its test.
+
+    Args:
+        entries: values by column of `tracks` and `vehicles`, one per entry. What is not said: each entry is of a
+            vehicle of its own (a car, 4 m x 2 m) in frame 1, in lane 1, at x = y = 0, 20 m/s, neither speeding up nor
+            slowing down; anything else is null.
+        breaks: the places of those that break the rule.
+        frame_rate_hz: of the source.
+        lane_markings_m: y_m of the lane markings, leftmost first.
+    """
+
+    entries: Mapping[str, Sequence[Any]]
+    breaks: tuple[int, ...]
+    frame_rate_hz: float = 25.0
+    lane_markings_m: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
 class Rule:
     """What is wrong with an entry, declared.
 
@@ -45,6 +64,8 @@ class Rule:
         value: what is reported of a breaking entry, in `unit`; never null where the rule is broken. An expression, or
             thresholds by name -> expression where it depends on them.
         extreme: which end of `value` is the worst.
+        compared: how exactly, in words: what equals a threshold in the source's decimals must not exceed it.
+        case: its example.
     """
 
     name: str
@@ -56,6 +77,8 @@ class Rule:
     breaks: Callable[[Limits], pl.Expr]
     value: pl.Expr | Callable[[Limits], pl.Expr]
     extreme: Literal["min", "max"]
+    compared: str
+    case: Case
 
     @property
     def defaults(self) -> dict[str, float]:

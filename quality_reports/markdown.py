@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from quality_reports.declaring import Case
 from quality_reports.rules import RULES, Rule
 
 HEAD = """# Rules
@@ -10,9 +11,12 @@ Derived from `quality_reports/`; do not edit (`make docs` writes it).
 
 A finding is a run of consecutive entries of one vehicle that breaks one rule. Findings flag; nothing is deleted. Errors
 cannot be, warnings hardly can, infos are worth knowing. Thresholds are settings: `[thresholds]` in `tracklake.toml`.
-A rule is not checked where the source lacks a column that it reads, and the report says so. Values that are compared
-with a threshold are rounded first (lengths to 1 mm, speeds to 0.1 mm/s, jerk to 1 mm/s3), so that what equals it in the
-source's decimals does not exceed it.
+A rule is not checked where the source lacks a column that it reads, and the report says so. What equals a threshold in
+the source's decimals does not exceed it; how exactly values are compared stands with each rule.
+
+In the examples a line is an entry, at the default thresholds. What they do not say: each entry is of a vehicle of its
+own, a car of 4 m x 2 m, in frame 1 of 25 Hz, in lane 1, at x = y = 0, at 20 m/s and no acceleration. An empty cell is
+null.
 """
 
 
@@ -37,8 +41,25 @@ def _section(rule: Rule) -> Iterator[str]:
     yield ""
     yield f"- Thresholds: {', '.join(thresholds)}"
     yield f"- Reads: {', '.join(f'`{name}`' for name in rule.columns)}"
+    yield f"- Compared: {rule.compared}"
     yield f"- Source: {rule.source}"
     yield ""
+    yield from _example(rule.case)
+    yield ""
+
+
+def _example(case: Case) -> Iterator[str]:
+    facts = [f"{case.frame_rate_hz:g} Hz"] if case.frame_rate_hz != Case.frame_rate_hz else []
+    if case.lane_markings_m is not None:
+        facts.append(f"lane markings at {' m, '.join(map('{:g}'.format, case.lane_markings_m))} m")
+    if facts:
+        yield f"Example, {', '.join(facts)}:"
+        yield ""
+    yield f"| {' | '.join(case.entries)} | breaks it |"
+    yield "| --- " * (len(case.entries) + 1) + "|"
+    for place, values in enumerate(zip(*case.entries.values(), strict=True)):
+        shown = ("" if value is None else f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+        yield f"| {' | '.join(shown)} | {'yes' if place in case.breaks else ''} |"
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import altair as alt
 import vl_convert
 
 from quality_reports.rasters import VIRIDIS
+from schemas.start_assessments import ESTIMATORS
 
 Row = dict[str, Any]
 
@@ -137,6 +138,64 @@ def draw_start_positions(positions: Sequence[Row], starts: Sequence[Row]) -> str
     return _svg(alt.vconcat(*charts))
 
 
+def draw_assessments(positions: Sequence[Row]) -> str:
+    """How good repair windows are by where tracks start: coverage and excess per estimator, a row of two per data set.
+
+    Args:
+        positions: rows of assessed_positions.sql.
+    """
+    data = _data(
+        {
+            "dataset": row["dataset"],
+            "beyond_m": row["beyond_m"],
+            "estimator": name_estimator(row["estimator"]),
+            "coverage": None if row["coverage"] is None else 100 * row["coverage"],
+            "excess": None if row["excess"] is None else 100 * row["excess"],
+        }
+        for row in positions
+    )
+    names = [name_estimator(name) for name in ESTIMATORS]
+    marks = (
+        alt.Chart(data)
+        .mark_line(point=alt.OverlayMarkDef(size=46, filled=True, opacity=1), strokeWidth=1.5)
+        .encode(
+            x=alt.X("beyond_m:Q", title="start beyond the cut-off (m)", axis=alt.Axis(tickCount=5)),
+            color=alt.Color(
+                "estimator:N", title=None, scale=alt.Scale(domain=names, range=[BLUE, ORANGE, MUTED, GREEN]), sort=names
+            ),
+            shape=alt.Shape(
+                "estimator:N", title=None, scale=alt.Scale(domain=names, range=["circle", "square", "cross", "diamond"])
+            ),
+        )
+        .properties(width=(WIDTH - 130) // 2, height=190)
+    )
+    return _svg(
+        alt.vconcat(
+            *(
+                alt.hconcat(
+                    *(
+                        marks.encode(
+                            y=alt.Y(f"{figure}:Q", title=title, scale=alt.Scale(zero=zero), axis=alt.Axis(tickCount=5))
+                        )
+                        .transform_filter(alt.datum.dataset == dataset)
+                        .properties(title=dataset)
+                        for figure, title, zero in (
+                            ("coverage", "covered (% of missing time)", False),
+                            ("excess", "in vain (% of missing time)", True),
+                        )
+                    )
+                )
+                for dataset in _names(positions, "dataset")
+            )
+        )
+    )
+
+
+def name_estimator(name: str) -> str:
+    """What an estimator is called on plots and in tables."""
+    return name.replace("_", " ")
+
+
 def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, dataset: str) -> str:
     """How alike the parts of one dataset's split are: each subset's flow, each part's weighted mean and deviation.
 
@@ -179,6 +238,66 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
     deviation = spread.mark_rule(color=INK, yOffset=17).encode(x=alt.X("from:Q", scale=x_scale), x2="to:Q")
     mean = spread.mark_tick(color=INK, thickness=2, size=12, yOffset=17).encode(x="flow_mean_veh_per_lane_s:Q")
     return _svg((subsets + deviation + mean).properties(width=WIDTH, height=52 * max(1, len(present))))
+
+
+def draw_shared(shared: Sequence[Row], splits: Sequence[str]) -> str:
+    """What part of the evaluation is also in training, per dataset: one bar per split and kind of thing.
+
+    Args:
+        shared: split, dataset, what, percent.
+        splits: their names, in order.
+    """
+    kinds = _names(shared, "what")
+    bars = (
+        alt.Chart(_data(shared))
+        .mark_bar(height=9)
+        .encode(
+            x=alt.X("percent:Q", title="of the evaluation part (%)", scale=alt.Scale(domain=[0, 100])),
+            y=alt.Y("split:N", title=None, sort=list(splits), axis=alt.Axis(labelLimit=LABEL_LIMIT)),
+            yOffset=alt.YOffset("what:N", sort=kinds),
+            color=alt.Color(
+                "what:N", title=None, sort=kinds, scale=alt.Scale(domain=kinds, range=[BLUE, ORANGE, GREEN, MUTED])
+            ),
+        )
+        .properties(width=WIDTH - LABEL_LIMIT, height=alt.Step(14))
+        .facet(row=alt.Row("dataset:N", title=None, header=_ROW_HEADER))
+    )
+    return _svg(bars)
+
+
+def draw_shifts(shifts: Sequence[Row], splits: Sequence[str]) -> str:
+    """How far training and evaluation differ, per dataset and quantity: one mark per split.
+
+    Args:
+        shifts: rows of split_shifts.sql, of one pair of parts.
+        splits: their names, in order.
+    """
+    marks = (
+        alt.Chart(_data(shifts))
+        .mark_point(filled=True, size=90, opacity=0.85)
+        .encode(
+            x=alt.X("shift:Q", title="greatest difference of the cumulative distributions", scale=alt.Scale(zero=True)),
+            y=alt.Y("quantity:N", title=None, sort=_names(shifts, "quantity"), axis=alt.Axis(grid=True)),
+            color=alt.Color(
+                "split:N",
+                title=None,
+                sort=list(splits),
+                scale=alt.Scale(domain=list(splits), range=[BLUE, GREEN, MUTED, ORANGE]),
+            ),
+            shape=alt.Shape(
+                "split:N",
+                title=None,
+                sort=list(splits),
+                scale=alt.Scale(domain=list(splits), range=["circle", "square", "cross", "diamond"]),
+            ),
+        )
+        .properties(width=WIDTH - LABEL_LIMIT, height=5 * 26)
+        .facet(row=alt.Row("dataset:N", title=None, header=_ROW_HEADER))
+    )
+    return _svg(marks)
+
+
+_ROW_HEADER = alt.Header(labelColor=INK, labelAngle=0, labelAlign="left", labelFontSize=13)
 
 
 def draw_fundamental(intervals: Sequence[Row]) -> str:

@@ -10,9 +10,11 @@ from markupsafe import Markup
 
 from quality_reports import plots
 from quality_reports.appendix import compare_speeds, count_errors
+from quality_reports.assessments import tabulate_assessments
+from quality_reports.page_names import FOLDER, name_pages
 from quality_reports.rendering import flatten, make_environment, read_style
 from quality_reports.rules import RULES, Rule
-from quality_reports.subset_pages import FOLDER, name_pages
+from quality_reports.split_page import SPLITS_PAGE, compare_splits, render_splits
 from quality_reports.summaries import Connection, Row, collect
 
 
@@ -23,10 +25,12 @@ class Report:
     Args:
         html: the page; it fetches nothing.
         quality: the page's numbers as plain values; its keys are those of `quality_reports.summaries.collect`.
+        splits_html: the page of the splits; None where there are none.
     """
 
     html: str
     quality: dict[str, Any]
+    splits_html: str | None = None
 
     @property
     def json(self) -> str:
@@ -40,6 +44,7 @@ def build_report(
     *,
     rules: Sequence[Rule] = RULES,
     scores: Sequence[Mapping[str, Any]] | None = None,
+    pages: Mapping[tuple[str, str], str] | None = None,
 ) -> Report:
     """Query the lake's views and render the report.
 
@@ -48,16 +53,18 @@ def build_report(
         provenance: lake, tracklake, versions, settings, created...: shown as given; `thresholds` are the overrides.
         rules: what validation judged by.
         scores: [{model, part, rows: [{seconds, rmse_m, n}]}], where models were evaluated.
+        pages: file names of the subsets' pages that there are, by (dataset, subset); None: of all subsets.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     quality = collect(connection, provenance, rules=rules, scores=scores)
-    return Report(html=render(quality), quality=quality)
+    return Report(html=render(quality, pages), quality=quality, splits_html=render_splits(quality))
 
 
-def render(quality: Row) -> str:
+def render(quality: Row, pages: Mapping[tuple[str, str], str] | None = None) -> str:
     """Render the page from what `collect` returns. Everything but our own style sheet and plots is escaped."""
+    pages = name_pages(quality["subsets"]) if pages is None else pages
     return (
         make_environment()
         .get_template("report.html.j2")
@@ -74,8 +81,12 @@ def render(quality: Row) -> str:
             settings=flatten(_without_known(quality["provenance"])),
             compared_speeds=compare_speeds(quality),
             counted_errors=count_errors(quality),
-            pages={key: f"{FOLDER}/{quote(name)}" for key, name in name_pages(quality["subsets"]).items()},
-            horizons=sorted({row["seconds"] for score in quality["scores"] for row in score["rows"]}),
+            compared_splits=compare_splits(quality["splits"]),
+            splits_page=SPLITS_PAGE,
+            assessed=tabulate_assessments(quality["starts"]["assessed"]),
+            name_estimator=plots.name_estimator,
+            pages={key: f"{FOLDER}/{quote(name)}" for key, name in pages.items()},
+            horizons=sorted({row["seconds"] for score in quality["model_scores"] for row in score["rows"]}),
         )
     )
 
@@ -88,7 +99,9 @@ def _without_known(provenance: Row) -> Row:
 def _drawings(quality: Row) -> dict[str, Any]:
     """The page's plots by name, as markup; None where there is nothing to draw."""
     speeds, starts, splits = quality["speeds"], quality["starts"], quality["splits"]
-    parts = dict.fromkeys((row["split"], row["dataset"]) for row in splits["balance"])
+    # The others stand on the page of splits.
+    beside = {row["split"] for row in splits["recipes"] if not row["trains"]}
+    parts = dict.fromkeys((row["split"], row["dataset"]) for row in splits["balance"] if row["split"] not in beside)
     return {
         "speed_histogram": Markup(plots.draw_speed_histogram(speeds["histogram"], speeds["summary"]))
         if speeds["histogram"]
@@ -96,6 +109,9 @@ def _drawings(quality: Row) -> dict[str, Any]:
         "speed_ranges": Markup(plots.draw_speed_ranges(speeds["summary"])) if speeds["summary"] else None,
         "start_positions": Markup(plots.draw_start_positions(starts["positions"], starts["subsets"]))
         if starts["positions"] and starts["subsets"]
+        else None,
+        "assessments": Markup(plots.draw_assessments(starts["assessed"]["positions"]))
+        if starts["assessed"]["positions"]
         else None,
         "splits": {
             (split, dataset): Markup(plots.draw_split(splits["members"], splits["balance"], split, dataset))

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from quality_reports.declaring import Rule, Threshold, recorded
+from quality_reports.declaring import Case, Rule, Threshold, recorded
 
 DESIGN = "docs/DESIGN.md, section 5"
 PUNZO = "Punzo, Borzacchiello and Ciuffo (2011)"
@@ -28,6 +28,8 @@ HIGH_ACCELERATION = Rule(
     breaks=lambda limits: pl.col("accel_mps2") > recorded(limits["high_acceleration_mps2"]),
     value=pl.col("accel_mps2"),
     extreme="max",
+    compared="as recorded, in single precision",
+    case=Case({"accel_mps2": (3.05, 3.06, None)}, breaks=(1,)),
 )
 
 LOW_CONSTANT_SPEED = Rule(
@@ -45,6 +47,8 @@ LOW_CONSTANT_SPEED = Rule(
     ),
     value=pl.col("speed_mps"),
     extreme="min",
+    compared="as recorded, in single precision",
+    case=Case({"speed_mps": (0.0, 1.52, 1.53, 1.0), "accel_mps2": (0.0, 0.0, 0.0, 0.01)}, breaks=(1,)),
 )
 
 BACKWARD = Rule(
@@ -57,6 +61,8 @@ BACKWARD = Rule(
     breaks=lambda limits: pl.col("speed_mps") < recorded(limits["backward_mps"]),
     value=pl.col("speed_mps"),
     extreme="min",
+    compared="as recorded, in single precision",
+    case=Case({"speed_mps": (0.0, -0.01)}, breaks=(1,)),
 )
 
 POSITION_JUMP = Rule(
@@ -71,6 +77,11 @@ POSITION_JUMP = Rule(
     breaks=lambda limits: pl.col("jump_m") > limits["position_jump_m"],
     value=pl.col("jump_m"),
     extreme="max",
+    compared="rounded to 1 μm",
+    case=Case(
+        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "x_m": (0.0, 2.8, 0.0, 2.801), "speed_mps": (20.0,) * 4},
+        breaks=(3,),  # 0.8 m are driven in a frame
+    ),
 )
 
 FRAME_GAP = Rule(
@@ -84,6 +95,8 @@ FRAME_GAP = Rule(
     breaks=lambda limits: pl.col("frames_skipped") > limits["frame_gap_frames"],
     value=pl.col("frames_skipped"),
     extreme="max",
+    compared="whole numbers",
+    case=Case({"vehicle_id": (1, 1, 1), "frame": (1, 2, 4)}, breaks=(2,)),
 )
 
 SPEED_MISMATCH = Rule(
@@ -97,6 +110,8 @@ SPEED_MISMATCH = Rule(
     breaks=lambda limits: speed_difference > limits["speed_mismatch_mps"],
     value=speed_difference,
     extreme="max",
+    compared="rounded to 0.1 mm/s",
+    case=Case({"speed_mps": (20.01, 20.02, 20.0), "speed_10hz_mps": (19.01, 19.01, None)}, breaks=(1,)),
 )
 
 HIGH_JERK = Rule(
@@ -110,6 +125,12 @@ HIGH_JERK = Rule(
     breaks=lambda limits: pl.col("jerk_mps3").abs() > limits["high_jerk_mps3"],
     value=pl.col("jerk_mps3").abs(),
     extreme="max",
+    compared="rounded to 1 mm/s³",
+    case=Case(
+        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "accel_mps2": (0.0, -1.5, 0.0, -1.51)},
+        breaks=(3,),
+        frame_rate_hz=10.0,
+    ),
 )
 
 JERK_FLICKER = Rule(
@@ -124,4 +145,10 @@ JERK_FLICKER = Rule(
     breaks=lambda limits: pl.col("jerk_reversals") > limits["jerk_flicker_changes"],
     value=pl.col("jerk_reversals"),
     extreme="max",
+    compared="whole numbers; changes of acceleration of less than 0.05 mm/s² are none",
+    case=Case(
+        {"vehicle_id": (1,) * 5, "frame": (1, 2, 3, 4, 5), "accel_mps2": (0.0, 0.1, 0.1, 0.0, 0.1)},
+        breaks=(4,),  # up, level, down, up
+        frame_rate_hz=10.0,
+    ),
 )

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from quality_reports.declaring import Limits, Rule, Threshold, recorded
+from quality_reports.declaring import Case, Limits, Rule, Threshold, recorded
 
 DESIGN = "docs/DESIGN.md, section 5"
 COIFMAN = "Coifman and Li (2017)"
@@ -17,6 +17,8 @@ NEGATIVE_HEADWAY = Rule(
     breaks=lambda limits: pl.col("gap_m") < limits["negative_headway_m"],
     value=pl.col("gap_m"),
     extreme="min",
+    compared="to 1 mm, as ingestion rounds it",
+    case=Case({"gap_m": (0.0, -0.001, None)}, breaks=(1,)),
 )
 
 NEGATIVE_HEADWAY_RECORDED = Rule(
@@ -31,6 +33,8 @@ NEGATIVE_HEADWAY_RECORDED = Rule(
     breaks=lambda limits: pl.col("recorded_gap_m") < limits["negative_headway_recorded_m"],
     value=pl.col("recorded_gap_m"),
     extreme="min",
+    compared="rounded to 1 mm",
+    case=Case({"leader_id": (None, 1, 1), "headway_recorded_m": (None, 4.0, 3.999)}, breaks=(2,)),
 )
 
 OVERLAP = Rule(
@@ -46,6 +50,8 @@ OVERLAP = Rule(
     breaks=lambda limits: pl.col("overlap_m") > limits["overlap_m"],
     value=pl.col("overlap_m"),
     extreme="max",
+    compared="rounded to 1 mm",
+    case=Case({"x_m": (10.0, 14.0, 110.0, 113.999)}, breaks=(2, 3)),
 )
 
 LANE_FLICKER = Rule(
@@ -60,6 +66,16 @@ LANE_FLICKER = Rule(
     breaks=lambda limits: pl.col("lane_stay_s") <= limits["lane_flicker_s"],
     value=pl.col("lane_stay_s"),
     extreme="min",
+    compared="as it is",
+    case=Case(
+        {
+            "vehicle_id": (1, 1, 1, 1, 2, 2, 2, 2, 2),
+            "frame": (1, 2, 3, 4, 1, 2, 3, 4, 5),
+            "lane": (1, 2, 2, 1, 1, 2, 2, 2, 1),
+        },
+        breaks=(1, 2),
+        frame_rate_hz=1.0,
+    ),
 )
 
 leader, nearest = pl.col("leader_ahead_m"), pl.col("nearest_ahead_m")
@@ -82,6 +98,15 @@ LEADER_MISMATCH = Rule(
     ),
     value=(leader.fill_null(0.0) - nearest.fill_null(0.0)).abs(),
     extreme="max",
+    compared="rounded to 0.1 mm",
+    case=Case(
+        {
+            "x_m": (0.0, 20.0, 50.0, 150.1, 0.0),
+            "lane": (1, 1, 1, 1, 2),
+            "leader_id": (2, None, None, None, 1),
+        },
+        breaks=(1, 4),
+    ),
 )
 
 headway_difference = (pl.col("recorded_gap_m") - pl.col("gap_m")).abs().round(3)
@@ -98,6 +123,11 @@ HEADWAY_MISMATCH = Rule(
     breaks=lambda limits: headway_difference > limits["headway_mismatch_m"],
     value=headway_difference,
     extreme="max",
+    compared="rounded to 1 mm",
+    case=Case(
+        {"leader_id": (None, 1, 1), "headway_recorded_m": (None, 15.0, 15.01), "gap_m": (None, 10.0, 10.0)},
+        breaks=(2,),
+    ),
 )
 
 SIZES_M: dict[str, dict[str, tuple[float, float]]] = {
@@ -147,6 +177,8 @@ IMPLAUSIBLE_SIZE = Rule(
     breaks=lambda limits: _beyond_bounds(limits) > 0,
     value=_beyond_bounds,
     extreme="max",
+    compared="as recorded, in single precision",
+    case=Case({"class": ("car", "car", "truck"), "length_m": (8.0, 8.01, 8.01)}, breaks=(1,)),
 )
 
 OUTSIDE_LANE = Rule(
@@ -160,4 +192,6 @@ OUTSIDE_LANE = Rule(
     breaks=lambda limits: pl.col("out_of_lane_m") > limits["outside_lane_m"],
     value=pl.col("out_of_lane_m"),
     extreme="max",
+    compared="rounded to 1 mm",
+    case=Case({"y_m": (0.0, 3.75, 3.751)}, breaks=(2,), lane_markings_m=(0.0, 3.75)),
 )

@@ -1,7 +1,5 @@
 """One page per subset beside the overview: its facts, findings, time-space diagrams, flow, worst examples, scores."""
 
-import hashlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -10,63 +8,38 @@ from markupsafe import Markup
 from quality_reports import plots
 from quality_reports.examples import find_examples
 from quality_reports.flow import draw_flow
+from quality_reports.page_names import name_pages
 from quality_reports.rendering import make_environment, read_style
 from quality_reports.rules import RULES, Rule
 from quality_reports.summaries import Connection, Row, query, query_frame
 from quality_reports.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
 
-FOLDER = "subsets"
-"""Of the pages, beside the overview."""
 INTERVALS_S = (5.0, 10.0, 30.0, 60.0)
 """Lengths of the intervals of flow, density and speed: the longest of which a recording has at least FEWEST."""
 FEWEST = 15
 MOST_ROWS = 10
 """Rows of a table of single vehicles."""
-LONGEST_NAME = 80
 
 MAIN_KEYS = ("dataset", "subset")
 
 
-def name_pages(subsets: Sequence[Row]) -> dict[tuple[str, str], str]:
-    """The file name of every subset's page by (dataset, subset): the subset's name where that may be a file's name.
-
-    Other characters than ASCII letters, digits, dots, hyphens and underscores are written as ~ and two digits a byte;
-    long names are cut. Names that would be the same file, also where letters' case is ignored, get a suffix.
-
-    Args:
-        subsets: dataset and subset of each.
-    """
-    names = {(row["dataset"], row["subset"]): _name_file(row["subset"]) for row in subsets}
-    taken = [name.lower() for name in names.values()]
-    return {
-        key: f"{name if taken.count(name.lower()) == 1 else f'{name}~{_hash(*key)}'}.html"
-        for key, name in names.items()
-    }
-
-
-def _name_file(subset: str) -> str:
-    safe = re.sub(
-        r"[^A-Za-z0-9._-]|^\.",
-        lambda found: "".join(f"~{byte:02x}" for byte in found[0].encode("utf-8", "surrogatepass")),
-        subset,
-    )
-    return safe if 0 < len(safe) <= LONGEST_NAME else f"{safe[:LONGEST_NAME]}~{_hash(subset)}"
-
-
-def _hash(*texts: str) -> str:
-    return hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
-
-
-def render_pages(connection: Connection, quality: Row, *, rules: Sequence[Rule] = RULES) -> Iterator[tuple[str, str]]:
+def render_pages(
+    connection: Connection,
+    quality: Row,
+    *,
+    rules: Sequence[Rule] = RULES,
+    names: Mapping[tuple[str, str], str] | None = None,
+) -> Iterator[tuple[str, str]]:
     """Render the subsets' pages one after another, as (file name, html): they are many, and large.
 
     Args:
         connection: with the catalog's views and its macros flow_density and lane_changes.
-        quality: the overview's numbers, as `quality_reports.summaries.collect` returns them.
+        quality: the overview's numbers, as `quality_reports.summaries.collect` returns them, of these subsets at least.
         rules: what validation judged by.
+        names: of the files by (dataset, subset), where there are other subsets besides.
     """
     template = make_environment().get_template("subset.html.j2")
-    names = name_pages(quality["subsets"])
+    names = names or name_pages(quality["subsets"])
     extremes = {rule.name: rule.extreme for rule in rules}
     declared = [
         {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
@@ -102,7 +75,7 @@ def _select(quality: Row, subset: Row) -> Row:
         "start_positions": Markup(plots.draw_start_positions(positions, starts)) if positions and starts else None,
         "samples": of_subset(quality["samples"]["subsets"]),
         "parts": of_subset(quality["splits"]["members"]),
-        "feasibility": next(iter(of_subset(quality["feasibility"])), None),
+        "subset_scores": next(iter(of_subset(quality["subset_scores"])), None),
         "per_second": next(iter(of_subset(quality["speeds"]["per_second"])), None),
         "left_out": [
             row

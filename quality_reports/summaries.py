@@ -12,6 +12,8 @@ import polars as pl
 from quality_reports.published import SOURCE, list_published
 from quality_reports.rules import RULES, Rule, describe
 from schemas.columns import PARTS
+from schemas.split_leakage import QUANTITIES
+from schemas.start_assessments import ESTIMATORS
 
 QUALITY_SCHEMA = "tracklake/quality/1"
 SIGNIFICANT_DIGITS = 10
@@ -113,21 +115,23 @@ def collect(
         speeds: {summary: rows of speeds.sql, per_second: rows of speeds_per_second.sql, histogram: rows of
             speed_histogram.sql}.
         recordings: rows of recordings.sql.
-        feasibility: rows of scores.sql.
+        subset_scores: rows of subset_scores.sql.
         published: {source, figures: fields of quality_reports.published.Published}.
-        starts: {subsets: rows of starts.sql, positions: rows of start_positions.sql}.
+        starts: {subsets: rows of starts.sql, positions: rows of start_positions.sql, assessed: {subsets: rows of
+            assessed_subsets.sql, positions: rows of assessed_positions.sql}}.
         samples: {subsets: rows of samples.sql, drops: rows of sample_drops.sql}.
-        splits: {balance: rows of split_balance.sql, members: rows of split_members.sql}.
+        splits: {recipes, balance, members, leakage, context, shifts, left_out: rows of split_<name>.sql}.
         completeness: rows of completeness.sql.
         ingestion: {files: rows of ingested_files.sql, rejects: rows of rejects.sql}.
-        scores: [{model, part, rows: [{seconds, rmse_m, n}]}], empty unless given.
+        model_scores: [{model, part, rows: [{seconds, rmse_m, n}]}], empty unless given.
         provenance: as given, and source_files: rows of source_files.sql.
 
     Args:
-        connection: with the views tracks, vehicles, subsets, findings, start_cutoffs, missing_starts, samples,
-            sample_drops, neighbors, splits, split_balance, completeness, ingest_log and rejects; they may be empty.
+        connection: with the views tracks, vehicles, subsets, findings, start_cutoffs, missing_starts,
+            start_assessments, samples, sample_drops, neighbors, the tables of splits, completeness, ingest_log,
+            rejects and sample_counts; they may be empty.
         provenance: anything worth citing: lake, tracklake, versions, settings...; `thresholds`, where given, are the
-            overrides that validation ran with.
+            overrides that validation ran with (of most recordings; `thresholds_elsewhere` those of the others).
         rules: what validation judged by.
         scores: what evaluation found.
 
@@ -147,13 +151,25 @@ def collect(
             "histogram": query(connection, "speed_histogram"),
         },
         "recordings": query(connection, "recordings"),
-        "feasibility": query(connection, "scores"),
+        "subset_scores": query(connection, "subset_scores"),
         "published": {"source": SOURCE, "figures": list_published()},
-        "starts": {"subsets": query(connection, "starts"), "positions": query(connection, "start_positions")},
+        "starts": {
+            "subsets": query(connection, "starts"),
+            "positions": query(connection, "start_positions"),
+            "assessed": {
+                "subsets": query(connection, "assessed_subsets", {"estimators": list(ESTIMATORS)}),
+                "positions": query(connection, "assessed_positions", {"estimators": list(ESTIMATORS)}),
+            },
+        },
         "samples": {"subsets": query(connection, "samples"), "drops": query(connection, "sample_drops")},
         "splits": {
+            "recipes": query(connection, "split_recipes"),
             "balance": query(connection, "split_balance", {"parts": list(PARTS)}),
             "members": query(connection, "split_members", {"parts": list(PARTS)}),
+            "leakage": query(connection, "split_leakage", {"parts": list(PARTS)}),
+            "context": query(connection, "split_context", {"parts": list(PARTS)}),
+            "shifts": query(connection, "split_shifts", {"parts": list(PARTS), "quantities": list(QUANTITIES)}),
+            "left_out": query(connection, "split_left_out"),
         },
         "completeness": query(connection, "completeness"),
         "ingestion": {
@@ -164,18 +180,14 @@ def collect(
                 {"rejects_per_file": REJECTS_PER_FILE, "reject_characters": REJECT_CHARACTERS},
             ),
         },
-        "scores": plain(list(scores or ())),
+        "model_scores": plain(list(scores or ())),
         "provenance": {**plain(provenance), "source_files": query(connection, "source_files")},
     }
 
 
 def _rules(connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]) -> list[Row]:
     """Each rule's declaration, with what was found in the whole lake, per dataset and per subset."""
-    rows = query(
-        connection,
-        "findings",
-        {"rules": [rule.name for rule in rules], "columns": [list(rule.columns) for rule in rules]},
-    )
+    rows = query(connection, "findings", {"rules": [rule.name for rule in rules]})
     extremes = {rule.name: "least" if rule.extreme == "min" else "greatest" for rule in rules}
     found: dict[str, list[Row]] = {rule.name: [] for rule in rules}
     for row in rows:

@@ -5,9 +5,11 @@ from schemas.completeness import COMPLETENESS
 from schemas.findings import FINDINGS
 from schemas.ingestion import INGEST_LOG, REJECTS
 from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
-from schemas.samples import NEIGHBORS, SAMPLE_DROPS, SAMPLES
+from schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
 from schemas.scores import SUBSET_SCORES, VEHICLE_SCORES
-from schemas.splits import SPLIT_BALANCE, SPLITS
+from schemas.split_leakage import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS
+from schemas.splits import SPLIT_BALANCE, SPLIT_LEFT_OUT, SPLIT_RECIPES, SPLITS
+from schemas.start_assessments import START_ASSESSMENTS
 from schemas.subsets import SUBSET_STATUS, SUBSETS
 from schemas.tracks import TRACKS
 from schemas.vehicles import VEHICLE_STARTS, VEHICLES
@@ -29,11 +31,18 @@ TABLES: tuple[Table, ...] = (
     SUBSET_SCORES,
     START_CUTOFFS,
     MISSING_STARTS,
+    START_ASSESSMENTS,
     SAMPLES,
     SAMPLE_DROPS,
+    SAMPLE_COUNTS,
     NEIGHBORS,
     SPLITS,
+    SPLIT_LEFT_OUT,
+    SPLIT_RECIPES,
     SPLIT_BALANCE,
+    SPLIT_LEAKAGE,
+    SPLIT_CONTEXT,
+    SPLIT_SHIFTS,
 )
 
 __all__ = [
@@ -44,10 +53,17 @@ __all__ = [
     "NEIGHBORS",
     "REJECTS",
     "SAMPLES",
+    "SAMPLE_COUNTS",
     "SAMPLE_DROPS",
     "SCHEMA_VERSION",
     "SPLITS",
     "SPLIT_BALANCE",
+    "SPLIT_CONTEXT",
+    "SPLIT_LEAKAGE",
+    "SPLIT_LEFT_OUT",
+    "SPLIT_RECIPES",
+    "SPLIT_SHIFTS",
+    "START_ASSESSMENTS",
     "START_CUTOFFS",
     "SUBSETS",
     "SUBSET_SCORES",

@@ -9,7 +9,7 @@ from pipeline.lake import connect
 
 THRESHOLD = {"TRACKLAKE_THRESHOLDS": '{"high_acceleration_mps2": 1.5}'}
 FOUND = (
-    "SELECT subset, count(*), count(DISTINCT vehicle_id), sum(entries)::BIGINT FROM findings "
+    "SELECT subset, count(*), count(DISTINCT vehicle_id), sum(entries) FROM findings "
     "WHERE rule = 'high_acceleration' GROUP BY subset"
 )
 
@@ -41,9 +41,10 @@ def test_a_copy_is_said_to_be_equal(command, lake, copied):
     assert (done.code, compared["equal"]) == (0, True)
 
 
+@pytest.mark.usefixtures("prefect_here")
 def test_another_threshold_changes_its_findings_only(command, lake, copied):
-    assert command("validate", "--lake", copied, **THRESHOLD).code == 0
-    done = command("report", "--lake", copied, "--compare", lake.root, "--json", **THRESHOLD)
+    assert command.here("validate", "--lake", copied, **THRESHOLD).code == 0
+    done = command.here("report", "--lake", copied, "--compare", lake.root, "--json", **THRESHOLD)
     assert done.code == 0, done.err
     record = json.loads(done.out)
     compared = record["comparison"]
@@ -81,7 +82,7 @@ def test_another_threshold_changes_its_findings_only(command, lake, copied):
 
 
 def test_what_is_no_lake_is_refused_before_any_work(command, lake, tmp_path):
-    done = command("report", "--lake", lake.root, "--compare", tmp_path)
+    done = command.here("report", "--lake", lake.root, "--compare", tmp_path)
     assert done.code == 1
     assert done.err.startswith(f"error: {tmp_path}: no lake here (no manifest.json).")
     assert done.out == ""

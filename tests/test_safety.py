@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.lake import connect
+
 HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
 BASE = 1_118_846_978_900  # us-101-0750
 
@@ -23,27 +25,28 @@ def write_part(path: Path, vehicles: range, feet: float = 0.0) -> Path:
     return path
 
 
-def count(command, lake) -> int:
-    out = command("sql", "SELECT count(*) AS n FROM tracks", "--lake", lake, "--format", "json").out
-    return json.loads(out)[0]["n"]
+def count(lake) -> int:
+    with connect(lake) as connection:
+        return connection.sql("SELECT count(*) FROM tracks").fetchall()[0][0]
 
 
+@pytest.mark.usefixtures("prefect_here")
 def test_a_second_part_of_a_recording_does_not_replace_the_first(command, tmp_path):
     lake, raw = tmp_path / "lake", tmp_path / "raw"
     first, second = write_part(raw / "a.csv", range(1, 3)), write_part(raw / "b.csv", range(3, 6))
-    assert command("ingest", first, "--lake", lake).code == 0
-    refused = command("ingest", second, "--lake", lake)
+    assert command.here("ingest", first, "--lake", lake).code == 0
+    refused = command.here("ingest", second, "--lake", lake)
     assert refused.code == 3
     assert "recording us-101-0750: it is in the lake already, from a.csv, and now came from b.csv" in refused.err
-    assert count(command, lake) == 20
-    assert command("ingest", second, "--lake", lake).code == 3, "asked again, refused again"
-    assert command("ingest", raw, "--lake", lake).code == 0, "both at once"
-    assert count(command, lake) == 50
-    assert command("ingest", second, "--lake", lake, "--replace").code == 0
-    assert count(command, lake) == 30
+    assert count(lake) == 20
+    assert command.here("ingest", second, "--lake", lake).code == 3, "asked again, refused again"
+    assert command.here("ingest", raw, "--lake", lake).code == 0, "both at once"
+    assert count(lake) == 50
+    assert command.here("ingest", second, "--lake", lake, "--replace").code == 0
+    assert count(lake) == 30
     write_part(second, range(3, 5))
-    assert command("ingest", second, "--lake", lake).code == 0, "a new version of the same file"
-    assert count(command, lake) == 20
+    assert command.here("ingest", second, "--lake", lake).code == 0, "a new version of the same file"
+    assert count(lake) == 20
 
 
 def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path):
@@ -52,43 +55,46 @@ def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path):
     done = command("run", "--lake", tmp_path / "lake", "--minutes", "0.1")
     assert done.code == 1
     assert "holds recordings that are not this generated sample (a.csv)" in done.err
-    assert count(command, tmp_path / "lake") == 20
+    assert count(tmp_path / "lake") == 20
 
 
+@pytest.mark.usefixtures("prefect_here")
 def test_stages_refuse_what_was_made_with_other_settings(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)
     strict = {"TRACKLAKE_MAX_BACKWARD_SHARE": "0"}
-    assert command("validate", "--lake", copy, **strict).code == 0
-    stale = command("split", "--lake", copy, **strict)
+    assert command.here("validate", "--lake", copy, **strict).code == 0
+    stale = command.here("split", "--lake", copy, **strict)
     assert stale.code == 1
     assert "Run `tracklake samples` first" in stale.err
     for stage in ("samples", "split", "tensors"):
-        assert command(stage, "--lake", copy, **strict).code == 0
-    query = "SELECT count(*) AS n FROM splits JOIN subsets USING (dataset, subset) WHERE excluded"
-    assert json.loads(command("sql", query, "--lake", copy, "--format", "json").out) == [{"n": 0}]
-    other = command("evaluate", "--lake", copy, TRACKLAKE_MIN_FUTURE_S="5")
+        assert command.here(stage, "--lake", copy, **strict).code == 0
+    with connect(copy) as connection:
+        query = "SELECT count(*) FROM splits JOIN subsets USING (dataset, subset) WHERE excluded"
+        assert connection.sql(query).fetchall() == [(0,)]
+    other = command.here("evaluate", "--lake", copy, TRACKLAKE_MIN_FUTURE_S="5")
     assert other.code == 1
     assert "another protocol" in other.err
 
 
+@pytest.mark.usefixtures("prefect_here")
 def test_evaluate_passes_by_a_run_that_was_made_for_other_tensors(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)
     assert command("train", "lstm", "--lake", copy, "--seconds", "0.5", "--name", "old").code == 0
     full = {"TRACKLAKE_MIN_FUTURE_S": "5"}
     for stage in ("samples", "split", "tensors"):
-        assert command(stage, "--lake", copy, **full).code == 0
+        assert command.here(stage, "--lake", copy, **full).code == 0
     done = command("evaluate", "--lake", copy, **full)
     assert done.code == 0, done.err
     assert "constant-velocity on eval" in done.out
     assert "passed by" in done.err
-    assert command("evaluate", "old", "--lake", copy, **full).code == 1
+    assert command.here("evaluate", "old", "--lake", copy, **full).code == 1
 
 
 @pytest.mark.parametrize("name", ["../tracks", "/etc", ".hidden", "constant-velocity"])
 def test_a_runs_name_cannot_reach_other_folders(command, lake, name):
-    done = command("train", "lstm", "--lake", lake.root, "--seconds", "0.5", f"--name={name}")
+    done = command.here("train", "lstm", "--lake", lake.root, "--seconds", "0.5", f"--name={name}")
     assert done.code == 2
     assert (lake.root / "tracks").is_dir()
 
@@ -103,8 +109,8 @@ def test_words_that_are_none_of_the_choices_are_usage_errors(command, lake, tmp_
         ("sample", "--out", tmp_path / "s", "--minutes", "99999"),
     ]
     for arguments in calls:
-        assert command(*arguments).code == 2, arguments
-    threshold = command("validate", "--lake", lake.root, TRACKLAKE_THRESHOLDS='{"high_acceleration": 3}')
+        assert command.here(*arguments).code == 2, arguments
+    threshold = command.here("validate", "--lake", lake.root, TRACKLAKE_THRESHOLDS='{"high_acceleration": 3}')
     assert threshold.code == 2
     assert "high_acceleration_mps2" in threshold.err
 
@@ -114,7 +120,7 @@ def test_a_foreign_folder_is_left_as_it_is(command, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "notes.md").write_text("mine")
-    done = command("ingest", raw, "--lake", mine, "--json")
+    done = command.here("ingest", raw, "--lake", mine, "--json")
     assert done.code == 1
     assert "holds other files (notes.md)" in json.loads(done.out)["error"]
     assert [path.name for path in mine.iterdir()] == ["notes.md"]
@@ -127,7 +133,7 @@ def test_linked_folders_are_followed_once(command, tmp_path):
     (source / "link").symlink_to(tmp_path / "disk")
     (tmp_path / "disk" / "loop").symlink_to(source)
     assert command("ingest", source, "--lake", tmp_path / "lake").code == 0
-    assert count(command, tmp_path / "lake") == 20
+    assert count(tmp_path / "lake") == 20
 
 
 def test_a_reader_that_has_seen_enough_ends_the_output_quietly(command, lake):

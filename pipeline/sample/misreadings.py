@@ -10,14 +10,21 @@ FREE_M = 30.0
 """A lane is entered by mistake only where nobody is this near in it, and a position jumps only into free road."""
 
 
+def _pick_following(work: Work, place: int) -> tuple[int, int] | None:
+    """A random run of 0.3 to 2 s, first and last row, in which there is always a leader."""
+    run = pick_run(work, place, work.seconds(0.3, 2.0), margin=2)
+    if run is None or (work.leader[run[0] : run[1] + 1] == NOBODY).any():
+        return None
+    return run
+
+
 def skip_leader(work: Work, place: int) -> bool:
     """For a while the leader's leader is recorded as the own."""
-    run = pick_run(work, place, work.seconds(0.3, 2.0), margin=2)
+    run = _pick_following(work, place)
     if run is None:
         return False
     rows = slice(run[0], run[1] + 1)
-    leader = work.leader[rows]
-    if (leader == NOBODY).any() or (work.leader[leader] == NOBODY).any():
+    if (work.leader[work.leader[rows]] == NOBODY).any():
         return False
     work.leader_skipped[rows] = True
     work.note("wrong_leader", *run)
@@ -26,8 +33,8 @@ def skip_leader(work: Work, place: int) -> bool:
 
 def misread_headway(work: Work, place: int) -> bool:
     """For a while the recorded headway is too long."""
-    run = pick_run(work, place, work.seconds(0.3, 2.0), margin=2)
-    if run is None or (work.leader[run[0] : run[1] + 1] == NOBODY).any():
+    run = _pick_following(work, place)
+    if run is None:
         return False
     error = work.random.uniform(1.5, 4.0)
     work.headway_error[run[0] : run[1] + 1] = error

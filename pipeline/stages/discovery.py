@@ -69,6 +69,22 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawF
     return Discovery(tuple(units), tuple(refusals), tuple(search.passed_by), tuple(chain(*search.recognised.values())))
 
 
+def recognise(source: Path, dataset: str) -> list[RawFile]:
+    """Find a dataset's raw files by their first lines alone: nothing is read through, and none is given its hash.
+
+    Args:
+        source: as for `discover`.
+        dataset: whose.
+
+    Raises:
+        SourceError: no such file or folder.
+    """
+    search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
+    for path in _candidates(source):
+        search.look_at(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+    return search.found
+
+
 class _Search:
     """What has been found so far."""
 
@@ -80,6 +96,11 @@ class _Search:
         self._single = source if source.is_file() else None
         self._digest = digest
         self._found: list[tuple[Source, RawFile]] = []
+
+    @property
+    def found(self) -> list[RawFile]:
+        """What was recognised, before it has hashes."""
+        return [file for _, file in self._found]
 
     def look_at(self, file: RawFile) -> None:
         """Sort a file of the source, or the members of an archive, into recognised, refused and passed by."""

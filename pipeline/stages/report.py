@@ -5,37 +5,66 @@ import platform
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from pipeline.lake import Entry, LakeFile, Manifest, connect, load, write_aside
+from pipeline.lake import Entry, Manifest, connect, load
 from pipeline.lake.files import REPORTS, remove
 from pipeline.lake.manifest import remove_leftovers
 from pipeline.settings import Settings
 from pipeline.sources import SOURCES
 from pipeline.stages.base import Job, make_entry, make_job, recordings
+from pipeline.stages.pages import find_pages, write_report_file
 from pipeline.stages.score import collect_scores, finished_runs
+from quality_reports.page_names import FOLDER
+from quality_reports.rules import RULES, resolve
+from quality_reports.split_page import SPLITS_PAGE
 
-VERSION = 2
+VERSION = 4
 PAGE, DOCUMENT = "index.html", "quality.json"
 SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job over everything that is in the lake."""
+    """One job over everything that is in the lake, the subsets' pages among it."""
     entries = {key: entry.fingerprint for key, entry in manifest.entries.items() if entry.stage != "report"}
     runs = {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in finished_runs(root)}
-    made_of = {"entries": entries, "runs": runs, "settings": _shown(settings)}
+    made_of = {"entries": entries, "runs": runs, "settings": _shown(settings), **_find_thresholds(manifest, settings)}
     return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
 
 
 def _shown(settings: Settings) -> dict[str, object]:
-    """Settings that change what is in the lake, not where it stands or how fast it is made."""
-    return settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address"})
+    """Settings that change what is in the lake, not where it stands or how fast it is made; thresholds apart."""
+    return settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address", "thresholds"})
+
+
+def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
+    """What validation judged by, whatever the settings are now.
+
+    Returns:
+        thresholds: those of most recordings that are not the defaults, by name; of the settings before validation.
+        thresholds_elsewhere: those of other recordings that differ from these, by `dataset/recording` and name.
+    """
+    defaults = resolve(RULES)
+    used = {
+        entry.key.partition("/")[2]: {
+            name: entry.built_from["thresholds"].get(name, defaults[name]) for name in defaults
+        }
+        for entry in manifest.of_stage("validate")
+    }
+    usual = max(used.values(), key=list(used.values()).count, default=resolve(RULES, settings.thresholds))
+    return {
+        "thresholds": {name: value for name, value in usual.items() if value != defaults[name]},
+        "thresholds_elsewhere": {
+            recording: {name: value for name, value in values.items() if value != usual[name]}
+            for recording, values in used.items()
+            if values != usual
+        },
+    }
 
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
-    """Query the lake and write reports/subsets/, one page each, then reports/index.html and reports/quality.json."""
+    """Query the lake and write reports/index.html and reports/quality.json; the subsets' pages are there by then."""
     from quality_reports.report import build_report
-    from quality_reports.subset_pages import FOLDER, render_pages
 
     manifest = load(root)
     provenance = {
@@ -45,7 +74,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         "tracklake": version("tracklake"),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in SHOWN_VERSIONS},
-        "thresholds": settings.thresholds,
+        **_find_thresholds(manifest, settings),
         "settings": _shown(settings),
         "data": {
             source.name: {"title": source.title, "licence": source.licence, "citation": source.citation}
@@ -54,23 +83,18 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         },
         "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
     }
+    # No overview leads to a page that is not there, and no page is of a subset that is gone.
+    made = manifest.of_stage("pages")
     with connect(root) as connection:
-        report = build_report(connection, provenance, scores=collect_scores(root, manifest))
-        pages = [
-            _write(root, f"{FOLDER}/{name}", content) for name, content in render_pages(connection, report.quality)
-        ]
-    # Last, so that no overview leads to a page that is not there.
-    files = [*pages, _write(root, PAGE, report.html), _write(root, DOCUMENT, report.json)]
-    written = {root / file.path for file in pages}
-    remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in written])
+        scores = collect_scores(root, manifest)
+        report = build_report(connection, provenance, scores=scores, pages=find_pages(root, made))
+    files = [write_report_file(root, PAGE, report.html), write_report_file(root, DOCUMENT, report.json)]
+    if report.splits_html is not None:
+        files.append(write_report_file(root, SPLITS_PAGE, report.splits_html))
+    else:
+        (root / REPORTS / SPLITS_PAGE).unlink(missing_ok=True)
+    live = {root / file.path for entry in made for file in entry.files[REPORTS]}
+    remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
+    for folder in (root / REPORTS, root / REPORTS / FOLDER):
+        remove_leftovers(folder)
     return make_entry(job, {REPORTS: files}, {})
-
-
-def _write(root: Path, name: str, content: str) -> LakeFile:
-    """Put one file of the report into its place."""
-    target = root / REPORTS / name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # What a killed process left beside it, in whose place this one works now.
-    remove_leftovers(target.parent)
-    write_aside(target, content.encode("utf-8", "backslashreplace"))
-    return LakeFile(f"{REPORTS}/{name}", None, target.stat().st_size)

@@ -1,30 +1,13 @@
 -- Per rule: over the whole lake (dataset and subset null), per dataset (subset null) and per subset: vehicles and
 -- entries that break it, and their shares of the subsets in which it was checked. Null where it was not: validation
 -- has not run, or the source lacks a column that the rule reads.
--- $rules: the rules' names; $columns: for each of them the columns of tracks, vehicles and subsets that it reads.
-WITH rules AS (
-    SELECT unnest($rules::VARCHAR[]) AS rule, unnest($columns::VARCHAR[][]) AS columns
-),
-traits AS (
+-- $rules: the rules' names.
+WITH checked AS (
     SELECT
-        dataset, subset,
-        CASE WHEN count(length_m) = 0 THEN ['length_m'] ELSE [] END
-        || CASE WHEN count(width_m) = 0 THEN ['width_m'] ELSE [] END
-        || CASE WHEN count("class") = 0 THEN ['class'] ELSE [] END AS traits_missing
-    FROM vehicles GROUP BY dataset, subset
-),
-lacking AS (
-    SELECT
-        subsets.*,
-        coalesce(columns_missing, []) || coalesce(traits_missing, ['length_m', 'width_m', 'class'])
-        || CASE WHEN lane_markings_m IS NULL THEN ['lane_markings_m'] ELSE [] END AS columns_lacking
-    FROM subsets LEFT JOIN traits USING (dataset, subset)
-),
-checked AS (
-    SELECT
-        rule, dataset, subset, vehicles AS all_vehicles, entries AS all_entries,
-        excluded IS NOT NULL AND NOT list_has_any(columns_lacking, columns) AS is_checked
-    FROM rules CROSS JOIN lacking
+        rule, dataset, subset, vehicles AS all_vehicles, subsets.entries AS all_entries,
+        excluded IS NOT NULL AND NOT coalesce(list_contains(rules_unchecked, rule), false) AS is_checked
+    FROM (SELECT unnest($rules::VARCHAR[]) AS rule)
+    CROSS JOIN subsets LEFT JOIN subset_scores USING (dataset, subset)
 ),
 found AS (
     SELECT

@@ -1,13 +1,11 @@
 -- One row per recording: vehicles and entries found beside what is announced, by the first authority that says so.
 WITH announced AS (
-    SELECT
-        dataset, recording, measure,
-        min_by(authority, list_position(['published', 'recordingMeta', 'tracksMeta', 'Total_Frames'], authority)) AS authority,
-        min_by(expected, list_position(['published', 'recordingMeta', 'tracksMeta', 'Total_Frames'], authority)) AS expected,
-        min_by(found, list_position(['published', 'recordingMeta', 'tracksMeta', 'Total_Frames'], authority)) AS found
-    FROM completeness
+    SELECT dataset, recording, measure, authority, expected, found FROM completeness
     WHERE expected IS NOT NULL AND measure IN ('vehicles', 'entries')
-    GROUP BY dataset, recording, measure
+    QUALIFY row_number() OVER (
+        PARTITION BY dataset, recording, measure
+        ORDER BY list_position(['published', 'recordingMeta', 'tracksMeta', 'Total_Frames'], authority)
+    ) = 1
 ),
 vehicles_announced AS (FROM announced WHERE measure = 'vehicles'),
 entries_announced AS (FROM announced WHERE measure = 'entries'),

@@ -11,6 +11,8 @@ from quality_reports.report import Report, build_report
 from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES
 
 SHA = "0123456789abcdef" * 4
+UNCHECKED = ["negative_headway_recorded", "overlap", "headway_mismatch", "implausible_size", "outside_lane"]
+"""Rules of the small lake's subsets that need sizes or lane markings."""
 
 JOINED = {
     VEHICLES.name: (VEHICLE_STARTS.name, ("dataset", "subset", "vehicle_id")),
@@ -63,6 +65,11 @@ def a_subset(dataset: str, subset: str, **values) -> dict:
         "source_files": [{"file": f"{subset[:2]}_tracks.csv", "sha256": SHA}],
     }
     return at(dataset, subset, **{**usual, **values})
+
+
+def a_score(dataset: str, subset: str, entries: int, unchecked: list[str]) -> dict:
+    shares = ("share_without_error", "share_without_warning", "vehicles_without_error", "vehicles_without_warning")
+    return at(dataset, subset, entries=entries, spacings=0, rules_unchecked=unchecked, **dict.fromkeys(shares, 0.5))
 
 
 def counted(dataset: str, recording: str, authority: str, measure: str, expected, found, **values) -> dict:
@@ -129,6 +136,11 @@ def small_lake() -> dict[str, list[dict]]:
             at(*upper, backward_vehicles=1, excluded=True, excluded_reason="1 of 1 vehicles reverse"),
             at(*arterial, backward_vehicles=0, excluded=False),
         ],
+        "subset_scores": [
+            a_score(*lower, 4, UNCHECKED),
+            a_score(*upper, 2, UNCHECKED),
+            a_score(*arterial, 1, ["negative_headway", *UNCHECKED]),
+        ],
         "findings": [
             at(*lower, **finding, first_frame=1, last_frame=1, entries=1, worst=-0.5),
             at(*lower, **finding, first_frame=3, last_frame=3, entries=1, worst=-2.5),
@@ -168,6 +180,9 @@ def small_lake() -> dict[str, list[dict]]:
         "sample_drops": [
             at(*lower, protocol="csp", reason="history", entries=4),
             at(*lower, protocol="csp", reason="future", entries=1),
+        ],
+        "sample_counts": [
+            at(*lower, protocol="csp", entries_on_clock=8, samples=3, neighbors=1, collisions=2, crowded_out=1),
         ],
         "neighbors": [
             at(*lower, protocol="csp", vehicle_id=1, tick=16, cell=19, neighbor_id=2, dx_m=4.0),

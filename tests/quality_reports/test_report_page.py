@@ -3,65 +3,16 @@
 import re
 from datetime import datetime
 from decimal import Decimal
-from html.parser import HTMLParser
 from pathlib import Path
 
 import duckdb
 import pytest
+from page_elements import HOSTILE, parse, spoil_texts
 
 from quality_reports import plots
 from quality_reports.rendering import DASH, flatten, format_cell, format_duration, visible
 from quality_reports.report import build_report
 from quality_reports.summaries import plain, statement
-
-HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;\u202e"
-
-
-class Elements(HTMLParser):
-    """Collects every element and whether the page is well nested."""
-
-    VOID = frozenset({"meta", "br", "img", "link", "input", "hr"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.elements.append((tag, dict(attributes)))
-
-    def handle_endtag(self, tag):
-        assert self.open, f"</{tag}> closes nothing"
-        assert self.open.pop() == tag
-
-
-def parse(html: str) -> Elements:
-    parser = Elements()
-    parser.feed(html)
-    parser.close()
-    assert parser.open == []
-    return parser
-
-
-def spoil_texts(lake: dict[str, list[dict]]) -> dict[str, list[dict]]:
-    """A lake with every text a hostile one, except those that the schemas restrict."""
-    keep = {"dataset", "part", "severity", "rule", "method", "lateral_maneuver", "longitudinal_maneuver"}
-
-    def spoil(value):
-        if isinstance(value, str):
-            return HOSTILE + value
-        if isinstance(value, list):
-            return [spoil(each) for each in value]
-        if isinstance(value, dict):
-            return {key: each if key in keep else spoil(each) for key, each in value.items()}
-        return value
-
-    return {name: [spoil(each) for each in rows] for name, rows in lake.items()}
 
 
 def test_no_name_injects_markup(open_lake, small_lake):

@@ -1,18 +1,16 @@
 """The subsets' pages and the tables beside published figures: from SQL over small lakes, by hand."""
 
-import json
 import re
-import shutil
-from urllib.parse import unquote
 
 import pytest
-from test_report_page import HOSTILE, parse, spoil_texts
+from page_elements import HOSTILE, parse, spoil_texts
 
 from quality_reports.appendix import compare_speeds, count_errors
 from quality_reports.examples import find_examples, write_sql
+from quality_reports.page_names import name_pages
 from quality_reports.published import PUBLISHED
 from quality_reports.report import build_report
-from quality_reports.subset_pages import choose_interval, name_pages, render_pages
+from quality_reports.subset_pages import choose_interval, render_pages
 from quality_reports.summaries import query, query_frame
 
 WHERE = {"dataset": "highd", "subset": "01-lower"}
@@ -324,23 +322,6 @@ def test_published_figures_stand_beneath_known_recordings_only(open_lake, small_
     assert (published["headway_entries"], published["headway_entry_share"]) == (1912, 1912 / 1180598)
     assert published["acceleration_vehicles"] is None
     assert '<th scope="row">published</th>' in page.html
-
-
-def test_the_stage_writes_every_page_and_removes_those_of_subsets_that_are_gone(command, lake, tmp_path):
-    root = tmp_path / "lake"
-    shutil.copytree(lake.root, root)
-    folder = root / "reports" / "subsets"
-    wanted = {each["subset"] for each in json.loads((root / "reports" / "quality.json").read_text())["subsets"]}
-    assert {file.stem for file in folder.iterdir()} == wanted
-    (folder / "99-upper.html").write_text("of a subset that is no longer there")
-    (folder / "01-upper.html").unlink()
-    done = command("report", "--lake", root, "--quiet")
-    assert done.code == 0, done.err
-    assert {file.name for file in folder.iterdir()} == {f"{subset}.html" for subset in wanted}
-    overview = (root / "reports" / "index.html").read_text()
-    links = re.findall(r'href="(subsets/[^"]+)"', overview)
-    assert len(links) == len(wanted)
-    assert all((root / "reports" / unquote(link)).is_file() for link in links)
 
 
 def test_every_colour_of_our_own_drawings_follows_the_theme(open_lake, road):

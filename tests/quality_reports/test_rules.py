@@ -1,4 +1,7 @@
-"""The rules: each fires at its threshold and nowhere else, declared once for Pandera, findings and documentation."""
+"""The rules: declared once for Pandera, findings and documentation, with more boundaries than their own cases have.
+
+What a rule needs of tests comes from its declaration (test_rule_cases.py); what stands here is of DESIGN's sixteen.
+"""
 
 import polars as pl
 import pytest
@@ -42,11 +45,11 @@ def broken(frame: pl.DataFrame, name: str, **thresholds: float) -> list[bool]:
     return frame.select(rule.broken(resolve(RULES, thresholds))).to_series().to_list()
 
 
-def test_all_rules_are_declared():
-    assert [rule.name for rule in RULES] == NAMES
+def test_all_rules_of_the_design_are_declared():
+    assert [rule.name for rule in RULES if rule.name in NAMES] == NAMES
     assert {rule.severity for rule in RULES} <= set(SEVERITIES)
     assert len(resolve(RULES)) == sum(len(rule.thresholds) for rule in RULES), "two thresholds share a name"
-    assert {name for rule in RULES for name in rule.reads} == set(SOUND)
+    assert {name for rule in RULES if rule.name in NAMES for name in rule.reads} == set(SOUND)
     assert not [rule.name for rule in RULES if not rule.columns]
 
 
@@ -102,10 +105,6 @@ BOUNDARIES = [
     ),
     ("outside_lane", {"out_of_lane_m": [0.0, 0.001, None]}, [1]),
 ]
-
-
-def test_every_rule_has_its_boundary():
-    assert [name for name, _, _ in BOUNDARIES] == NAMES
 
 
 @pytest.mark.parametrize(("name", "columns", "expected"), BOUNDARIES, ids=NAMES)
@@ -177,7 +176,7 @@ def test_rules_are_checkable_where_nothing_they_read_is_lacking():
         "negative_headway", "negative_headway_recorded", "headway_mismatch", "outside_lane", "high_acceleration",
         "low_constant_speed", "high_jerk", "jerk_flicker",
     }  # fmt: skip
-    assert names == set(NAMES) - lost
+    assert names & set(NAMES) == set(NAMES) - lost
 
 
 @pytest.mark.parametrize(("name", "columns", "expected"), BOUNDARIES, ids=NAMES)
@@ -204,7 +203,7 @@ def test_as_pandera_checks_take_thresholds():
 
 def test_the_documentation_follows_from_the_declaration():
     rows = describe(thresholds={"backward_mps": -0.1})
-    assert [row["name"] for row in rows] == NAMES
+    assert [row["name"] for row in rows] == [rule.name for rule in RULES]
     assert rows[2]["thresholds"] == [{"name": "high_acceleration_mps2", "value": 3.05, "default": 3.05, "unit": "m/s2"}]
     assert rows[4]["thresholds"] == [{"name": "backward_mps", "value": -0.1, "default": 0.0, "unit": "m/s"}]
     assert rows[3]["columns"] == ["speed_mps", "accel_mps2"]
