@@ -1,4 +1,4 @@
-"""Samples with their context: maneuvers, grid and samples of 10 million dense entries, in memory.
+"""Samples with their context: maneuvers, grid and samples of 10 million dense entries, and `tracklake export csp`.
 
     python benchmarks/context.py [--scale 0.1]
 
@@ -7,7 +7,7 @@ that share a cell, gaps, late starts and findings. It is made first and saved; t
 run, each subset is read, drawn from as `tracklake samples` does it, and let go once drawn. Six subsets, as
 recordings come, and the same number of entries in one; at the clock of `csp` (5 Hz) and at 10 Hz; with and without
 the list of the nearest. Printed are the best of three runs by seconds, the time that reading took apart from the
-drawing, and the peak memory of the whole process.
+drawing, and the peak memory of the whole process. `csp_lake.py` describes what is measured of `tracklake export csp`.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from csp_lake import measure_export
 
 from pipeline.transforms.samples import TRACK_COLUMNS, draw_samples
 from schemas import FINDINGS, MISSING_STARTS
@@ -75,7 +76,7 @@ def measure_context(scale: float) -> None:
     print(f"over {LIMIT_S:g} s or {LIMIT_GIB:g} GiB: {'; '.join(over) or 'none'}")
 
 
-CASES: tuple[Callable[[float], None], ...] = (measure_context,)
+CASES: tuple[Callable[[float], None], ...] = (measure_context, measure_export)
 """One table each; a case takes --scale and prints."""
 
 

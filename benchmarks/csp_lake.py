@@ -1,14 +1,11 @@
 """`tracklake export csp` of 8.7 million entries: NGSIM's six freeway recordings, as dense as they are.
 
-    python benchmarks/export_csp.py [--scale 0.1] [--clean] [--lake DIR] [--work DIR]
-
 The lake is generated: six recordings of the published lengths together, 200 vehicles a frame at 10 Hz on six lanes of
 640 m, with noise, lane changes, vehicles that share a cell, and gaps. Then the command runs in a process of its own;
-printed are the best of three runs by seconds, the processor's time, and the program's own peak of memory. With --clean
-the stages that it needs are run first (a minute or two), and the command is measured with it as well.
+printed are the best of three runs by seconds, the processor's time, and the program's own peak of memory.
+`context.py` calls it.
 """
 
-import argparse
 import os
 import resource
 import shutil
@@ -41,33 +38,25 @@ RECORDINGS = {
 RATE_HZ, LANES, ROAD_M, SPEED_MPS, VEHICLES_A_FRAME = 10, 6, 640.0, 9.0, 200
 FINGERPRINT = "0" * 16
 REPEATS = 3
+OPTIONS: tuple[tuple[str, ...], ...] = ((), ("--full-future",), ("--clean",))
 NEEDED_BY_CLEAN = ("validate", "repair", "samples", "split")
 
 
-def main() -> None:
-    """Measure and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scale", type=float, default=1.0, help="of the number of entries")
-    parser.add_argument("--clean", action="store_true", help="measure --clean, too")
-    parser.add_argument("--lake", type=Path, help="where the lake is, or is to be made and kept")
-    parser.add_argument("--work", type=Path, help="folder for the files written (2 GB at scale 1)")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=options.work) as work:
-        lake = options.lake or Path(work) / "lake"
-        if not (lake / "manifest.json").exists():
-            make_lake(lake, options.scale)
-        cases: list[tuple[str, ...]] = [(), ("--full-future",)]
-        if options.clean:
-            run_stages(lake)
-            cases.append(("--clean",))
+def measure_export(scale: float) -> None:
+    """Print the table; --clean reads what other stages make, which is made first."""
+    with tempfile.TemporaryDirectory() as work:
+        lake = Path(work) / "lake"
+        make_lake(lake, scale)
         print("| entries | options | seconds | processor s | peak GiB | GB written |")
         print("| --- | --- | --- | --- | --- | --- |")
         entries = sum(file.rows or 0 for file in load(lake).live(TRACKS.name))
-        for case in cases:
-            runs = [export(lake, Path(work) / "out", case) for _ in range(REPEATS)]
+        for options in OPTIONS:
+            if "--clean" in options:
+                run_stages(lake)
+            runs = [export(lake, Path(work) / "out", options) for _ in range(REPEATS)]
             seconds, processor_s, peak_gib, written = min(runs)
             figures = (f"{seconds:.1f}", f"{processor_s:.1f}", f"{peak_gib:.2f}", f"{written:.2f}")
-            print(f"| {entries:,} | {' '.join(case) or '-'} | {' | '.join(figures)} |", flush=True)
+            print(f"| {entries:,} | {' '.join(options) or '-'} | {' | '.join(figures)} |", flush=True)
 
 
 def export(lake: Path, out: Path, options: tuple[str, ...]) -> tuple[float, float, float, float]:
@@ -155,7 +144,3 @@ def run_stages(lake: Path) -> None:
             stage = STAGE_BY_NAME[name]
             for job in stage.plan(lake, writer.manifest, settings):
                 writer.commit(stage.build(lake, job, settings))
-
-
-if __name__ == "__main__":
-    main()
