@@ -119,10 +119,12 @@ def _show(terminal: "Terminal", export: "CspExport") -> None:
     from rich.table import Table
 
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for heading in ("file", "samples", "vehicles", "tracks", "entries"):
+    for heading in ("file", "samples", "tracks with samples", "tracks", "entries"):
         table.add_column(heading, justify="left" if heading == "file" else "right")
     for file in export.files:
-        table.add_row(file.name, *(f"{count:,}" for count in (file.samples, file.vehicles, file.tracks, file.entries)))
+        table.add_row(
+            file.name, *(f"{count:,}" for count in (file.samples, file.sampled_tracks, file.tracks, file.entries))
+        )
     if terminal.talks:
         terminal.out.print(table)
     counts = [f"{reason} {count:,}" for reason, count in export.count_drops().items()]

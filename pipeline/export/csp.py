@@ -65,7 +65,7 @@ class CspFile:
     name: str
     part: str
     samples: int = 0
-    vehicles: int = 0
+    sampled_tracks: int = 0
     tracks: int = 0
     entries: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
@@ -209,7 +209,7 @@ def _count(prepared: Sequence[CspSubset], export: CspExport) -> None:
             samples = subset.samples_of(place)
             mine = subset.entries.track_id[subset.part == place]
             file.samples += samples.size
-            file.vehicles += np.unique(subset.entries.track_id[samples]).size
+            file.sampled_tracks += np.unique(subset.entries.track_id[samples]).size
             file.tracks += np.unique(mine).size
             file.entries += mine.size
             for reason, counts in subset.dropped.items():

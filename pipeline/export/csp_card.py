@@ -20,9 +20,11 @@ Subsets that validation excludes are in it.
 CLEAN = """\
 Made with `--clean`. The arithmetic of labels and samples is the original script's; what differs: entries around which
 a vehicle is missing (late starts), or of vehicles that entered before the road ahead was recorded, are no samples;
-of two vehicles in one cell the nearer stands there and the other in the nearest free cell of its lane; the parts are
-those of tracklake's split, which no vehicle and no neighbor crosses; subsets that validation excludes are left out. A
-track with a gap is several tracks, of which the later ones have ids that no vehicle had.
+of two vehicles in one cell the nearer stands there and the other in the nearest free cell of its lane; no vehicle
+and no neighbor crosses from part to part: the parts are those of the lake's split where it has a validation part,
+else of one planned for these files, whose TrainSet may hold what the lake evaluates on; subsets that validation
+excludes are left out. A track with a gap, or across a border of the split, is several tracks, of which the later ones
+have ids that no vehicle had.
 """
 
 
@@ -37,10 +39,10 @@ def write_card(path: Path, export: "CspExport") -> None:
         "of conv-social-pooling (Deo and Trivedi 2018, github.com/nachiket92/conv-social-pooling).",
         "",
         CLEAN if export.options.clean else ORIGINAL,
-        "| file | samples | vehicles with samples | tracks | entries of tracks |",
+        "| file | samples | tracks with samples | tracks | entries of tracks |",
         "| --- | ---: | ---: | ---: | ---: |",
         *(
-            f"| {file.name} | {file.samples:,} | {file.vehicles:,} | {file.tracks:,} | {file.entries:,} |"
+            f"| {file.name} | {file.samples:,} | {file.sampled_tracks:,} | {file.tracks:,} | {file.entries:,} |"
             for file in export.files
         ),
         "",

@@ -49,13 +49,13 @@ def read_context(
     splits = scan(root, manifest, SPLITS).filter(split=protocol.split).collect()
     parts = splits.select("dataset", "part").unique().rows()
     if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
-        recipe = next(recipe for recipe in settings.get_split_recipes() if recipe.name == protocol.split)
+        recipe = settings.get_split_recipe()
         material = Material(root, manifest, split.gather_subsets(root, manifest, protocol), protocol)
         allocation = make_split(replace(recipe, validation=True), material).allocation
         splits = allocation.splits
         notes.append(
             f"the lake's split {protocol.split} has no validation part; the files hold the one that `validation_part = "
-            "true` makes, so that TestSet.mat is not the lake's eval part"
+            "true` makes: TestSet.mat is not the lake's eval part, and TrainSet.mat may hold some of it"
         )
         notes += [
             f"split of {dataset} is relaxed: {reason}"

@@ -1,5 +1,6 @@
 """Files of an export: all of them in their place, or none."""
 
+import os
 import shutil
 import uuid
 from collections.abc import Callable, Sequence
@@ -26,8 +27,15 @@ def refuse_taken(out: Path, names: Sequence[str], *, force: bool, lake: Path) ->
     """
     if out.exists() and not out.is_dir():
         raise ExportError(f"{out}: is a file; the export needs a folder. Name another with --out.")
-    if out.resolve().is_relative_to(lake.resolve()):
+    place = out.resolve()
+    nearest = next(folder for folder in (place, *place.parents) if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise ExportError(f"{out}: nothing can be put there, for {nearest} is no folder to write in. Name another.")
+    if place.is_relative_to(lake.resolve()):
         raise ExportError(f"{out}: lies in the lake, which sweeps what is not its own. Name another folder with --out.")
+    folders = [name for name in names if (out / name).is_dir()]
+    if folders:
+        raise ExportError(f"{out}: holds folders named {', '.join(folders)}. Name another folder with --out.")
     taken = [name for name in names if (out / name).exists()]
     if taken and not force:
         raise ExportError(f"{out}: holds {', '.join(taken)}. Name another folder with --out, or replace them: --force.")

@@ -174,7 +174,8 @@ def prepare_clean(clock: pl.DataFrame, context: Context, recorded: Recorded, *, 
         IN_TWO_PARTS: int(((intended != NO_PART) & (part == NO_PART)).sum()),
     }
     within = part != NO_PART
-    named = name_by_runs(clock.with_columns(part=part).filter(within), block[within])
+    highest_id = int(clock["vehicle_id"].to_numpy().max(initial=0))
+    named = name_by_runs(clock.with_columns(part=part).filter(within), block[within], highest_id=highest_id)
     entries = to_csp_entries(named, last_lane=recorded.last_lane)
     part = named["part"].to_numpy()
     early = context.vehicle_starts.filter("early")["vehicle_id"].implode()

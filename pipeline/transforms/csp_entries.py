@@ -109,7 +109,7 @@ def name_as_recorded(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.Da
     return once, named.height - once.height
 
 
-def name_by_runs(clock: pl.DataFrame, block: NDArray[np.int32]) -> pl.DataFrame:
+def name_by_runs(clock: pl.DataFrame, block: NDArray[np.int32], *, highest_id: int) -> pl.DataFrame:
     """Name tracks so that none has a gap: the first run of a vehicle keeps its id, later ones get unused ids.
 
     The Dataset class counts rows, not frames: across a gap it would take a second for a tenth of one.
@@ -117,6 +117,7 @@ def name_by_runs(clock: pl.DataFrame, block: NDArray[np.int32]) -> pl.DataFrame:
     Args:
         clock: vehicle_id, tick, segment, sorted by vehicle_id, tick.
         block: (N,) of the split; where it changes, a new run begins.
+        highest_id: of all vehicles, also of those that are not in the clock; unused ids are above it.
 
     Returns:
         The clock with track_id, sorted by track_id, tick.
@@ -129,6 +130,6 @@ def name_by_runs(clock: pl.DataFrame, block: NDArray[np.int32]) -> pl.DataFrame:
     if not again.any():
         return clock.with_columns(track_id="vehicle_id")
     starts = np.flatnonzero(new_vehicle | again)
-    names = np.where(again[starts], int(vehicle.max()) + np.cumsum(again[starts]), vehicle[starts])
+    names = np.where(again[starts], highest_id + np.cumsum(again[starts]), vehicle[starts])
     track_id = pl.Series(np.repeat(names, np.diff(starts, append=vehicle.size)), dtype=pl.Int64)
     return clock.with_columns(track_id=track_id).sort("track_id", "tick")

@@ -96,7 +96,7 @@ def draw_samples(
     if whole_subset or clock.is_empty():
         drops = {whole_subset: clock.height} if whole_subset else {}
         nobody = Neighborhood(NEIGHBORS.empty(), collisions=0, crowded_out=0)
-        return _gather(SAMPLES.empty(), drops, nobody, names)
+        return _gather(clock.height, SAMPLES.empty(), drops, nobody, names)
 
     early_ids = vehicle_starts.filter("early")["vehicle_id"].implode()
     would_be = find_would_be_neighbors(clock, missing_starts, **rates)
@@ -127,7 +127,8 @@ def draw_samples(
     drops = {reason: sum(dropped.get(reason, 0) for _, dropped in pieces) for reason in DROP_REASONS}
     nearest = find_nearest(clock, protocol.nearest, kept) if protocol.nearest else pl.lit(None)
     clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # the rest is room for the neighbors
-    return _gather(samples.with_columns(nearest.alias("nearest")), drops, find_neighbors(clock, kept), names)
+    samples = samples.with_columns(nearest.alias("nearest"))
+    return _gather(clock.height, samples, drops, find_neighbors(clock, kept), names)
 
 
 def find_faulty(
@@ -176,13 +177,15 @@ def _key(vehicle_id: NDArray[np.int32], frame: NDArray[np.integer]) -> NDArray[n
     return key
 
 
-def _gather(samples: pl.DataFrame, drops: dict[str, int], around: Neighborhood, names: dict[str, str]) -> SampleTables:
+def _gather(
+    entries: int, samples: pl.DataFrame, drops: dict[str, int], around: Neighborhood, names: dict[str, str]
+) -> SampleTables:
     """The tables of one subset, complete."""
     constants = [pl.lit(value).alias(name) for name, value in names.items()]
     dropped = [{**names, "reason": reason, "entries": entries} for reason, entries in sorted(drops.items()) if entries]
     counts = {
         **names,
-        "entries_on_clock": samples.height + sum(drops.values()),
+        "entries_on_clock": entries,
         "samples": samples.height,
         "neighbors": around.neighbors.height,
         "collisions": around.collisions,

@@ -76,7 +76,7 @@ def test_side_by_side_stands_evaluation_beside_training(open_lake, tables):
 def test_the_page_says_why_one_flatters_and_the_other_does_not(open_lake, tables):
     html = build_report(open_lake(**tables), {}).splits_html
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", html))
-    assert "csp-2018 of highd: in 75.00 % of the evaluation’s frames training vehicles drive as well" in text
+    assert "csp-2018 of highd: in 75.00 % of the evaluation\u2019s frames training vehicles drive as well" in text
     assert "and 50.00 % of its moments give training samples, too; 75.00 % of its neighbors are cut off." in text
     assert "flow-balanced of highd shares no vehicle, frame, scene or neighbor." in text
     assert "flow-balanced of highd: in" not in text

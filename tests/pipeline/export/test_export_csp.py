@@ -272,7 +272,7 @@ def test_the_same_lake_gives_the_same_bytes_and_a_card_with_the_counts(ngsim, tm
     assert (tmp_path / "a" / CARD).read_bytes() == (tmp_path / "b" / CARD).read_bytes()
     card = (tmp_path / "a" / CARD).read_text()
     for file in first.files:
-        assert f"| {file.name} | {file.samples:,} | {file.vehicles:,} | {file.tracks:,} |" in card
+        assert f"| {file.name} | {file.samples:,} | {file.sampled_tracks:,} | {file.tracks:,} |" in card
     assert "| 4 | ngsim | i-80-1600 | i-80-1600 |" in card
 
 

@@ -32,6 +32,17 @@ def test_files_come_beside_what_is_there(tmp_path, there):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def test_what_stands_in_the_way_is_found_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ExportError, match=r"file is no folder to write in"):
+        refuse_taken(tmp_path / "file" / "out", NAMES, force=True, lake=tmp_path / "lake")
+    (tmp_path / "out" / "b").mkdir(parents=True)
+    with pytest.raises(ExportError, match=r"out: holds folders named b\."):
+        refuse_taken(tmp_path / "out", NAMES, force=True, lake=tmp_path / "lake")
+    refuse_taken(tmp_path / "new" / "out", NAMES, force=False, lake=tmp_path / "lake")
+    assert contents(tmp_path) == {"file": "mine"}
+
+
 @pytest.mark.parametrize("nested", [False, True])
 def test_what_breaks_off_while_writing_leaves_nothing(tmp_path, nested):
     def fail(aside):

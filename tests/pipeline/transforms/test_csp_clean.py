@@ -49,6 +49,14 @@ def tracks_of(subset, part=TRAIN):
     }
 
 
+def test_a_later_run_gets_an_id_that_no_vehicle_had():
+    """Vehicle 5 has a gap; the highest id, 7, is of a vehicle that stands outside the split."""
+    rows = [(5, frame, 6.0, 10.0 * frame, 1) for frame in (*range(1, 41), *range(61, 101))]
+    rows += [(7, frame, 6.0, 10.0 * (frame - 200), 1) for frame in range(201, 241)]
+    found = clean(rows, blocks=(("train", 1, 150),))
+    assert tracks_of(found) == {5: list(range(1, 41)), 8: list(range(61, 101))}
+
+
 @given(recordings(), st.sampled_from([None, 6]), st.booleans())
 @settings(max_examples=40, deadline=None)
 def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_future):
