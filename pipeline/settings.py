@@ -101,6 +101,10 @@ class Settings(BaseSettings):
             split=self.split,
         )
 
+    def get_split_recipe(self) -> SplitRecipe:
+        """That of the split that tensors are made of."""
+        return next(recipe for recipe in self.get_split_recipes() if recipe.name == self.split)
+
     def get_split_recipes(self) -> list[SplitRecipe]:
         """The splits to make, each with every parameter, in the order of SPLIT_NAMES."""
         protocol = self.get_protocol()

@@ -23,6 +23,7 @@ def write_tensors(
     protocol: Protocol,
     *,
     storage: str,
+    split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write a tensor folder; no more than one subset is held in memory at a time.
 
@@ -32,6 +33,7 @@ def write_tensors(
         splits: the split's rows of `schemas.splits.SPLITS`.
         protocol: of the samples.
         storage: of positions, one of `schemas.tensors.POSITION_STORAGES`, as `subsets` were built.
+        split_recipe: what the split is made by: digest, parameters, left_out_vehicles; None: not known.
 
     Returns:
         What `index.json` holds.
@@ -72,6 +74,7 @@ def write_tensors(
         samples_by_part=by_part.tolist(),
         max_error_m=worst.tolist(),
         squared_error_m2=squares.tolist(),
+        split_recipe=split_recipe,
     )
     (folder / INDEX_FILE).write_text(json.dumps(index, indent=1, allow_nan=False), encoding="utf-8")
     return index

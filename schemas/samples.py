@@ -23,8 +23,14 @@ SAMPLES = Table(
             nullable=True,
         ),
         "lane": column(pl.Int16, "lane at the tick"),
-        "lateral_maneuver": column(pl.Enum(LATERAL_MANEUVERS), "left or right where the lane changes from 4 s before to now or from now to 4 s after, else keep"),
-        "longitudinal_maneuver": column(pl.Enum(LONGITUDINAL_MANEUVERS), "brake where the mean speed over the next 5 s is under 0.8 of that over the last 3 s, else normal"),
+        "lateral_maneuver": column(
+            pl.Enum(LATERAL_MANEUVERS),
+            "left or right where the lane changes from 4 s before to now or from now to 4 s after, else keep",
+        ),
+        "longitudinal_maneuver": column(
+            pl.Enum(LONGITUDINAL_MANEUVERS),
+            "brake where the mean speed over the next 5 s is under 0.8 of that over the last 3 s, else normal",
+        ),
         "nearest": column(
             pl.List(pl.Int32),
             "the nearest vehicles at the tick, whatever their lanes, the nearest first (of two equally far the smaller "

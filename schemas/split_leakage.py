@@ -23,7 +23,12 @@ SPLIT_LEAKAGE = Table(
         "other_part": _OTHER,
         "vehicles_shared": column(pl.Int64, "vehicles with entries in both parts", ge=0),
         "vehicles": column(pl.Int64, "with entries in the other part", ge=0),
-        "frames_shared": column(pl.Int64, "frames of a subset in which both parts have entries", ge=0),
+        "frames_shared": column(
+            pl.Int64,
+            "frames of a subset in which both parts have entries; recordings that follow one another in clock time are "
+            "not compared",
+            ge=0,
+        ),
         "frames": column(pl.Int64, "frames of a subset in which the other part has entries", ge=0),
         "scenes_shared": column(pl.Int64, "moments of a subset at which both parts have samples", ge=0),
         "scenes": column(pl.Int64, "moments of a subset at which the other part has samples", ge=0),
@@ -32,7 +37,7 @@ SPLIT_LEAKAGE = Table(
         "nearest_s": column(
             pl.Float64,
             "least time between an entry of one part and an entry of the other in the same subset; null where no "
-            "subset stands in both",
+            "subset stands in both; recordings that follow one another in clock time are not compared",
             unit="s",
             nullable=True,
             ge=0,

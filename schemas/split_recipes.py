@@ -1,4 +1,4 @@
-"""Recipes of splits: what each is made by, every parameter of it, and a hash of them all."""
+"""Recipes of splits: what each is made by, the parameters that apply, and a hash of them."""
 
 import hashlib
 import json
@@ -18,6 +18,16 @@ MEANINGS: Mapping[str, str] = {
     "comparison with published tables only",
     BY_RECORDING: "whole recordings drawn at random; for comparison",
 }
+
+_SEARCH = ("validation", "seed", "restarts")
+
+PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    FLOW_BALANCED: _SEARCH,
+    TIME_BLOCKS: (*_SEARCH, "block_s", "purge_s", "rate_hz", "history_s", "horizon_s", "min_future_s"),
+    CSP_2018: (),
+    BY_RECORDING: ("validation", "seed"),
+}
+"""What each split is made by, besides the subsets and their samples (which are the protocol's)."""
 
 LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
 """Splits that claim that nothing of one part is reachable from another."""
@@ -68,10 +78,11 @@ class SplitRecipe:
 
     @property
     def parameters(self) -> str:
-        """Every parameter, as JSON."""
-        return json.dumps(asdict(self), sort_keys=True)
+        """The name and every parameter that the split is made by, as JSON."""
+        values = asdict(self)
+        return json.dumps({name: values[name] for name in ("name", *PARAMETERS[self.name])}, sort_keys=True)
 
     @property
     def digest(self) -> str:
-        """First 12 hex digits of the sha256 of every parameter."""
+        """First 12 hex digits of the sha256 of `parameters`."""
         return hashlib.sha256(self.parameters.encode()).hexdigest()[:12]

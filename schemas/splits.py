@@ -36,9 +36,9 @@ SPLIT_BALANCE = Table(
         "dataset": DATASET,
         "part": column(pl.String, "train, val or eval", isin=PARTS),
         "subsets": column(pl.Int32, "carriageways in the part", ge=0),
-        "vehicles": column(pl.Int64, "vehicles in the part", ge=0),
-        "vehicle_share": column(pl.Float64, "of the dataset's vehicles", ge=0, le=1),
-        "samples": column(pl.Int64, "kept samples in the part: the weight of its subsets", ge=0),
+        "vehicles": column(pl.Int64, "vehicles that give entries to the part, each counted once", ge=0),
+        "vehicle_share": column(pl.Float64, "of the vehicles of all parts of the dataset", ge=0, le=1),
+        "samples": column(pl.Int64, "kept samples in the part, of vehicles that are not left out of it", ge=0),
         "flow_mean": column(pl.Float64, "sample-weighted mean of flow", unit="veh/lane/s", nullable=True),
         "flow_std": column(
             pl.Float64,
@@ -82,7 +82,7 @@ SPLIT_RECIPES = Table(
         "claims_no_leakage": column(pl.Boolean, "whether `tracklake split` fails where its parts share anything"),
         "trains": column(pl.Boolean, "whether tensors are made of it"),
         "window_s": column(pl.Float64, "history and future of a sample together", unit="s", gt=0),
-        "digest": column(pl.String, "first 12 hex digits of the sha256 of the parameters"),
-        "parameters": column(pl.String, "every one, as JSON"),
+        "digest": column(pl.String, "first 12 hex digits of the sha256 of name and parameters"),
+        "parameters": column(pl.String, "every one that the split is made by, as JSON"),
     },
 )

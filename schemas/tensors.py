@@ -107,26 +107,40 @@ every vehicle of one (subset, block, tick) at which one of them at least is a sa
 MOST_TICKS = 255
 """H and F are at most this: known ticks are stored in a byte."""
 
-INDEX_KEYS = (
-    "version",
-    "split",
-    "protocol",
-    "storage",
-    "max_error_m",
-    "rms_error_m",
-    "subsets",
-    "blocks",
-    "sizes",
-    "samples_by_part",
-)
+INDEX_KEYS = {
+    "version": "a whole number",
+    "split": "text",
+    "protocol": "an object",
+    "storage": "text",
+    "max_error_m": "two numbers",
+    "rms_error_m": "two numbers",
+    "subsets": "objects",
+    "blocks": "objects",
+    "sizes": "counts by name",
+    "samples_by_part": "counts by name",
+}
+"""Each key and the kind of its value."""
+
+LATER_INDEX_KEYS = ("split_recipe",)
+"""Written, but not demanded: folders made before there were these can be read."""
 
 INDEX_MEANING = """\
 What `index.json` holds: the version; the split's name; the protocol's parameters and digest; how positions are stored;
 the greatest and the root-mean-square rounding error of positions in m, along and across the road, as measured on
-writing; the subsets in their order, each with the keys below; the split's rows; the sizes by letter; and the number of
-samples in each part."""
+writing; the subsets in their order, each with the keys below; the split's rows; the sizes by letter; the number of
+samples in each part; and of the split's recipe the digest, the parameters and `left_out_vehicles`, how many are left
+out of val and eval (null where the recipe is not known)."""
 
-SUBSET_KEYS = ("dataset", "subset", "frame_rate_hz", "centre_m", "lane_markings_m", "last_lane", "width_m")
+SUBSET_KEYS = {
+    "dataset": "text",
+    "subset": "text",
+    "frame_rate_hz": "a number",
+    "centre_m": "two numbers",
+    "lane_markings_m": "numbers or null",
+    "last_lane": "a whole number",
+    "width_m": "a number",
+}
+"""Likewise of each subset."""
 
 SUBSET_MEANING = """\
 Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,

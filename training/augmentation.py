@@ -85,7 +85,7 @@ def mirror_scenes(folder: TensorFolder, batch: SceneBatch, mirrored: Flags) -> S
 
 
 def shift(batch: Batch, shift_m: Floats) -> Batch:
-    """Move samples and all around them along the road.
+    """Move samples and all around them along the road; scenes: `shift_scenes`.
 
     Relative positions do not change; `origin` does, and so do all positions of an absolute batch.
 
@@ -93,8 +93,7 @@ def shift(batch: Batch, shift_m: Floats) -> Batch:
         batch: as gathered.
         shift_m: (B,) how far, m; positive in the direction of travel.
     """
-    moved = np.zeros((len(batch), 1, 2), dtype=np.float32)
-    moved[:, 0, 0] = shift_m
+    moved = _move(shift_m)
     shifted = replace(batch, origin=batch.origin + moved[:, 0])
     if not batch.absolute:
         return shifted
@@ -104,6 +103,27 @@ def shift(batch: Batch, shift_m: Floats) -> Batch:
         future=batch.future + moved,
         neighbor_history=batch.neighbor_history + moved[batch.neighbor_sample],
     )
+
+
+def shift_scenes(batch: SceneBatch, shift_m: Floats) -> SceneBatch:
+    """Move whole scenes along the road, each with all its vehicles; positions as in `shift`.
+
+    Args:
+        batch: as gathered.
+        shift_m: (B,) how far, m; positive in the direction of travel.
+    """
+    moved = _move(shift_m)[batch.vehicle_scene]
+    shifted = replace(batch, origin=batch.origin + moved[:, 0])
+    if not batch.absolute:
+        return shifted
+    return replace(shifted, history=batch.history + moved, future=batch.future + moved)
+
+
+def _move(shift_m: Floats) -> Floats:
+    """(B, 1, 2) what is added to positions."""
+    moved = np.zeros((len(shift_m), 1, 2), dtype=np.float32)
+    moved[:, 0, 0] = shift_m
+    return moved
 
 
 def _mirror_cells(cell: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:

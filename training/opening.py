@@ -1,4 +1,4 @@
-"""Opening tensor folders: both files checked against their declaration, arrays mapped and not read."""
+"""Opening tensor folders: both files checked against their declaration; of the arrays, only their index is read."""
 
 import json
 import math
@@ -14,23 +14,16 @@ from schemas.tensors import (
     ARRAYS,
     ARRAYS_FILE,
     INDEX_FILE,
-    INDEX_KEYS,
     POSITION_STORAGES,
     SAFETENSORS_DTYPES,
     STEPS_M,
-    SUBSET_KEYS,
     TENSORS_VERSION,
 )
-
-AGAIN = "run `tracklake tensors` again"
-
-
-class TensorError(ValueError):
-    """A tensor folder is absent, unfinished or not what its index says."""
+from training.checks import AGAIN, TensorError, check_arrays, check_index, is_pair, is_whole
 
 
 def read_index(path: Path) -> dict[str, Any]:
-    """`index.json` of a folder: of this version, with its keys, and with rounding errors that its storage can have.
+    """`index.json` of a folder: of this version, keys of their kinds, rounding errors that its storage can have.
 
     Raises:
         TensorError: it is absent, or not so.
@@ -45,10 +38,7 @@ def read_index(path: Path) -> dict[str, Any]:
     if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
         found = index.get("version") if isinstance(index, dict) else type(index).__name__
         raise TensorError(f"{file}: expected version {TENSORS_VERSION} of tensors, got {found}; {AGAIN}")
-    missing = [key for key in INDEX_KEYS if key not in index]
-    missing += [f"subsets: {key}" for subset in index.get("subsets", []) for key in SUBSET_KEYS if key not in subset]
-    if missing:
-        raise TensorError(f"{file}: lacks {', '.join(missing[:5])}; {AGAIN}")
+    check_index(file, index)
     _check_storage(file, index)
     return index
 
@@ -60,7 +50,7 @@ def _check_storage(file: Path, index: dict[str, Any]) -> None:
         raise TensorError(f"{file}: expected storage {' or '.join(POSITION_STORAGES)}, got {storage!r}; {AGAIN}")
     for axis, error, step in zip(("along", "across"), errors, STEPS_M.get(storage, (0.0, 0.0)), strict=True):
         most = step / 2 + 1e-3  # float32 rounds as well: 0.5 mm at 8 km
-        if not (math.isfinite(error) and error <= most):
+        if error > most:
             raise TensorError(
                 f"{file}: expected a rounding error {axis} the road of at most {most:g} m for {storage}, got {error}; "
                 f"{AGAIN}"
@@ -90,11 +80,11 @@ def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
 
 
 def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
-    """Every array of ARRAYS, mapped read-only, of the declared dtype and shape.
+    """Every array of ARRAYS, mapped read-only, of the declared dtype and shape, and in agreement with the index.
 
     Raises:
         TensorError: the file is absent, cut short or too long, no safetensors file, or lacks an array or holds it with
-            another dtype or shape.
+            another dtype or shape; or see `training.checks.check_arrays`.
     """
     file = path / ARRAYS_FILE
     header, start = _read_header(file)
@@ -105,12 +95,19 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
     for array in ARRAYS:
         dtype, shape = array.stored_as(index["storage"]), array.sizes(index["sizes"])
         found = header.get(array.name, {})
+        if not isinstance(found, dict):
+            raise TensorError(f"{file}: array `{array.name}`: expected an object in the header, got {found!r}; {AGAIN}")
         if (found.get("dtype"), found.get("shape")) != (SAFETENSORS_DTYPES[dtype], list(shape)):
             raise TensorError(
                 f"{file}: array `{array.name}`: expected {SAFETENSORS_DTYPES[dtype]} of shape {list(shape)}, got "
                 f"{found.get('dtype', 'nothing')} of shape {found.get('shape')}; {AGAIN}"
             )
-        first, end = found.get("data_offsets", (0, -1))
+        place = found.get("data_offsets")
+        if not is_pair(place, is_whole) or place[0] < 0:
+            raise TensorError(
+                f"{file}: array `{array.name}`: expected its two `data_offsets` in bytes, got {place!r}; {AGAIN}"
+            )
+        first, end = place
         if end - first != math.prod(shape) * np.dtype(dtype).itemsize or first % np.dtype(dtype).itemsize:
             raise TensorError(f"{file}: array `{array.name}` cannot stand at bytes {first} to {end}; {AGAIN}")
         if end > size:
@@ -122,6 +119,7 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
     ends = max(header[array.name]["data_offsets"][1] for array in ARRAYS)
     if size != ends:
         raise TensorError(f"{file}: expected {start + ends:,} bytes, got {start + size:,}; {AGAIN}")
+    check_arrays(file, index, arrays)
     return arrays
 
 

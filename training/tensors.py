@@ -13,8 +13,9 @@ from schemas.columns import PARTS
 from schemas.protocols import Protocol
 from schemas.tensors import STEPS_M
 from training.batches import Batch, Bytes, Floats, Integers, SceneBatch
+from training.checks import TensorError
 from training.drawing import draw_numbers
-from training.opening import TensorError, map_arrays, read_index, read_protocol
+from training.opening import map_arrays, read_index, read_protocol
 from training.scenes import Lanes, find_lanes, gather_scenes
 from training.windows import Masks, Windows, check_numbers, place, spread, subtract
 
@@ -63,7 +64,8 @@ class TensorFolder:
 
         Raises:
             TensorError: the folder, its index or its arrays are absent, of another version, unreadable or cut short;
-                or an array is not of the dtype and shape declared.
+                a key of the index is not of its kind; an array is not of the dtype and shape declared; or offsets,
+                subsets or parts do not agree with the index.
         """
         index = read_index(path)
         return cls(path=path, index=index, protocol=read_protocol(path, index), **map_arrays(path, index))

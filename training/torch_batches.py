@@ -1,6 +1,6 @@
 """Batches as torch tensors: streamed from the mapped folder, drawn by a sampler, or gathered on the device itself."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from typing import Any, Self
@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from training.batches import Batch
+from training.batches import Batch, Integers
 from training.drawing import draw_numbers
 from training.tensors import TensorFolder, find_part
+
+Change = Callable[[Batch], Batch]
 
 
 @dataclass(frozen=True)
@@ -59,20 +61,28 @@ def _as_tensor(value: Any) -> Any:  # noqa: ANN401  (arrays become tensors, what
     return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
 
 
+def _to_torch(batch: Batch, change: Change | None) -> TorchBatch:
+    return TorchBatch.of(batch if change is None else change(batch))
+
+
 class BatchStream(IterableDataset[TorchBatch]):
     """All samples of a part, batch by batch; each pass in an order of its own.
 
     For `DataLoader(stream, batch_size=None)`, or to iterate as it is: gathering needs no workers. With several, every
-    batch is yielded by one of them.
+    batch is yielded by one of them, and the order of a pass also depends on the seed that DataLoader draws for it:
+    `torch.manual_seed` (or its `generator`) repeats it.
 
     Args:
         folder: where from.
         part: train, val or eval.
         batch_size: B; the last batch may be smaller.
-        shuffle_seed: of the first pass; the next one takes the next seed. None = the samples' own order.
+        shuffle_seed: of the first pass; the next one takes the next seed (with workers: another). None = the samples'
+            own order.
         shuffle_block: see `training.drawing.draw_numbers`.
         absolute: see `Batch`.
         pin_memory: whether batches stand in page-locked memory; needs an accelerator.
+        change: made to each batch before it becomes torch, such as `training.augmentation.mirror`. Each worker has a
+            copy of it: let it draw by `torch.rand`, which DataLoader seeds for each worker and pass.
 
     Raises:
         ValueError: no such part.
@@ -88,11 +98,12 @@ class BatchStream(IterableDataset[TorchBatch]):
         shuffle_block: int | None = None,
         absolute: bool = False,
         pin_memory: bool = False,
+        change: Change | None = None,
     ) -> None:
         super().__init__()
         self.folder, self.part, self.batch_size = folder, find_part(part), batch_size
         self.shuffle_seed, self.shuffle_block = shuffle_seed, shuffle_block
-        self.absolute, self.pin_memory = absolute, pin_memory
+        self.absolute, self.pin_memory, self.change = absolute, pin_memory, change
         self.passes = 0
 
     def __len__(self) -> int:
@@ -101,14 +112,20 @@ class BatchStream(IterableDataset[TorchBatch]):
 
     def __iter__(self) -> Iterator[TorchBatch]:
         """One pass."""
-        seed = None if self.shuffle_seed is None else self.shuffle_seed + self.passes
+        seed, worker = self.shuffle_seed, get_worker_info()
+        if seed is not None:
+            # A worker's count of passes ends with it, where workers do not persist. The loader's base seed is new for
+            # each set of workers, and the same for all of them.
+            seed += self.passes + (0 if worker is None else worker.seed - worker.id)
         self.passes += 1
-        worker = get_worker_info()
         drawn = draw_numbers(
             self.folder.sample_part, self.part, self.batch_size, shuffle_seed=seed, shuffle_block=self.shuffle_block
         )
-        for samples in drawn if worker is None else islice(drawn, worker.id, None, worker.num_workers):
-            batch = TorchBatch.of(self.folder.gather(samples, absolute=self.absolute))
+        return self._gather(drawn if worker is None else islice(drawn, worker.id, None, worker.num_workers))
+
+    def _gather(self, drawn: Iterable[Integers]) -> Iterator[TorchBatch]:
+        for samples in drawn:
+            batch = _to_torch(self.folder.gather(samples, absolute=self.absolute), self.change)
             yield batch.pin_memory() if self.pin_memory else batch
 
 
@@ -121,13 +138,16 @@ class SampleDataset(Dataset[TorchBatch]):
         folder: where from.
         part: train, val or eval.
         absolute: see `Batch`.
+        change: made to each batch before it becomes torch, see `BatchStream`.
 
     Raises:
         ValueError: no such part.
     """
 
-    def __init__(self, folder: TensorFolder, part: str, *, absolute: bool = False) -> None:
-        self.folder, self.absolute = folder, absolute
+    def __init__(
+        self, folder: TensorFolder, part: str, *, absolute: bool = False, change: Change | None = None
+    ) -> None:
+        self.folder, self.absolute, self.change = folder, absolute, change
         self.numbers = folder.samples_of(part)
 
     def __len__(self) -> int:
@@ -141,7 +161,7 @@ class SampleDataset(Dataset[TorchBatch]):
     def __getitems__(self, positions: Sequence[int]) -> list[TorchBatch]:
         """One batch of several, in the list that DataLoader expects."""
         chosen = self.numbers[np.asarray(positions, dtype=np.int64)]
-        return [TorchBatch.of(self.folder.gather(chosen, absolute=self.absolute))]
+        return [_to_torch(self.folder.gather(chosen, absolute=self.absolute), self.change)]
 
     @staticmethod
     def collate(batches: list[TorchBatch]) -> TorchBatch:
@@ -154,7 +174,8 @@ class ResidentTensors:
     """A whole folder on a device, and batches gathered there: nothing crosses the bus but the samples' numbers.
 
     Takes what the arrays take: for each sample some 20 bytes, 6 for each of its neighbors, 14 for each entry on the
-    clock (with float32 positions).
+    clock (with float32 positions). Its batches are never NumPy's, so nothing of `training.augmentation` can change
+    them: that needs `BatchStream` or `SampleDataset`.
 
     Args:
         folder: what to load.

@@ -1,9 +1,11 @@
 """The card beside exported windows: what they hold, where they come from, what may be done with them."""
 
 import json
+import math
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
@@ -109,6 +111,8 @@ def write_card(path: Path, export: "WindowsExport", folder: TensorFolder, facts:
         "",
         "## Split",
         "",
+        *_name_recipe(index["split_recipe"]),
+        "",
         "| subset | block | frames | vehicles | part |",
         "| --- | ---: | --- | --- | --- |",
     ]
@@ -119,20 +123,38 @@ def write_card(path: Path, export: "WindowsExport", folder: TensorFolder, facts:
         frames = f"{block['first_frame']} to {block['last_frame']}"
         subset = f"{block['dataset']}/{block['subset']}"
         lines.append(f"| {subset} | {block['block']} | {frames} | {vehicles} | {block['part']} |")
-    along, across = (f"{error * 1000:.3g}" for error in index["max_error_m"])
     lines += [
         "",
         "## What the files hold",
         "",
         ABSOLUTE if export.absolute else RELATIVE,
-        f"Positions were stored as {index['storage']}; the rounding error is at most {along} mm along the road and "
-        f"{across} mm across it.",
+        _bound_errors(index, absolute=export.absolute),
         "",
         *_describe(export, folder),
         "",
         LOADING[export.format],
     ]
     path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def _bound_errors(index: Mapping[str, Any], *, absolute: bool) -> str:
+    """How far positions are from the tables'; the difference of two of them errs up to twice as far."""
+    most_mm = [(1 if absolute else 2) * 1000 * error for error in index["max_error_m"]]
+    # Rounded up, and float32's own errors on top: differences of up to 400 m err by less than 0.04 mm.
+    along, across = (f"{math.ceil((error + 0.04) * 10) / 10:g}" for error in most_mm)
+    said = f"Positions were stored as {index['storage']}; the rounding error is at most {along} mm along the road and "
+    if absolute:
+        return f"{said}{across} mm across it."
+    return f"{said}{across} mm across it (each is the difference of two stored ones), half of that in `origin`."
+
+
+def _name_recipe(recipe: dict[str, Any]) -> list[str]:
+    """What the split is made by: digest, parameters, and how many vehicles it leaves out."""
+    return [
+        f"- recipe: {recipe['digest']}",
+        *(f"- {name}: {value}" for name, value in recipe["parameters"].items()),
+        f"- vehicles left out of val and eval: {recipe['left_out_vehicles']:,}",
+    ]
 
 
 def _cite(facts: pl.DataFrame) -> list[str]:

@@ -25,7 +25,7 @@ from schemas import (
 from schemas.protocols import Protocol
 from schemas.split_recipes import MEANINGS, SplitRecipe
 
-VERSION = 2
+VERSION = 3
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:

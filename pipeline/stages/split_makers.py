@@ -9,15 +9,16 @@ import polars as pl
 from pipeline.lake import Manifest, scan
 from pipeline.transforms.split_comparisons import divide_by_id, divide_by_recording
 from pipeline.transforms.split_tables import Allocation
-from pipeline.transforms.splits import allocate_flow_balanced
+from pipeline.transforms.splits import allocate_flow_balanced, write_up
 from pipeline.transforms.time_blocks import (
-    BLOCKS,
     VISITS,
+    WEIGHTS,
     count_samples,
     cut_blocks,
     describe_blocks,
     find_left_out,
     find_visits,
+    recount_blocks,
 )
 from schemas import SAMPLES, SPLIT_LEFT_OUT, TRACKS, VEHICLES
 from schemas.protocols import Protocol
@@ -75,7 +76,7 @@ def _make_flow_balanced(recipe: SplitRecipe, material: Material) -> Made:
 
 def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
     blocks = cut_blocks(material.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
-    visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema={**_BLOCK_KEY, "weight": pl.Int64})]
+    visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema=WEIGHTS)]
     for facts in material.subsets.sort("dataset", "subset").iter_rows(named=True):
         values = {"dataset": facts["dataset"], "subset": facts["subset"]}
         own = blocks.filter(pl.col("dataset") == facts["dataset"], pl.col("subset") == facts["subset"])
@@ -85,7 +86,7 @@ def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
         stride = facts["frame_rate_hz"] / recipe.rate_hz
         weights.append(
             count_samples(
-                samples.filter(pl.col("protocol") == material.protocol.name).select("tick").collect(),
+                samples.filter(pl.col("protocol") == material.protocol.name).select("vehicle_id", "tick").collect(),
                 own,
                 stride=stride,
                 first_frame=facts["first_frame"],
@@ -93,15 +94,16 @@ def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
                 future=recipe.min_future_ticks * stride,
             )
         )
-    units = describe_blocks(blocks, material.subsets, pl.concat(visits), pl.concat(weights))
+    seen, sampled = pl.concat(visits), pl.concat(weights)
+    units = describe_blocks(blocks, material.subsets, seen, sampled)
     allocation = allocate_flow_balanced(
         units, split=recipe.name, validation=recipe.validation, seed=recipe.seed, restarts=recipe.restarts
     )
-    left_out = find_left_out(pl.concat(visits), allocation.splits)
-    return Made(allocation, left_out, units.select("dataset", "subset", "block", "flow"))
-
-
-_BLOCK_KEY = {name: BLOCKS[name] for name in ("dataset", "subset", "block")}
+    left_out = find_left_out(seen, allocation.splits)
+    # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
+    recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
+    written = write_up(recounted, split=recipe.name, validation=recipe.validation)
+    return Made(written, left_out, units.select("dataset", "subset", "block", "flow"))
 
 
 def _make_csp(recipe: SplitRecipe, material: Material) -> Made:

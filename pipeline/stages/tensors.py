@@ -19,7 +19,7 @@ from schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS
 from schemas.protocols import Protocol
 from schemas.tensors import INDEX_FILE
 
-VERSION = 2
+VERSION = 3
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane", "speed_mps")
 SAMPLE_COLUMNS = ("protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver")
@@ -33,7 +33,12 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     if not made:
         return []
     protocol = settings.get_protocol()
-    made_of = {**made, "protocol": protocol.digest, "positions": settings.tensor_positions}
+    made_of = {
+        **made,
+        "protocol": protocol.digest,
+        "split_recipe": describe_recipe(settings),
+        "positions": settings.tensor_positions,
+    }
     return [make_job(TENSORS, version_of_stage=VERSION, made_of=made_of, inputs={"split": protocol.split})]
 
 
@@ -52,13 +57,20 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
             yield facts, build_one(root, manifest, facts, splits.filter(here), vehicles, protocol, storage)
 
     def write(folder: Path) -> None:
-        write_tensors(folder, tensors_of(), splits, protocol, storage=storage)
+        recipe = {**describe_recipe(settings), "left_out_vehicles": left_out.height}
+        write_tensors(folder, tensors_of(), splits, protocol, storage=storage, split_recipe=recipe)
 
     path = free_path(root, f"{TENSORS}/{protocol.split}/{job.fingerprint}")
     files = write_folder(root, path, write)
     index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}
     return make_entry(job, {TENSORS: files}, info)
+
+
+def describe_recipe(settings: Settings) -> dict[str, Any]:
+    """What the tensors' split is made by: digest, and parameters by name."""
+    recipe = settings.get_split_recipe()
+    return {"digest": recipe.digest, "parameters": json.loads(recipe.parameters)}
 
 
 def read_split(root: Path, manifest: Manifest, protocol: Protocol) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -121,7 +133,7 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
     """Where the live tensors stand.
 
     Raises:
-        StageError: there are none, or they are of another protocol than the settings name.
+        StageError: there are none, or they are of another protocol or split than the settings name.
     """
     entry = manifest.entries.get(TENSORS)
     if entry is None or entry.info["path"] is None:
@@ -133,5 +145,12 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
         raise StageError(
             f"{root}: the tensors were made by another protocol than {protocol.name} ({protocol.digest}) as it is set "
             "now. Run `tracklake run` with these settings, or set what they were made with."
+        )
+    recipe, found = settings.get_split_recipe(), entry.built_from.get("split_recipe", {"digest": "unknown"})
+    if found["digest"] != recipe.digest:
+        raise StageError(
+            f"{root}: the tensors were made by another recipe of the split {recipe.name} ({found['digest']}: "
+            f"{json.dumps(found.get('parameters', {}))}) than the settings now give ({recipe.digest}: "
+            f"{recipe.parameters}). Run `tracklake run` with these settings, or set what they were made with."
         )
     return root / str(entry.info["path"])

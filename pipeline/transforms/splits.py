@@ -68,14 +68,28 @@ def allocate_flow_balanced(
     table = _check(subsets)
     shares = THREE_PARTS if validation else TWO_PARTS
     allocated = [table.with_columns(part=pl.lit(None, pl.String)).clear()]
-    reasons: dict[str, str | None] = {}
     for (dataset,), rows in sorted(table.group_by("dataset"), key=lambda item: str(item[0][0])):
-        problem = _pose(rows, shares)
-        part = allocate(problem, np.random.default_rng([seed, *str(dataset).encode()]), restarts)
+        part = allocate(_pose(rows, shares), np.random.default_rng([seed, *str(dataset).encode()]), restarts)
         names = pl.Series("part", [list(shares)[position] for position in part], dtype=pl.String)
         allocated.append(rows.with_columns(names))
-        reasons[str(dataset)] = _explain(allocated[-1], problem, part, shares)
-    return tabulate(pl.concat(allocated), split=split, parts=list(shares), reasons=reasons)
+    return write_up(pl.concat(allocated), split=split, validation=validation)
+
+
+def write_up(units: pl.DataFrame, *, split: str, validation: bool = False) -> Allocation:
+    """Write an allocation up, and judge by the counts given whether it is relaxed.
+
+    Args:
+        units: the columns of `split_tables.COLUMNS` (and `block`, where a subset has several rows), and `part`.
+        split: the name to write into the tables.
+        validation: whether there is a third part, `val`.
+    """
+    shares = THREE_PARTS if validation else TWO_PARTS
+    units = complete(units).sort("dataset", "site", "direction", "subset", "block")
+    reasons: dict[str, str | None] = {}
+    for (dataset,), rows in units.group_by("dataset"):
+        part = rows["part"].replace_strict(list(shares), range(len(shares)), return_dtype=pl.Int64).to_numpy()
+        reasons[str(dataset)] = _explain(rows, _pose(rows, shares), part.astype(np.intp), shares)
+    return tabulate(units, split=split, parts=list(shares), reasons=reasons)
 
 
 def _check(subsets: pl.DataFrame) -> pl.DataFrame:

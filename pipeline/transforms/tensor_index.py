@@ -43,8 +43,9 @@ def describe_tensors(
     samples_by_part: Sequence[int],
     max_error_m: Sequence[float],
     squared_error_m2: Sequence[float],
+    split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `index.json` holds: `schemas.tensors.INDEX_KEYS`.
+    """What `index.json` holds: `schemas.tensors.INDEX_KEYS` and LATER_INDEX_KEYS.
 
     Args:
         subsets: of `describe_subset`, in the order of `run_subset`.
@@ -56,6 +57,7 @@ def describe_tensors(
         samples_by_part: in the order of PARTS.
         max_error_m: greatest rounding error of all positions: along, across.
         squared_error_m2: sums of the squared rounding errors.
+        split_recipe: digest, parameters, left_out_vehicles; None: not known.
     """
     split = splits["split"].unique().sort()
     return {
@@ -69,4 +71,5 @@ def describe_tensors(
         "blocks": splits.drop("split").sort("dataset", "subset", "block").to_dicts(),
         "sizes": dict(sizes),
         "samples_by_part": {part: int(count) for part, count in zip(PARTS, samples_by_part, strict=True)},
+        "split_recipe": None if split_recipe is None else dict(split_recipe),
     }

@@ -27,6 +27,15 @@ VISITS: dict[str, pl.DataType | type[pl.DataType]] = {
 }
 """What `find_visits` returns."""
 
+WEIGHTS: dict[str, pl.DataType | type[pl.DataType]] = {
+    "dataset": pl.String,
+    "subset": pl.String,
+    "block": pl.Int32,
+    "vehicle_id": pl.Int32,
+    "weight": pl.Int64,
+}
+"""What `count_samples` returns."""
+
 SMALLEST = 1e-6
 """Of a frame: positions between frames are floating-point."""
 
@@ -91,10 +100,10 @@ def find_visits(entries: pl.DataFrame, blocks: pl.DataFrame) -> pl.DataFrame:
 def count_samples(
     samples: pl.DataFrame, blocks: pl.DataFrame, *, stride: float, first_frame: int, history: float, future: float
 ) -> pl.DataFrame:
-    """Count the samples of every block whose history and least future lie within it.
+    """Count the samples of every vehicle in every block whose history and least future lie within it.
 
     Args:
-        samples: tick of one subset's samples.
+        samples: vehicle_id and tick of one subset's samples.
         blocks: its rows of `cut_blocks`.
         stride: source frames per tick.
         first_frame: where tick 0 lies.
@@ -102,11 +111,11 @@ def count_samples(
         future: what it needs after it, likewise.
 
     Returns:
-        dataset, subset, block, weight; blocks without samples are not there.
+        The columns of `WEIGHTS`, sorted by them; blocks without samples are not there.
     """
     at = first_frame + pl.col("tick") * stride
     return (
-        samples.select(begins=at - history + SMALLEST, ends=at + future - SMALLEST)
+        samples.select("vehicle_id", begins=at - history + SMALLEST, ends=at + future - SMALLEST)
         .sort("begins")
         .join_asof(
             blocks.with_columns(pl.col("first_frame").cast(pl.Float64)).sort("first_frame"),
@@ -115,9 +124,10 @@ def count_samples(
             strategy="backward",
         )
         .filter(pl.col("ends") <= pl.col("last_frame"))
-        .group_by("dataset", "subset", "block")
-        .agg(weight=pl.len().cast(pl.Int64))
-        .sort("dataset", "subset", "block")
+        .group_by("dataset", "subset", "block", "vehicle_id")
+        .agg(weight=pl.len())
+        .select(pl.col(name).cast(dtype) for name, dtype in WEIGHTS.items())
+        .sort("dataset", "subset", "block", "vehicle_id")
     )
 
 
@@ -143,7 +153,7 @@ def describe_blocks(
             subsets.select("dataset", "subset", "site", "direction", "lanes", "frame_rate_hz"), on=["dataset", "subset"]
         )
         .join(visits.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
-        .join(weights, on=key, how="left")
+        .join(weights.group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
         .with_columns(pl.col("vehicles", "weight").fill_null(0))
         .with_columns(flow=pl.col("vehicles") / pl.col("lanes") / seconds)
         .drop("lanes", "frame_rate_hz")
@@ -174,4 +184,40 @@ def find_left_out(visits: pl.DataFrame, splits: pl.DataFrame) -> pl.DataFrame:
         .with_columns(pl.col("parts").list.join(", "))
         .select(pl.col(name).cast(dtype) for name, dtype in SPLIT_LEFT_OUT.dtypes.items())
         .sort(SPLIT_LEFT_OUT.key)
+    )
+
+
+def recount_blocks(
+    units: pl.DataFrame, splits: pl.DataFrame, left_out: pl.DataFrame, visits: pl.DataFrame, weights: pl.DataFrame
+) -> pl.DataFrame:
+    """Count what each block gives to its part once vehicles are left out.
+
+    Args:
+        units: of `describe_blocks`.
+        splits: rows of `schemas.splits.SPLITS` of one split, one per block.
+        left_out: of `find_left_out`, of this split.
+        visits: of `find_visits`, of all subsets.
+        weights: of `count_samples`, of all subsets.
+
+    Returns:
+        `units` with `part`, and both counts anew: weight, the samples without those of vehicles left out of the part;
+        vehicles, those that give entries to the part, each in its first block there, so that sums over blocks count
+        none twice.
+    """
+    vehicle, key = ["dataset", "subset", "vehicle_id"], ["dataset", "subset", "block"]
+    parts = splits.select(*key, "part")
+    gone = left_out.select(*vehicle, gone=True)
+
+    def stay(counted: pl.DataFrame) -> pl.DataFrame:
+        known = counted.join(parts, on=key).join(gone, on=vehicle, how="left")
+        return known.filter((pl.col("part") == PARTS[0]) | pl.col("gone").is_null())
+
+    present = stay(visits).group_by(*vehicle, "part").agg(pl.col("block").min())
+    return (
+        units.drop("vehicles", "weight")
+        .join(parts, on=key)
+        .join(present.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
+        .join(stay(weights).group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
+        .with_columns(pl.col("vehicles", "weight").fill_null(0))
+        .sort(key)
     )

@@ -82,7 +82,15 @@ def test_the_page_says_why_one_flatters_and_the_other_does_not(open_lake, tables
     assert "flow-balanced of highd: in" not in text
     assert "2 vehicles of highd have entries in two parts; 200 entries of theirs" in text
     assert "how csp-2018 &lt;divides&gt;. It does not claim to be free of leakage." in text
+    assert "recordings that follow one another in clock time are not compared" in text
+    assert "Recipe abc: seed 3" in text
     assert html.count("<svg") == 4, "two that compare, and the flows of each split"
+
+
+def test_a_recipe_without_parameters_says_so(open_lake, tables):
+    bare = [{**row, "parameters": '{"name": "x"}'} for row in tables["split_recipes"]]
+    html = build_report(open_lake(**{**tables, "split_recipes": bare}), {}).splits_html
+    assert html.count("Recipe <code>abc</code>, without parameters</p>") == 2
 
 
 def test_the_overview_leads_there_and_shows_the_split_that_trains(open_lake, tables):

@@ -11,7 +11,7 @@ from tensor_loop import UNDIVIDED, random_tables
 from tensor_tables import CLOCK, split_row, write
 
 from schemas.samples import NEIGHBORS, SAMPLES
-from training.augmentation import draw_mirrored, mirror, mirror_scenes, shift
+from training.augmentation import draw_mirrored, mirror, mirror_scenes, shift, shift_scenes
 from training.tensors import TensorFolder
 
 MARKINGS = [0.0, 4.0, 8.0, 11.0]
@@ -83,6 +83,37 @@ def test_a_shift_moves_absolute_positions_along_the_road_and_no_others(folder):
     assert absolute.future[0, 0].tolist() == [37.5, 4.5]
     assert absolute.neighbor_history[:, -1].tolist() == [[18.5, 10], [36.5, 7]]
     assert absolute.origin.tolist() == [[27.5, 4]]
+
+
+def test_a_shifted_scene_by_hand(folder):
+    # At tick 2 vehicle 1 stands at (20, 4), 2 at (29, 7), 3 at (11, 10).
+    by = np.array([7.5], dtype=np.float32)
+    relative, plain = shift_scenes(folder.gather_scenes([0]), by), folder.gather_scenes([0])
+    assert relative.origin.tolist() == [[27.5, 4], [36.5, 7], [18.5, 10]]
+    assert relative.history.tolist() == plain.history.tolist()
+    assert relative.future.tolist() == plain.future.tolist()
+    absolute = shift_scenes(folder.gather_scenes([0], absolute=True), by)
+    assert absolute.origin.tolist() == relative.origin.tolist()
+    assert absolute.history[0].tolist() == [[7.5, 3], [17.5, 3.5], [27.5, 4]]
+    assert absolute.future[:, 0].tolist() == [[37.5, 4.5], [46.5, 7.5], [28.5, 10.5]]
+    assert absolute.lane_offset_m.tolist() == plain.lane_offset_m.tolist()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), absolute=st.booleans())
+def test_each_scene_is_shifted_by_its_own_and_back_again(tmp_path_factory, seed, absolute):
+    folder = TensorFolder.open(write(tmp_path_factory.mktemp("tensors"), random_tables(seed), UNDIVIDED))
+    scenes = folder.gather_scenes(np.arange(len(folder.scene_part)), absolute=absolute)
+    by = np.arange(len(scenes), dtype=np.float32)
+    moved = shift_scenes(scenes, by)
+    for vehicle, scene in enumerate(scenes.vehicle_scene.tolist()):
+        assert moved.origin[vehicle].tolist() == [
+            scenes.origin[vehicle, 0] + np.float32(scene),
+            scenes.origin[vehicle, 1],
+        ]
+    back = shift_scenes(moved, -by)
+    for own in fields(scenes):
+        np.testing.assert_allclose(getattr(back, own.name), getattr(scenes, own.name), atol=1e-4, err_msg=own.name)
 
 
 @settings(max_examples=25, deadline=None)

@@ -7,7 +7,9 @@ import pytest
 from tensor_loop import UNDIVIDED, random_tables
 from tensor_tables import TINY, drive, sample_everything, split_row, write
 
-from schemas.tensors import ARRAYS, ARRAYS_FILE, INDEX_FILE
+from schemas.columns import PARTS
+from schemas.tensors import ARRAYS, ARRAYS_FILE, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
+from training.checks import KINDS
 from training.tensors import TensorError, TensorFolder
 
 
@@ -43,6 +45,33 @@ def change_header(name, **changes):
     return change
 
 
+def change_subset(**changes):
+    def change(folder):
+        file = folder / INDEX_FILE
+        index = json.loads(file.read_text())
+        index["subsets"][1] |= changes
+        file.write_text(json.dumps(index))
+
+    return change
+
+
+def set_value(name, position, value):
+    """Overwrite one value of an array."""
+
+    def change(folder):
+        file = folder / ARRAYS_FILE
+        whole = bytearray(file.read_bytes())
+        length = int.from_bytes(whole[:8], "little")
+        entry = json.loads(whole[8 : 8 + length])[name]
+        start, end = (8 + length + offset for offset in entry["data_offsets"])
+        values = np.frombuffer(whole[start:end], {"I64": "<i8", "I32": "<i4", "U8": "u1"}[entry["dtype"]]).copy()
+        values[position] = value
+        whole[start:end] = values.tobytes()
+        file.write_bytes(whole)
+
+    return change
+
+
 def resize(change):
     def damage(folder):
         file = folder / ARRAYS_FILE
@@ -72,6 +101,45 @@ def resize(change):
         (change_header("lane", dtype="I32"), "array `lane`: expected I16 of shape .*, got I32 of shape"),
         (change_header("neighbor_offset", shape=[1]), r"array `neighbor_offset`: expected I64 of shape .*\[1\]"),
         (change_header("lane", data_offsets=[1, 3]), "array `lane` cannot stand at bytes 1 to 3"),
+        (change_header("lane", data_offsets="x"), "`lane`: expected its two `data_offsets` in bytes, got 'x'; run"),
+        (change_header("lane", data_offsets=[0]), r"`lane`: expected its two `data_offsets` in bytes, got \[0\]"),
+        (change_header("lane", data_offsets=None), "`lane`: expected its two `data_offsets` in bytes, got None"),
+        (change_header("lane", data_offsets=[-4, 0]), r"two `data_offsets` in bytes, got \[-4, 0\]"),
+        (change_header("lane", data_offsets=[0, True]), r"two `data_offsets` in bytes, got \[0, True\]"),
+        (change_index(sizes={}), "index.json: lacks sizes: R, sizes: S, sizes: C, sizes: N, sizes: K; run"),
+        (change_index(sizes=None), "index.json: `sizes`: expected counts by name, got None; run"),
+        (change_index(sizes={"N": -1}), r"`sizes`: expected counts by name, got \{'N': -1\}"),
+        (change_index(protocol=None), "`protocol`: expected an object, got None"),
+        (change_index(split=5), "`split`: expected text, got 5"),
+        (change_index(max_error_m=None), "`max_error_m`: expected two numbers, got None"),
+        (change_index(max_error_m=[]), r"`max_error_m`: expected two numbers, got \[\]"),
+        (change_index(max_error_m=[0.0, float("nan")]), r"`max_error_m`: expected two numbers, got \[0.0, nan\]"),
+        (change_index(rms_error_m=[True, 0]), r"`rms_error_m`: expected two numbers, got \[True, 0\]"),
+        (change_index(blocks=None), "`blocks`: expected objects, got None"),
+        (change_index(subsets=None), "`subsets`: expected objects, got None"),
+        (change_index(subsets=[5]), r"`subsets`: expected objects, got \[5\]"),
+        (change_index(subsets=[]), "array `run_subset`: expected 0 to -1, the index's subsets, got 0 to [0-9]; run"),
+        (change_subset(centre_m=[0.0]), r"`subsets\[1\].centre_m`: expected two numbers, got \[0.0\]; run"),
+        (
+            change_subset(lane_markings_m=["x"]),
+            r"`subsets\[1\].lane_markings_m`: expected numbers or null, got \['x'\]",
+        ),
+        (change_subset(last_lane=2.5), r"`subsets\[1\].last_lane`: expected a whole number, got 2.5"),
+        (change_subset(width_m=None), r"`subsets\[1\].width_m`: expected a number, got None"),
+        (change_index(samples_by_part=None), "`samples_by_part`: expected counts by name, got None"),
+        (change_index(samples_by_part={"val": 0}), "lacks samples_by_part: train, samples_by_part: eval; run"),
+        (
+            change_index(samples_by_part={"train": 1, "val": 0, "eval": 0}),
+            "array `sample_part`: expected 1 samples of train, as the index counts, got [0-9]+; run",
+        ),
+        (set_value("sample_part", 0, 2), "array `sample_part`: expected [0-9]+ samples of [a-z]+, as the index counts"),
+        (set_value("run_subset", 0, -1), "array `run_subset`: expected 0 to [0-9], the index's subsets, got -1 to"),
+        (set_value("run_first_row", 0, 1), "array `run_first_row`: expected offsets from 0 to [0-9]+, got 1 to"),
+        (set_value("neighbor_offset", -1, 0), "`neighbor_offset`: expected offsets from 0 to [0-9]+, got 0 to 0; run"),
+        (
+            set_value("scene_offset", 1, -7),
+            "`scene_offset`: expected offsets that never fall, got -7 after 0 at 1; run",
+        ),
     ],
 )
 def test_a_damaged_folder_is_refused_with_what_and_where(tmp_path, damage, message):
@@ -79,6 +147,22 @@ def test_a_damaged_folder_is_refused_with_what_and_where(tmp_path, damage, messa
     damage(tmp_path)
     with pytest.raises(TensorError, match=message):
         TensorFolder.open(tmp_path)
+
+
+def test_samples_of_no_part_are_refused(tmp_path):
+    """Those that are left do agree with the index."""
+    write(tmp_path, random_tables(1), UNDIVIDED)
+    index = json.loads((tmp_path / INDEX_FILE).read_text())
+    part = PARTS[TensorFolder.open(tmp_path).sample_part[0]]
+    counts = index["samples_by_part"] | {part: index["samples_by_part"][part] - 1}
+    change_index(samples_by_part=counts)(tmp_path)
+    set_value("sample_part", 0, 9)(tmp_path)
+    with pytest.raises(TensorError, match=r"`sample_part`: expected 0 to 2, got 9 \(1 samples of no part\); run"):
+        TensorFolder.open(tmp_path)
+
+
+def test_every_kind_that_is_declared_is_known():
+    assert {*INDEX_KEYS.values(), *SUBSET_KEYS.values()} == set(KINDS)
 
 
 def test_steps_that_do_not_fit_the_error_are_refused(tmp_path):

@@ -11,6 +11,7 @@ from tensor_loop import IN_TIME, UNDIVIDED, random_tables
 from tensor_tables import drive, sample_everything, split_row, write
 from torch.utils.data import DataLoader
 
+from training.augmentation import mirror
 from training.batches import Batch
 from training.tensors import TensorFolder
 from training.torch_batches import BatchStream, ResidentTensors, SampleDataset, TorchBatch
@@ -84,6 +85,42 @@ def test_workers_of_a_stream_share_the_batches(folder, monkeypatch):
         monkeypatch.setattr("training.torch_batches.get_worker_info", lambda worker=worker: worker)
         seen.append([batch.sample.tolist() for batch in BatchStream(folder, "train", 7, absolute=True)])
     assert seen == [wanted[0::2], wanted[1::2]]
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+def test_workers_share_every_pass_and_draw_it_anew(folder, persistent):
+    def read_epochs(seed):
+        torch.manual_seed(seed)
+        stream = BatchStream(folder, "train", 3, shuffle_seed=5)
+        # Fork, as the folder is mapped; a test that spawns would import torch twice for each epoch.
+        loader = DataLoader(
+            stream,
+            batch_size=None,
+            num_workers=2,
+            persistent_workers=persistent,
+            multiprocessing_context="fork",
+        )
+        return [torch.cat([batch.sample for batch in loader]).tolist() for _ in range(2)]
+
+    first, second = read_epochs(seed=1)
+    everything = folder.samples_of("train").tolist()
+    assert len(everything) > 20
+    assert sorted(first) == sorted(second) == everything
+    assert first != second
+    assert read_epochs(seed=1) == [first, second]
+    assert read_epochs(seed=2)[0] != first
+
+
+def test_batches_are_changed_before_they_become_torch(folder):
+    def change(batch):
+        return mirror(folder, batch, np.ones(len(batch), dtype=np.bool_))
+
+    numbers = folder.samples_of("train")[:4]
+    wanted = change(folder.gather(numbers))
+    assert (wanted.history[..., 1] == -folder.gather(numbers).history[..., 1]).all()
+    assert_equals(next(iter(BatchStream(folder, "train", 4, change=change))), wanted)
+    (got,) = SampleDataset(folder, "train", change=change).__getitems__([0, 1, 2, 3])
+    assert_equals(got, wanted)
 
 
 def test_a_sampler_draws_whole_batches(folder):

@@ -1,6 +1,8 @@
 """`tracklake export windows` and `npz`: every sample of the tables, value for value, and a card that says what."""
 
 import json
+import re
+import shutil
 import zipfile
 
 import numpy as np
@@ -169,6 +171,8 @@ def test_the_card_says_what_the_files_are(lake, parquet, tmp_path):
         "- ngsim: public domain (U.S. Department of Transportation)",
         "Cite: U.S. Department of Transportation Federal Highway Administration (2016).",
         f"- digest: {digest}",
+        f"- recipe: {Settings().get_split_recipe().digest}\n- name: flow-balanced\n- restarts: 200\n- seed: 0\n"
+        "- validation: False\n- vehicles left out of val and eval: 0\n",
         "H = 16 positions of history, the sample's own included; F = 25 of future",
         "| ngsim/i-80-1600 | 0 | ",
         "| history_x_m | fixed_size_list<float>[16] | up to the sample's tick, m |",
@@ -196,6 +200,18 @@ def test_places_and_lakes_that_will_not_do(lake, parquet, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("change", [{"split_seed": 7}, {"validation_part": True}])
+def test_tensors_of_another_recipe_of_the_split_are_refused(lake, change):
+    asked, made = (Settings(lake=lake, **values) for values in (change, {}))
+    assert asked.get_protocol().digest == made.get_protocol().digest
+    digests = f"{made.get_split_recipe().digest}.*{asked.get_split_recipe().digest}"
+    with pytest.raises(StageError, match=f"another recipe of the split flow-balanced .{digests}.*Run `tracklake run`"):
+        tensors.tensor_folder(lake, load(lake), asked)
+    # What only other splits are made by changes nothing.
+    other = Settings(lake=lake, split_block_s=30)
+    assert tensors.tensor_folder(lake, load(lake), other) == tensors.tensor_folder(lake, load(lake), made)
+
+
 def test_a_failure_leaves_nothing(lake, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
@@ -219,7 +235,13 @@ def test_the_command(lake, parquet, tmp_path, name):
     assert "replace them: --force" in again.output.replace("\n", " ")
 
 
-def test_positions_as_int16_are_made_anew_and_the_card_says_how_exact_they_are(lake):
+def flatten(rows, axis):
+    """All positions of all windows along one axis."""
+    own = [rows[f"{window}_{axis}_m"].explode() for window in ("history", "future")]
+    return pl.concat([*own, rows[f"neighbor_history_{axis}_m"].explode().explode()])
+
+
+def test_positions_as_int16_are_made_anew_and_the_card_says_how_exact_they_are(lake, parquet, tmp_path):
     settings = Settings(lake=lake, tensor_positions="int16-centimetres")
     assert pending(lake, load(lake), tensors.plan(lake, load(lake), Settings(lake=lake))) == []
     (job,) = pending(lake, load(lake), tensors.plan(lake, load(lake), settings))
@@ -230,3 +252,20 @@ def test_positions_as_int16_are_made_anew_and_the_card_says_how_exact_they_are(l
     assert index["max_error_m"][1] <= 0.00051
     assert entry.info["samples"] == sum(index["samples_by_part"].values()) > 0
     assert {file.path.rpartition("/")[2] for file in entry.files["tensors"]} >= {"arrays.safetensors", "index.json"}
+
+    rounded = Settings(lake=tmp_path / "lake", tensor_positions="int16-centimetres")
+    shutil.copytree(lake, rounded.lake)
+    run_stages(rounded, "tensors")
+    export_windows(Settings(lake=lake), tmp_path / "exact", "parquet", absolute=True)
+    for name, absolute, exact in (("relative", False, parquet[1]), ("absolute", True, tmp_path / "exact")):
+        export_windows(rounded, tmp_path / name, "parquet", absolute=absolute)
+        card = (tmp_path / name / "README.md").read_text()
+        said = re.search(r"as int16-centimetres; .* at most ([\d.]+) mm along the road and ([\d.]+) mm across it", card)
+        assert ("half of that in `origin`" in card) is not absolute
+        got, wanted = (pl.read_parquet(folder / "train.parquet") for folder in (tmp_path / name, exact))
+        for axis, most, once in zip("xy", map(float, said.groups()), index["max_error_m"], strict=True):
+            worst = 1000 * (flatten(got, axis) - flatten(wanted, axis)).abs().max()
+            origin = 1000 * (got[f"origin_{axis}_m"] - wanted[f"origin_{axis}_m"]).abs().max()
+            assert origin <= (most if absolute else most / 2)
+            assert 0.8 * most < worst <= most
+            assert absolute or worst > 1.2 * 1000 * once, "no more than absolute positions err"

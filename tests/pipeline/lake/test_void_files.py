@@ -10,6 +10,7 @@ from pipeline.lake import load, open_for_writing
 from pipeline.settings import Settings
 from pipeline.stages import tensors
 from pipeline.stages.base import Job
+from schemas import SPLIT_LEFT_OUT
 from schemas.tensors import INDEX_FILE
 
 
@@ -44,7 +45,7 @@ def test_the_tensors_of_a_rebuild_are_those_it_made(tmp_path: Path, monkeypatch:
     def write(folder: Path, *_: object, **__: object) -> None:
         (folder / INDEX_FILE).write_text(json.dumps({"sizes": {"S": samples}, "samples_by_part": {}}))
 
-    monkeypatch.setattr(tensors, "read_split", lambda *_: (None, None))
+    monkeypatch.setattr(tensors, "read_split", lambda *_: (None, SPLIT_LEFT_OUT.empty()))
     monkeypatch.setattr(tensors, "_sampled_subsets", lambda *_: [{}])
     monkeypatch.setattr(tensors, "write_tensors", write)
     job, settings = Job("tensors", f"{1:016x}"), Settings(lake=tmp_path)

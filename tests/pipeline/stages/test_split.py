@@ -1,6 +1,7 @@
 """The split stage over a small lake, with every recipe; a leak planted in it stops the stage."""
 
 import itertools
+import json
 from dataclasses import replace
 
 import polars as pl
@@ -8,7 +9,7 @@ import pytest
 
 from pipeline.lake import Entry, connect, load, open_for_writing, write_table
 from pipeline.settings import Settings
-from pipeline.stages import split
+from pipeline.stages import split, tensors
 from pipeline.stages.base import Job, StageError
 from schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
 from schemas.split_recipes import SPLIT_NAMES, SplitRecipe
@@ -22,14 +23,14 @@ def fill(table, rows):
     return frame.sort(table.key)
 
 
-def put_recording(root, number):
+def put_recording(root, number, on_road_s=ON_ROAD_S):
     """Two carriageways; frames count from 1, at 5 Hz, so that a tick is a frame. Neighbors: who comes next."""
     for side in ("upper", "lower"):
         where = {"dataset": "highd", "subset": f"{number}-{side}"}
         tracks, vehicles, samples, neighbors = [], [], [], []
-        for vehicle in range(1, SECONDS - ON_ROAD_S + 1):
+        for vehicle in range(1, SECONDS - on_road_s + 1):
             first = 1 + (vehicle - 1) * RATE_HZ
-            last = first + ON_ROAD_S * RATE_HZ - 1
+            last = first + on_road_s * RATE_HZ - 1
             vehicles.append({**where, "vehicle_id": vehicle, "source_vehicle_id": vehicle, "class": "car",
                              "length_m": 4.0, "width_m": 2.0, "first_frame": first, "last_frame": last,
                              "entries": last - first + 1, "start_x_m": 0.0, "end_x_m": 100.0, "start_lane": 1,
@@ -42,7 +43,7 @@ def put_recording(root, number):
                     at = {**where, "protocol": "csp", "vehicle_id": vehicle, "tick": frame - 1}
                     samples.append({**at, "frame": frame, "lane": 1, "lateral_maneuver": "keep",
                                     "longitudinal_maneuver": "normal"})  # fmt: skip
-                    if vehicle < SECONDS - ON_ROAD_S:
+                    if vehicle < SECONDS - on_road_s:
                         neighbors.append({**at, "cell": 19, "neighbor_id": vehicle + 1, "dx_m": 25.0})
         facts = {**where, "recording": number, "site": "1", "direction": side, "freeway": True, "frame_rate_hz": 5.0,
                  "lanes": 2, "seconds": float(SECONDS), "first_frame": 1, "last_frame": SECONDS * RATE_HZ,
@@ -212,3 +213,63 @@ def test_the_digest_covers_every_parameter():
                {"name": "csp-2018", "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0,
                 "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}.items()]  # fmt: skip
     assert len({plain.digest, *(recipe.digest for recipe in changed)}) == 1 + len(SplitRecipe.__dataclass_fields__)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("flow-balanced", {"validation", "seed", "restarts"}),
+        ("csp-2018", set()),
+        ("by-recording-random", {"validation", "seed"}),
+    ],
+)
+def test_parameters_that_do_not_apply_are_neither_recorded_nor_hashed(name, read):
+    plain = SplitRecipe(name)
+    assert set(json.loads(plain.parameters)) == {"name", *read}
+    other = {"validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0, "rate_hz": 10,
+             "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}  # fmt: skip
+    changed = {key for key, value in other.items() if replace(plain, **{key: value}).digest != plain.digest}
+    assert changed == read
+
+
+def test_time_blocks_are_balanced_by_what_is_left_when_vehicles_are_left_out(tmp_path):
+    """Vehicles stay for 20 s, longer than a block and a purge: many are in two blocks, and in two parts."""
+    root = tmp_path / "lake"
+    for number in ("01", "02"):
+        put_recording(root, number, on_road_s=20)
+    settings = Settings(lake=root, split="time-blocks", splits=["time-blocks"], split_block_s=10, validation_part=True)
+    with open_for_writing(root) as writer:
+        writer.commit(split.build(root, JOB, settings))
+    with open_for_writing(root) as writer:
+        made = tensors.build(root, Job("tensors", "2" * 16), settings)
+        writer.commit(made)
+    with connect(root) as connection:
+        balance = connection.sql("SELECT part, samples, vehicles, vehicle_share, relaxed, relaxed_reason "
+                                 "FROM split_balance").fetchall()  # fmt: skip
+        context = dict(connection.sql("SELECT part, samples FROM split_context").fetchall())
+        rows = connection.sql("SELECT subset, first_frame, last_frame, part FROM splits").fetchall()
+        entries = connection.sql("SELECT subset, vehicle_id, frame FROM tracks").fetchall()
+        (left_out,) = connection.sql("SELECT count(*) FROM split_left_out").fetchone()
+    stands = {}
+    for subset, vehicle, frame in entries:
+        for where, first, last, part in rows:
+            if where == subset and first <= frame <= last:
+                stands.setdefault((subset, vehicle), set()).add(part)
+    assert left_out == sum(len(parts) > 1 for parts in stands.values()) > 0
+    gives = {part: sum(found == {part} or (part == "train" and part in found) for found in stands.values())
+             for part in ("train", "val", "eval")}  # fmt: skip
+    assert {part: vehicles for part, _, vehicles, *_ in balance} == gives
+    assert {part: samples for part, samples, *_ in balance if samples} == context
+    off = set()
+    for part, _, vehicles, share, _, reason in balance:
+        assert share == pytest.approx(vehicles / sum(gives.values()))
+        if abs(share - {"train": 0.7, "val": 0.1, "eval": 0.2}[part]) > 0.005:
+            assert f"{part} holds {share:.3f} of the vehicles" in reason
+            off.add(part)
+    assert off, "the parts are not as planned"
+    assert all(relaxed for *_, relaxed, _ in balance)
+    index = json.loads((root / made.info["path"] / "index.json").read_text())
+    assert index["split_recipe"]["left_out_vehicles"] == left_out
+    assert index["split_recipe"]["parameters"]["block_s"] == 10
+    assert index["split_recipe"]["digest"] == settings.get_split_recipe().digest
+    assert {part: n for part, n in index["samples_by_part"].items() if n} == context

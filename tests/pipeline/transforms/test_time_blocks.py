@@ -8,16 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.transforms.splits import allocate_flow_balanced
+from pipeline.transforms.splits import allocate_flow_balanced, write_up
 from pipeline.transforms.time_blocks import (
     VISITS,
+    WEIGHTS,
     count_samples,
     cut_blocks,
     describe_blocks,
     find_left_out,
     find_visits,
+    recount_blocks,
 )
 from schemas.splits import SPLIT_LEFT_OUT, SPLITS
+
+ENTRY = {"vehicle_id": pl.Int32, "tick": pl.Int32}
 
 
 def subsets(*rows):
@@ -96,7 +100,7 @@ def test_vehicles_in_two_parts_are_those_that_a_loop_finds(seed, validation):
                 inside[name, block, vehicle] = inside.get((name, block, vehicle), 0) + 1
     assert {row[1:4]: row[4] for row in visits.iter_rows()} == inside
 
-    weights = pl.DataFrame(schema={"dataset": pl.String, "subset": pl.String, "block": pl.Int32, "weight": pl.Int64})
+    weights = pl.DataFrame(schema=WEIGHTS)
     units = describe_blocks(blocks, known, visits, weights)
     for row in units.iter_rows(named=True):
         count = sum((row["subset"], row["block"]) == key[:2] for key in inside)
@@ -140,12 +144,12 @@ def test_samples_count_where_history_and_least_future_fit():
     blocks = cut_blocks(subsets(("a", 1, 1200, 25.0)), block_s=20, purge_s=8)
     assert blocks.select("first_frame", "last_frame").rows() == [(1, 500), (701, 1200)]
     fits = {0: [*range(15, 99)], 1: [*range(155, 239)]}  # 1 + 5 * 98 + 5 = 496; 1 + 5 * 155 - 75 = 701; 1191 + 5
-    ticks = pl.DataFrame({"tick": pl.Series(range(240), dtype=pl.Int32)})
+    ticks = pl.DataFrame({"vehicle_id": [2**31 - 1] * 240, "tick": range(240)}, schema_overrides=ENTRY)
     counted = count_samples(ticks, blocks, stride=5.0, first_frame=1, history=75.0, future=5.0)
-    assert counted.rows() == [("ngsim", "a", block, len(found)) for block, found in fits.items()]
+    assert counted.rows() == [("ngsim", "a", block, 2**31 - 1, len(found)) for block, found in fits.items()]
     # 10 Hz: tick k at 1 + 2.5 k; the last that fits ends at frame 498.5, between two frames.
     (found,) = count_samples(ticks.head(201), blocks, stride=2.5, first_frame=1, history=75.0, future=2.5).rows()
-    assert found == ("ngsim", "a", 0, len(range(30, 199)))
+    assert found == ("ngsim", "a", 0, 2**31 - 1, len(range(30, 199)))
 
 
 def test_empty_tracks_visit_nothing():
@@ -156,3 +160,68 @@ def test_empty_tracks_visit_nothing():
     assert find_visits(one, blocks).rows() == [("ngsim", "a", 1, 2**31 - 1, 1)]
     purged = pl.DataFrame({"vehicle_id": [1, 1], "frame": [501, 700]}, schema=empty.schema)
     assert find_visits(purged, blocks).is_empty()
+
+
+def test_parts_count_vehicles_once_and_no_samples_of_those_left_out():
+    # Five blocks of one subset. Vehicle 1 is in two of train; 2 in train and eval; 3 in val and eval; 4 in two of eval.
+    key = {"dataset": "d", "subset": "a"}
+    parts = ["train", "train", "val", "eval", "eval"]
+    inside = [(0, 1), (1, 1), (1, 2), (3, 2), (2, 3), (3, 3), (3, 4), (4, 4)]
+    rows = [{**key, "block": block, "vehicle_id": vehicle} for block, vehicle in inside]
+    visits = pl.DataFrame([{**row, "entries": 9} for row in rows], schema=VISITS)
+    # One sample of the first, two of the second, four of the third ...: every sum names its terms.
+    weights = pl.DataFrame([{**row, "weight": 2**place} for place, row in enumerate(rows)], schema=WEIGHTS)
+    blocks = pl.DataFrame({"block": range(5), "part": parts}, schema={"block": pl.Int32, "part": pl.String})
+    known = {"site": "S", "direction": "south", "flow": 0.5, "first_frame": 1, "last_frame": 2}
+    units = blocks.drop("part").with_columns(
+        **{name: pl.lit(value) for name, value in {**key, **known}.items()}, vehicles=pl.lit(7), weight=pl.lit(7)
+    )
+    splits = blocks.with_columns(split=pl.lit("time-blocks"), dataset=pl.lit("d"), subset=pl.lit("a"))
+    left_out = find_left_out(visits, splits)
+    assert left_out["vehicle_id"].to_list() == [2, 3]
+    found = recount_blocks(units, splits, left_out, visits, weights)
+    expected = [("train", 1, 1), ("train", 1, 2 + 4), ("val", 0, 0), ("eval", 1, 64), ("eval", 0, 128)]
+    assert found.select("part", "vehicles", "weight").rows() == expected
+    allocation = write_up(found, split="time-blocks", validation=True)
+    columns = ("part", "vehicles", "vehicle_share", "samples")
+    assert {row[0]: row[1:] for row in allocation.balance.select(columns).iter_rows()} == {
+        "train": (2, 2 / 3, 7), "val": (0, 0.0, 0), "eval": (1, 1 / 3, 192),
+    }  # fmt: skip
+    (reason,) = allocation.relaxations.values()
+    assert "val without samples" in reason
+    assert "train holds 0.667 of the vehicles instead of 0.700" in reason
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_sums_of_recounted_blocks_are_those_of_a_loop(seed):
+    known, blocks, entries = scene(seed)
+    frames = pl.DataFrame(
+        entries, schema={"subset": pl.String, "vehicle_id": pl.Int32, "frame": pl.Int32}, orient="row"
+    )
+    visits = pl.concat(find_visits(frames.filter(subset=name), blocks.filter(subset=name)) for name in ("a", "b"))
+    draw = random.Random(seed)
+    weights = visits.select(
+        "dataset", "subset", "block", "vehicle_id",
+        weight=pl.Series([draw.randint(1, 9) for _ in range(visits.height)], dtype=pl.Int64),
+    )  # fmt: skip
+    drawn = [draw.choice(["train", "val", "eval"]) for _ in range(blocks.height)]
+    splits = blocks.with_columns(split=pl.lit("s"), part=pl.Series(drawn, dtype=pl.String))
+    part = {(row["subset"], row["block"]): row["part"] for row in splits.iter_rows(named=True)}
+    stands = {}
+    for _, name, block, vehicle, _ in visits.iter_rows():
+        stands.setdefault((name, vehicle), set()).add(part[name, block])
+    vehicles, samples = {}, {}
+    for _, name, block, vehicle, weight in weights.iter_rows():
+        if part[name, block] == "train" or len(stands[name, vehicle]) == 1:
+            vehicles.setdefault(part[name, block], set()).add((name, vehicle))
+            samples[name, block] = samples.get((name, block), 0) + weight
+    units = describe_blocks(blocks, known, visits, weights)
+    found = recount_blocks(
+        units, splits, find_left_out(visits, splits), visits, weights.sample(fraction=1, shuffle=True)
+    )
+    assert found.select("subset", "block").rows() == blocks.select("subset", "block").rows()
+    counted = dict(found.group_by("part").agg(pl.col("vehicles").sum()).iter_rows())
+    assert counted == {name: len(vehicles.get(name, ())) for name in set(drawn)}
+    assert {row[:2]: row[2] for row in found.select("subset", "block", "weight").iter_rows() if row[2]} == samples
+    assert found["flow"].to_list() == units["flow"].to_list()
