@@ -118,11 +118,9 @@ INDEX_KEYS = {
     "blocks": "objects",
     "sizes": "counts by name",
     "samples_by_part": "counts by name",
+    "split_recipe": "an object or null",
 }
 """Each key and the kind of its value."""
-
-LATER_INDEX_KEYS = ("split_recipe",)
-"""Written, but not demanded: folders made before there were these can be read."""
 
 INDEX_MEANING = """\
 What `index.json` holds: the version; the split's name; the protocol's parameters and digest; how positions are stored;

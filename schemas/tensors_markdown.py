@@ -2,7 +2,7 @@
 
 from schemas import tensors
 from schemas.protocols import CSP
-from schemas.tensors import ARRAYS, INDEX_KEYS, LATER_INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
+from schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
 
 LETTERS = {
     "N": "rows: entries on the protocol's clock that stand in a part of the split, of subsets with samples",
@@ -39,8 +39,7 @@ def write_tensors_page() -> str:
     lines += ["| storage | m per step along | m per step across |", "| --- | --- | --- |"]
     lines += [f"| {storage} | {along:g} | {across:g} |" for storage, (along, across) in STEPS_M.items()]
     lines += ["", "## The index", "", tensors.INDEX_MEANING, ""]
-    keys = (*INDEX_KEYS, *LATER_INDEX_KEYS)
-    lines += [f"Keys: {', '.join(f'`{key}`' for key in keys)}.", "", tensors.SUBSET_MEANING, ""]
+    lines += [f"Keys: {', '.join(f'`{key}`' for key in INDEX_KEYS)}.", "", tensors.SUBSET_MEANING, ""]
     lines += [f"Keys: {', '.join(f'`{key}`' for key in SUBSET_KEYS)}.", ""]
     return "\n".join(lines)
 

@@ -39,6 +39,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "two numbers": lambda value: is_pair(value, _is_number),
     "numbers or null": lambda value: value is None or (isinstance(value, list) and all(map(_is_number, value))),
     "an object": lambda value: isinstance(value, dict),
+    "an object or null": lambda value: value is None or isinstance(value, dict),
     "objects": lambda value: isinstance(value, list) and all(isinstance(one, dict) for one in value),
     "counts by name": lambda value: (
         isinstance(value, dict) and all(is_whole(count) and count >= 0 for count in value.values())

@@ -45,7 +45,7 @@ def describe_tensors(
     squared_error_m2: Sequence[float],
     split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `index.json` holds: `schemas.tensors.INDEX_KEYS` and LATER_INDEX_KEYS.
+    """What `index.json` holds: `schemas.tensors.INDEX_KEYS`.
 
     Args:
         subsets: of `describe_subset`, in the order of `run_subset`.

@@ -12,7 +12,7 @@ from pipeline.transforms.tensors import build_subset_tensors, count_sizes, join_
 from schemas.protocols import Protocol
 from schemas.samples import NEIGHBORS, SAMPLES
 from schemas.splits import SPLITS
-from schemas.tensors import INDEX_KEYS, LATER_INDEX_KEYS, SUBSET_KEYS
+from schemas.tensors import INDEX_KEYS, SUBSET_KEYS
 
 P = Protocol(name="p", rate_hz=2, history_s=0.5, horizon_s=1.0, min_future_s=0.5)  # 2 positions of history, 2 of future
 TOP = 2**31 - 1
@@ -183,7 +183,7 @@ def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
     marked = FACTS | {"subset": "b", "lane_markings_m": [0.0, 4.0, 8.0, 12.0]}
     index = write_tensors(tmp_path, [(FACTS, build_tensors()), (marked, build_tensors())], WHOLE, P, storage="float32")
     assert json.loads((tmp_path / "index.json").read_text()) == index
-    assert set(index) == {*INDEX_KEYS, *LATER_INDEX_KEYS}
+    assert set(index) == INDEX_KEYS.keys()
     assert index["split"] == "s"
     assert index["protocol"]["name"] == "p"
     assert index["protocol"]["digest"] == P.digest
