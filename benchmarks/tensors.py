@@ -26,7 +26,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -242,7 +242,9 @@ def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, 
     opened = TensorFolder.open(Path(folder))
     if order == "one at a time":
         reference = Reference(opened)
-        batches: Callable[[], Iterator[tuple[int, int]]] = lambda: reference.batches("train", batch_size, seed=1)  # noqa: E731  (one line each)
+
+        def batches() -> Iterator[tuple[int, int]]:
+            return reference.batches("train", batch_size, seed=1)
     else:
 
         def batches() -> Iterator[tuple[int, int]]:

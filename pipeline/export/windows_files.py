@@ -1,7 +1,7 @@
 """The files of windows: Parquet with a row per sample, or NumPy arrays in an `.npz`."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Self
@@ -98,7 +98,7 @@ def window_schema(folder: TensorFolder) -> pa.Schema:
     )
 
 
-def _name(names: Any, codes: npt.NDArray[np.integer]) -> pa.DictionaryArray:  # noqa: ANN401  (a sequence of strings)
+def _name(names: Sequence[str], codes: npt.NDArray[np.integer]) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(codes.astype(np.int32), pa.array(list(names), pa.string()))
 
 

@@ -1,8 +1,24 @@
 """Tracks for the tests of late starts: made by hand or at random, and the columns of `vehicles` that repair reads."""
 
+from pathlib import Path
+
 import polars as pl
 
+US101 = Path(__file__).parents[3].parent / "shared" / "data" / "ngsim" / "us101_0750_290_vehicles.csv.gz"
 NAMES = {"dataset": "ngsim", "subset": "us-101-0750"}
+
+
+def read_us101():
+    """The real excerpt: its tracks and its first frame."""
+    raw = pl.read_csv(US101).sort("Vehicle_ID", "Frame_ID")
+    tracks = raw.select(
+        vehicle_id=pl.col("Vehicle_ID").cast(pl.Int32),
+        frame=pl.col("Frame_ID").cast(pl.Int32),
+        x_m=pl.col("Local_Y") * 0.3048,
+        lane=pl.lit(None, pl.Int16),
+        speed_mps=(pl.col("v_Vel") * 0.3048).cast(pl.Float32),
+    )
+    return tracks, int(raw["Frame_ID"].min())
 
 
 def make_tracks(entries):

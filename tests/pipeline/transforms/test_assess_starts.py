@@ -16,9 +16,8 @@ from schemas.start_assessments import ESTIMATORS, START_ASSESSMENTS
 
 sys.path.append(str(Path(__file__).parent))
 
-from start_scenes import NAMES, creep, cross_slowly, drive, make_tracks, summarise
+from start_scenes import NAMES, US101, creep, cross_slowly, drive, make_tracks, read_us101, summarise
 
-US101 = Path(__file__).parents[3].parent / "shared" / "data" / "ngsim" / "us101_0750_290_vehicles.csv.gz"
 RATE_HZ = 10.0
 
 
@@ -263,24 +262,12 @@ def test_a_vehicle_that_backs_up_and_returns_starts_where_it_first_got():
     assert [(row["start_frame"], row["frames_true"]) for row in found] == [(70, 20.0)]
 
 
-def read_us101():
-    raw = pl.read_csv(US101).sort("Vehicle_ID", "Frame_ID")
-    tracks = raw.select(
-        vehicle_id=pl.col("Vehicle_ID").cast(pl.Int32),
-        frame=pl.col("Frame_ID").cast(pl.Int32),
-        x_m=pl.col("Local_Y") * 0.3048,
-        lane=pl.lit(None, pl.Int16),
-        speed_mps=(pl.col("v_Vel") * 0.3048).cast(pl.Float32),
-    )
-    first_frame = int(raw["Frame_ID"].min())
-    starts, cutoffs = judge_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=RATE_HZ)
-    return tracks, starts, cutoffs["cutoff_m"][0], first_frame
-
-
 @pytest.mark.skipif(not US101.exists(), reason=f"the real excerpt {US101.name} is not beside the project")
 def test_us101_excerpt():
     """The contract's windows cover 95 %; the local regression covers at least as much with far less in vain."""
-    tracks, starts, cutoff_m, first_frame = read_us101()
+    tracks, first_frame = read_us101()
+    starts, cutoffs = judge_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=RATE_HZ)
+    cutoff_m = cutoffs["cutoff_m"][0]
     table = assess_starts(tracks, starts, **NAMES, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=RATE_HZ)
     sums = table.group_by("estimator").agg(pl.col("starts", "frames_missing", "frames_covered", "frames_excess").sum())
     rows = {row["estimator"]: row for row in sums.to_dicts()}

@@ -1,13 +1,13 @@
 """Cut-off, late starts, the frame estimate and early vehicles."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from start_scenes import NAMES, US101, make_tracks, read_us101, summarise
 
 from pipeline.transforms.late_starts import (
     estimate_missing_starts,
@@ -17,27 +17,6 @@ from pipeline.transforms.late_starts import (
 )
 from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from schemas.vehicles import VEHICLE_STARTS
-
-US101 = Path(__file__).parents[3].parent / "shared" / "data" / "ngsim" / "us101_0750_290_vehicles.csv.gz"
-NAMES = {"dataset": "ngsim", "subset": "us-101-0750"}
-
-
-def make_tracks(entries):
-    """(vehicle_id, frame, x_m, lane, speed_mps) rows."""
-    schema = {"vehicle_id": pl.Int32, "frame": pl.Int32, "x_m": pl.Float64, "lane": pl.Int16, "speed_mps": pl.Float32}
-    return pl.DataFrame(entries, schema=schema, orient="row")
-
-
-def summarise(tracks):
-    """The columns of `vehicles` that judge_starts reads."""
-    return tracks.group_by("vehicle_id", maintain_order=True).agg(
-        first_frame=pl.col("frame").first(),
-        last_frame=pl.col("frame").last(),
-        entries=pl.len().cast(pl.Int32),
-        start_x_m=pl.col("x_m").first(),
-        end_x_m=pl.col("x_m").last(),
-        start_lane=pl.col("lane").first(),
-    )
 
 
 def judge(rows, *, frame_rate_hz=10.0, first_frame=0, on_ramp_lanes=()):
@@ -362,15 +341,7 @@ def test_estimates_agree_with_a_loop_on_tracks_that_creep_and_stop(seed):
 @pytest.mark.skipif(not US101.exists(), reason=f"the real excerpt {US101.name} is not beside the project")
 def test_us101_excerpt():
     """DESIGN section 6: cut-off 14 m, and one of 289 tracks late (vehicle 407, first seen at 504.803 ft)."""
-    raw = pl.read_csv(US101).sort("Vehicle_ID", "Frame_ID")
-    tracks = raw.select(
-        vehicle_id=pl.col("Vehicle_ID").cast(pl.Int32),
-        frame=pl.col("Frame_ID").cast(pl.Int32),
-        x_m=pl.col("Local_Y") * 0.3048,
-        lane=pl.lit(None, pl.Int16),
-        speed_mps=(pl.col("v_Vel") * 0.3048).cast(pl.Float32),
-    )
-    first_frame = int(raw["Frame_ID"].min())
+    tracks, first_frame = read_us101()
     starts, cutoffs = judge_starts(
         summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=10.0, on_ramp_lanes=(7,)
     )
