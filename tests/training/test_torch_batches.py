@@ -1,6 +1,10 @@
 """Batches as torch tensors: streamed, drawn by a sampler, and gathered on a device, equal to the mapped folder's."""
 
+import json
+import subprocess
+import sys
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -87,28 +91,17 @@ def test_workers_of_a_stream_share_the_batches(folder, monkeypatch):
     assert seen == [wanted[0::2], wanted[1::2]]
 
 
-@pytest.mark.parametrize("persistent", [False, True])
-def test_workers_share_every_pass_and_draw_it_anew(folder, persistent):
-    def read_epochs(seed):
-        torch.manual_seed(seed)
-        stream = BatchStream(folder, "train", 3, shuffle_seed=5)
-        # Fork, as the folder is mapped; a test that spawns would import torch twice for each epoch.
-        loader = DataLoader(
-            stream,
-            batch_size=None,
-            num_workers=2,
-            persistent_workers=persistent,
-            multiprocessing_context="fork",
-        )
-        return [torch.cat([batch.sample for batch in loader]).tolist() for _ in range(2)]
-
-    first, second = read_epochs(seed=1)
+def test_workers_share_every_pass_and_draw_it_anew(folder):
+    command = [sys.executable, Path(__file__).with_name("read_with_workers.py"), folder.path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     everything = folder.samples_of("train").tolist()
     assert len(everything) > 20
-    assert sorted(first) == sorted(second) == everything
-    assert first != second
-    assert read_epochs(seed=1) == [first, second]
-    assert read_epochs(seed=2)[0] != first
+    for (first, second), again, other in json.loads(done.stdout):
+        assert sorted(first) == sorted(second) == everything
+        assert first != second
+        assert again == [first, second]
+        assert other[0] != first
 
 
 def test_batches_are_changed_before_they_become_torch(folder):
