@@ -47,11 +47,12 @@ CASES = {
     "20 x 500,000 at 25 Hz, 3 lanes": {"subsets": 20, "entries": 500_000, "rate": 25.0, "lanes": 3, "apart_m": 45.0},
     "7 x 1,500,000 at 10 Hz, 6 lanes": {"subsets": 7, "entries": 1_500_000, "rate": 10.0, "lanes": 6, "apart_m": 11.0},
 }
-ORDERS: dict[str, dict[str, int | None]] = {
-    "own": {"shuffle_seed": None},
-    "shuffled": {"shuffle_seed": 1},
-    "shuffled by blocks": {"shuffle_seed": 1, "shuffle_block": 2**16},
+ORDERS: dict[str, tuple[int | None, int | None]] = {
+    "own": (None, None),
+    "shuffled": (1, None),
+    "shuffled by blocks": (1, 2**16),
 }
+"""Of reading: seed and block of the shuffle."""
 HALF_GRID_M, CELL_M = 27.432, 4.572
 
 
@@ -248,7 +249,8 @@ def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, 
     else:
 
         def batches() -> Iterator[tuple[int, int]]:
-            for batch in opened.batches("train", batch_size, **ORDERS[order]):  # type: ignore[arg-type]  # of a table
+            seed, block = ORDERS[order]
+            for batch in opened.batches("train", batch_size, shuffle_seed=seed, shuffle_block=block):
                 yield len(batch), len(batch.neighbor_sample)
 
     samples, neighbors, watch = 0, 0, Watch()

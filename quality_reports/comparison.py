@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from quality_reports.summaries import Connection, Row, plain, query
+from quality_reports.summaries import Connection, Row, plain, plain_row, query
 from schemas.columns import PARTS
 
 COMPARISON_SCHEMA = "tracklake/comparison/1"
@@ -246,7 +246,9 @@ def _compare_files(sides: Sequence[list[Row]]) -> Row:
 def _horizons(side: Side) -> list[Row]:
     """A row per model, part and horizon."""
     return [
-        {"model": score["model"], "part": score["part"], **plain(row)} for score in side.scores for row in score["rows"]
+        {"model": score["model"], "part": score["part"], **plain_row(row)}
+        for score in side.scores
+        for row in score["rows"]
     ]
 
 

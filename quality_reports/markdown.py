@@ -1,5 +1,6 @@
 """The rules as Markdown, derived from their declarations: `python -m quality_reports.markdown > docs/rules.md`."""
 
+import sys
 from collections.abc import Iterator
 
 from quality_reports.declaring import Case
@@ -63,4 +64,4 @@ def _example(case: Case) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    print(write_rules(), end="")  # noqa: T201 - it is what the module is for
+    sys.stdout.write(write_rules())

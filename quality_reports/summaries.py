@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from importlib.resources import files
 from pathlib import PurePath
-from typing import Any, Protocol
+from typing import Any, Protocol, SupportsFloat, TypeAlias
 
 import polars as pl
 
@@ -22,15 +22,34 @@ REJECTS_PER_FILE = 10
 REJECT_CHARACTERS = 300
 
 
+class Result(Protocol):
+    """What the report needs of a statement's result."""
+
+    @property
+    def description(self) -> Sequence[Any] | None:
+        """A tuple per column, of which the first is its name."""
+        ...
+
+    def fetchall(self) -> list[Any]:
+        """All rows as tuples."""
+        ...
+
+    def pl(self) -> pl.DataFrame:
+        """All rows as a frame."""
+        ...
+
+
 class Connection(Protocol):
     """What the report needs of a lake's connection: DuckDB's own has it, and the read-only one of the lake."""
 
-    def execute(self, statement: str, parameters: Any = ..., /) -> Any:  # noqa: ANN401 - DuckDB's own types
-        """Run a statement; the result has `description`, `fetchall()` and `pl()`."""
+    def execute(self, statement: str, parameters: Mapping[str, Any] = ..., /) -> Result:
+        """Run a statement."""
         ...
 
 
 Row = dict[str, Any]
+Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
+"""What JSON knows."""
 Parameters = Mapping[str, Any]
 
 
@@ -50,7 +69,7 @@ def query(connection: Connection, name: str, parameters: Parameters | None = Non
     # Not on a cursor: it would be a connection of its own, without the caller's local settings and registered frames.
     result = connection.execute(statement(name), dict(parameters or {}))
     names = [column[0] for column in result.description or ()]
-    return [dict(zip(names, plain(row), strict=True)) for row in result.fetchall()]
+    return [dict(zip(names, map(plain, row), strict=True)) for row in result.fetchall()]
 
 
 def query_frame(connection: Connection, name: str, parameters: Parameters | None = None) -> pl.DataFrame:
@@ -61,11 +80,15 @@ def query_frame(connection: Connection, name: str, parameters: Parameters | None
         name: the file's name without its suffix.
         parameters: values of its $names.
     """
-    frame: pl.DataFrame = connection.execute(statement(name), dict(parameters or {})).pl()
-    return frame
+    return connection.execute(statement(name), dict(parameters or {})).pl()
 
 
-def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a setting may hold
+def plain_row(row: Mapping[str, Any]) -> Row:
+    """A mapping with values that JSON knows; see `plain`."""
+    return {str(key): plain(value) for key, value in row.items()}
+
+
+def plain(value: object) -> Plain:
     """Turn a value into what JSON knows.
 
     NaN and infinity become None, other fractions are rounded to SIGNIFICANT_DIGITS, paths and dates become text,
@@ -79,14 +102,14 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - any value that a query or a sett
     if isinstance(value, float):
         return float(f"{value:.{SIGNIFICANT_DIGITS}g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
+        return plain_row(value)
     if isinstance(value, Sequence | set | frozenset) and not isinstance(value, bytes):
         return [plain(each) for each in (sorted(value) if isinstance(value, set | frozenset) else value)]
     if isinstance(value, datetime | date):
         return value.isoformat()
     if isinstance(value, PurePath):
         return str(value)
-    if hasattr(value, "__float__"):  # Decimal, NumPy scalars
+    if isinstance(value, SupportsFloat):  # Decimal, NumPy scalars
         return plain(float(value))
     raise TypeError(f"cannot put a {type(value).__name__} into the report: {value!r}")
 
@@ -181,7 +204,7 @@ def collect(
             ),
         },
         "model_scores": plain(list(scores or ())),
-        "provenance": {**plain(provenance), "source_files": query(connection, "source_files")},
+        "provenance": {**plain_row(provenance), "source_files": query(connection, "source_files")},
     }
 
 

@@ -1,5 +1,6 @@
 """The tables as Markdown, derived from their declarations: `python -m schemas.markdown > docs/tables.md`."""
 
+import sys
 from collections.abc import Iterator
 
 from schemas import SCHEMA_VERSION, TABLES, Table
@@ -61,4 +62,4 @@ def _bound(value: float | None) -> str:
 
 
 if __name__ == "__main__":
-    print(write_tables(), end="")  # noqa: T201 - it is what the module is for
+    sys.stdout.write(write_tables())

@@ -1,5 +1,7 @@
 """The tensor folder as Markdown, from its declaration: `python -m schemas.tensors_markdown > docs/tensors.md`."""
 
+import sys
+
 from schemas import tensors
 from schemas.protocols import CSP
 from schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
@@ -45,4 +47,4 @@ def write_tensors_page() -> str:
 
 
 if __name__ == "__main__":
-    print(write_tensors_page(), end="")  # noqa: T201 - it is what the module is for
+    sys.stdout.write(write_tensors_page())

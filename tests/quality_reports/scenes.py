@@ -12,7 +12,10 @@ from schemas import TRACKS
 TRACK_COLUMNS = tracks_needed()
 
 
-def scene_of(entries: dict[Key, Entry], surface: Surface = Surface()) -> Scene:  # noqa: B008 - frozen
+ANY_SURFACE = Surface()
+
+
+def scene_of(entries: dict[Key, Entry], surface: Surface = ANY_SURFACE) -> Scene:
     """A scene as ingestion would leave it: gaps and 10 Hz speeds computed from positions, one entry at a time."""
     slow = Scenery(entries, surface)
     rows = []

@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import change, driver, scene_of
+from scenes import ANY_SURFACE, change, driver, scene_of
 
 from pipeline.sample.judging import Surface
 from quality_reports import within_frames
@@ -15,7 +15,7 @@ from quality_reports.scene import NOBODY
 HALF_TICKS = Surface(rate_hz=25.0)
 
 
-def accelerations(values: list[float], surface: Surface = Surface(), missing: tuple[int, ...] = ()):  # noqa: B008
+def accelerations(values: list[float], surface: Surface = ANY_SURFACE, missing: tuple[int, ...] = ()):
     entries = driver(1, range(1, len(values) + 1), x=0.0)
     for frame, value in enumerate(values, start=1):
         change(entries, 1, [frame], accel=value)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 from typing import Protocol as Interface
 
@@ -76,9 +77,5 @@ def require_torch(model: str) -> None:
     Raises:
         ImportError: torch cannot be imported.
     """
-    try:
-        import torch  # noqa: F401  (only whether it can be imported)
-    except ImportError as missing:
-        raise ImportError(
-            f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"'
-        ) from missing
+    if find_spec("torch") is None:
+        raise ImportError(f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"')
