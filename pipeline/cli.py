@@ -12,6 +12,7 @@ from pipeline import planning
 from pipeline.allocation import keep_freed_memory
 from pipeline.export.commands import app as export_app
 from pipeline.generated import provide_sample, refuse_mixing, write_generated
+from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
 from pipeline.session import DONE, FAILED, carry_out, command, conclude, read_settings
 
 app = typer.Typer(
@@ -24,11 +25,6 @@ app = typer.Typer(
 )
 app.add_typer(export_app, name="export")
 
-LakeOption = Annotated[
-    Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
-]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim or highd.")]
 ReplaceOption = Annotated[
     bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
@@ -40,8 +36,6 @@ RebuildOption = Annotated[
     bool,
     typer.Option("--rebuild", help="Begin the lake anew in its place, also one of another schema version; redo all."),
 ]
-WorkersOption = Annotated[int | None, typer.Option("--workers", min=1, help="Recordings worked on at once.")]
-ProtocolOption = Annotated[str | None, typer.Option("--protocol", help="Name of the protocol [default: csp].")]
 MinutesOption = Annotated[float | None, typer.Option("--minutes", help="Length of the generated recordings.")]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Of the generated sample: same seed, same bytes.")]
 

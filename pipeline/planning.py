@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.options import JsonOption, LakeOption, QuietOption, WorkersOption
 from pipeline.session import REFUSED, carry_out, command, conclude, read_settings
 
 if TYPE_CHECKING:
@@ -27,10 +28,7 @@ SHOWN = ("dataset", "subset", "site", "direction", "vehicles", "weight", "flow",
 
 
 def split(
-    lake: Annotated[
-        Path | None,
-        typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake)."),
-    ] = None,
+    lake: LakeOption = None,
     plan: Annotated[
         Path | None,
         typer.Option(
@@ -44,11 +42,9 @@ def split(
     ] = None,
     format: Annotated[str, typer.Option("--format", help="With --plan: table, csv or json.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", help="With --plan: write the csv or json to this file.")] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Recordings worked on at once (or TRACKLAKE_WORKERS).")
-    ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")] = False,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Divide the subsets into train and eval, or plan from metadata how they would be divided."""
     with command(quiet=quiet, json=json) as terminal:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption
 from pipeline.session import command, read_settings
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from pipeline.terminal import Terminal
 
 app = typer.Typer(help="Write the lake's data in other projects' formats.", no_args_is_help=True)
+
+
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace such files in DIR.")]
 
 
 @app.callback()
@@ -26,10 +30,7 @@ def csp(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for TrainSet.mat, ValSet.mat, TestSet.mat.")
     ],
-    lake: Annotated[
-        Path | None,
-        typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake)."),
-    ] = None,
+    lake: LakeOption = None,
     clean: Annotated[
         bool, typer.Option("--clean", help="No late starts, gaps, overwritten neighbors, or leaks between the files.")
     ] = False,
@@ -37,9 +38,9 @@ def csp(
         bool, typer.Option("--full-future", help="Only samples with 5 s of future, not 0.2 s.")
     ] = False,
     dataset: Annotated[str | None, typer.Option("--dataset", help="Only ngsim, or only highd.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace such files in DIR.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")] = False,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """The files that conv-social-pooling's preprocess_data.m writes, value for value unless --clean is given."""
     with command(quiet=quiet, json=json) as terminal:
@@ -56,16 +57,9 @@ def csp(
 
 
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the files and their README.md.")]
-LakeOption = Annotated[
-    Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
-]
-ProtocolOption = Annotated[str | None, typer.Option("--protocol", metavar="NAME", help="Whose samples.")]
 AbsoluteOption = Annotated[
     bool, typer.Option("--absolute", help="Positions on the carriageway, not relative to the sample's last one.")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace such files in DIR.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 
 
 @app.command()
