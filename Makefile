@@ -2,6 +2,7 @@
 # make test    every test
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
+# make study   every model under every protocol, three seeds: docs/results.md (hours)
 # make docs    pages derived from the code
 # make clean   removes the environment and caches, never data
 #
@@ -12,7 +13,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 ARGS ?=
 
-.PHONY: install run test lint bench docs clean
+.PHONY: install run test lint bench study docs clean
 
 install: $(INSTALLED)
 
@@ -38,11 +39,15 @@ lint: install
 	$(BIN)/lint-imports
 
 bench: install
-	@for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python $$file $(ARGS) || exit 1; done
+	@for file in $(filter-out $(wildcard benchmarks/study*.py),$(wildcard benchmarks/*.py)); do echo "== $$file"; $(BIN)/python $$file $(ARGS) || exit 1; done
+
+study: install
+	$(BIN)/python benchmarks/study.py $(ARGS)
 
 docs: install
 	$(BIN)/python -m schemas.markdown > docs/tables.md
 	$(BIN)/python -m schemas.tensors_markdown > docs/tensors.md
+	$(BIN)/python -m schemas.protocols_markdown > docs/protocols.md
 	$(BIN)/python -m quality_reports.markdown > docs/rules.md
 
 clean:

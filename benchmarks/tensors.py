@@ -38,9 +38,11 @@ from pipeline.tensor_files import write_tensors
 from pipeline.transforms.resample import put_on_clock
 from pipeline.transforms.tensors import SubsetTensors, build_subset_tensors
 from schemas.columns import Table
+from schemas.findings import FINDINGS
 from schemas.protocols import CSP
 from schemas.samples import NEIGHBORS, SAMPLES
 from schemas.splits import SPLITS
+from schemas.vehicles import VEHICLES
 
 REPEATS = 3
 CASES = {
@@ -152,6 +154,13 @@ def save(folder: Path, number: int, case: dict[str, Any], scale: float) -> None:
             "speed_mps": np.full(len(frame), speed_mps, np.float32),
         }
     ).write_parquet(folder / "tracks.parquet")  # fmt: skip
+    table(VEHICLES, vehicles, {"vehicle_id": own, "length_m": 4.5, "width_m": 1.9}).write_parquet(
+        folder / "vehicles.parquet")  # fmt: skip
+    broken = np.repeat(own, 5)  # a finding every fifth of a track
+    begins = first[broken] + np.tile(np.arange(5) * (each // 5), vehicles)
+    table(FINDINGS, len(broken), {
+        "vehicle_id": broken, "severity": "warning", "first_frame": begins, "last_frame": begins + 2,
+    }).write_parquet(folder / "findings.parquet")  # fmt: skip
     stride = rate / CSP.rate_hz
     low = np.ceil((first - 1) / stride).astype(np.int64)
     high = np.floor((first + each - 2) / stride).astype(np.int64)
@@ -223,7 +232,10 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
                     "protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver"]),
                 pl.read_parquet(folder / "neighbors.parquet", columns=[
                     "protocol", "vehicle_id", "tick", "cell", "neighbor_id"]),
-                splits.filter(pl.col("subset") == folder.name), protocol=CSP, storage=storage, **clock,
+                splits.filter(pl.col("subset") == folder.name),
+                vehicles=pl.read_parquet(folder / "vehicles.parquet"), findings=pl.read_parquet(
+                    folder / "findings.parquet"),
+                protocol=CSP, storage=storage, **clock,
             )  # fmt: skip
             yield {"dataset": "highd", "subset": folder.name, "frame_rate_hz": case["rate"],
                    "lane_markings_m": None}, tensors  # fmt: skip

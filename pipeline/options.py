@@ -11,6 +11,8 @@ LakeOption = Annotated[
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", min=1, help="Recordings worked on at once (or TRACKLAKE_WORKERS).")
 ]
-ProtocolOption = Annotated[str | None, typer.Option("--protocol", help="Name of the protocol [default: csp].")]
+ProtocolOption = Annotated[
+    str | None, typer.Option("--protocol", help="Whose samples, split and tensors (docs/protocols.md) [default: csp].")
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]

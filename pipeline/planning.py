@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.options import JsonOption, LakeOption, QuietOption, WorkersOption
+from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
 from pipeline.session import REFUSED, carry_out, command, conclude, read_settings
 
 if TYPE_CHECKING:
@@ -42,13 +42,14 @@ def split(
     ] = None,
     format: Annotated[str, typer.Option("--format", help="With --plan: table, csv or json.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", help="With --plan: write the csv or json to this file.")] = None,
+    protocol: ProtocolOption = None,
     workers: WorkersOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Divide the subsets into train and eval, or plan from metadata how they would be divided."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers)
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
         if plan is None:
             if exclude or out is not None or format != "table":
                 raise typer.BadParameter("--exclude, --format and --out go with --plan FOLDER")
@@ -86,7 +87,12 @@ def _plan(
     subsets = announced.subsets.filter(~pl.col("subset").is_in(exclude))
     if subsets.is_empty():
         raise SourceError(f"{folder}: no recording whose metadata can be used, so there is nothing to plan.")
-    allocation = allocate_flow_balanced(subsets, validation=settings.validation_part, seed=settings.split_seed)
+    allocation = allocate_flow_balanced(
+        subsets,
+        train_share=settings.get_protocol().train_share,
+        validation=settings.validation_part,
+        seed=settings.split_seed,
+    )
     parts = subsets.join(allocation.splits.select("dataset", "subset", "part"), on=["dataset", "subset"])
     parts = parts.select(SHOWN).sort("dataset", "subset")
     _show(terminal, parts, allocation, form, out)

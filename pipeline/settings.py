@@ -3,13 +3,16 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
-from schemas.protocols import PROTOCOLS, Protocol
+from schemas.protocols import CSP, PROTOCOLS, Protocol
 from schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
+
+PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split")
+"""Settings that take the place of a protocol's own values."""
 
 
 class Settings(BaseSettings):
@@ -34,16 +37,23 @@ class Settings(BaseSettings):
     on_ramp_lanes: dict[str, list[int]] = Field(
         default_factory=dict, description="by site: lanes that are on-ramps, where the source does not know"
     )
-    protocol: str = Field("csp", description="name of the protocol")
-    min_future_s: float = Field(
-        0.2, gt=0, le=5, description="track that a sample needs after it; 5 = full futures only"
+    protocol: str = Field(CSP.name, description="name of the protocol")
+    min_future_s: float | None = Field(
+        None, gt=0, description="track that a sample needs after it, up to the horizon; none: the protocol's"
     )
-    drop_error_findings: bool = Field(
-        False, description="no samples where the vehicle breaks a rule of severity error in the history or the horizon"
+    drop_error_findings: bool | None = Field(
+        None,
+        description="no samples where the vehicle breaks a rule of severity error in the history or the horizon; none: "
+        "the protocol's",
     )
-    nearest: int = Field(10, ge=0, le=100, description="nearest vehicles listed with each sample; 0 = none")
-    validation_part: bool = Field(False, description="70 / 10 / 20 % with a validation part instead of 80 / 20 %")
-    split: SplitName = Field("flow-balanced", description="the split that tensors are made of")
+    nearest: int | None = Field(
+        None, ge=0, le=100, description="nearest vehicles listed with each sample, 0 = none; none: the protocol's"
+    )
+    validation_part: bool = Field(
+        False,
+        description="10 % of a split are a validation part, taken from what trains (70 / 10 / 20 instead of 80 / 20 %)",
+    )
+    split: SplitName | None = Field(None, description="the split that tensors are made of; none: the protocol's")
     splits: list[SplitName] = Field(
         list(SPLIT_NAMES), description="the splits that are made; those that are not trained on stand beside it"
     )
@@ -76,11 +86,21 @@ class Settings(BaseSettings):
             raise ValueError(f"expected one of {', '.join(PROTOCOLS)}")
         return name
 
+    @field_validator("min_future_s")
+    @classmethod
+    def _ends(cls, seconds: float | None, others: ValidationInfo) -> float | None:
+        protocol = PROTOCOLS.get(others.data.get("protocol", ""))
+        if seconds is not None and protocol is not None and seconds > protocol.horizon_s:
+            raise ValueError(f"expected {protocol.horizon_s:g} or less, the horizon of the protocol {protocol.name}")
+        return seconds
+
     @field_validator("splits")
     @classmethod
     def _trains(cls, names: list[SplitName], others: ValidationInfo) -> list[SplitName]:
-        if others.data.get("split") not in (None, *names):
-            raise ValueError(f"expected {others.data['split']!r} among them, the split that tensors are made of")
+        protocol = PROTOCOLS.get(others.data.get("protocol", ""))
+        trains = others.data.get("split") or (protocol.split if protocol is not None else None)
+        if trains not in (None, *names):
+            raise ValueError(f"expected {trains!r} among them, the split that tensors are made of")
         return names
 
     @field_validator("split_purge_s")
@@ -93,17 +113,15 @@ class Settings(BaseSettings):
 
     def get_protocol(self) -> Protocol:
         """The protocol with the settings that change it."""
+        changes: dict[str, Any] = {name: getattr(self, name) for name in PROTOCOL_SETTINGS}
         return replace(
-            PROTOCOLS[self.protocol],
-            min_future_s=self.min_future_s,
-            drop_error_findings=self.drop_error_findings,
-            nearest=self.nearest,
-            split=self.split,
+            PROTOCOLS[self.protocol], **{name: value for name, value in changes.items() if value is not None}
         )
 
     def get_split_recipe(self) -> SplitRecipe:
         """That of the split that tensors are made of."""
-        return next(recipe for recipe in self.get_split_recipes() if recipe.name == self.split)
+        trains = self.get_protocol().split
+        return next(recipe for recipe in self.get_split_recipes() if recipe.name == trains)
 
     def get_split_recipes(self) -> list[SplitRecipe]:
         """The splits to make, each with every parameter, in the order of SPLIT_NAMES."""
@@ -111,6 +129,7 @@ class Settings(BaseSettings):
         return [
             SplitRecipe(
                 name=name,
+                train_share=protocol.train_share,
                 validation=self.validation_part,
                 seed=self.split_seed,
                 block_s=self.split_block_s,

@@ -19,18 +19,39 @@ MEANINGS: Mapping[str, str] = {
     BY_RECORDING: "whole recordings drawn at random; for comparison",
 }
 
-_SEARCH = ("validation", "seed", "restarts")
+_SEARCH = ("train_share", "validation", "seed", "restarts")
 
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
     FLOW_BALANCED: _SEARCH,
     TIME_BLOCKS: (*_SEARCH, "block_s", "purge_s", "rate_hz", "history_s", "horizon_s", "min_future_s"),
     CSP_2018: (),
-    BY_RECORDING: ("validation", "seed"),
+    BY_RECORDING: ("train_share", "validation", "seed"),
 }
 """What each split is made by, besides the subsets and their samples (which are the protocol's)."""
 
 LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
 """Splits that claim that nothing of one part is reachable from another."""
+
+
+VALIDATION_SHARE = 0.1
+"""Of a part `val`."""
+
+
+def find_shares(train_share: float, *, validation: bool) -> dict[str, int]:
+    """Shares of the parts in thousandths: whole numbers, so that a share is met or missed exactly.
+
+    Args:
+        train_share: what trains where there is no part `val`.
+        validation: whether there is one; it is taken from what trains (0.8: 0.7, 0.1 and 0.2).
+
+    Raises:
+        ValueError: a part would have nothing.
+    """
+    val = round(1000 * VALIDATION_SHARE) if validation else 0
+    shares = {"train": round(1000 * train_share) - val, "val": val, "eval": 1000 - round(1000 * train_share)}
+    if min(shares["train"], shares["eval"]) <= 0:
+        raise ValueError(f"expected a share above {val / 1000:g} and below 1 to train, got {train_share:g}")
+    return {part: share for part, share in shares.items() if part != "val" or validation}
 
 
 @dataclass(frozen=True)
@@ -39,6 +60,7 @@ class SplitRecipe:
 
     Args:
         name: of SPLIT_NAMES.
+        train_share: how much of it trains, where there is no part `val`; that takes VALIDATION_SHARE of it.
         validation: whether there is a part `val`; csp-2018 has one whatever this says.
         seed: of all that is random.
         restarts: of the search.
@@ -51,6 +73,7 @@ class SplitRecipe:
     """
 
     name: SplitName
+    train_share: float = 0.8
     validation: bool = False
     seed: int = 0
     restarts: int = 200

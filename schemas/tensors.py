@@ -10,7 +10,7 @@ from dataclasses import dataclass
 ARRAYS_FILE = "arrays.safetensors"
 INDEX_FILE = "index.json"
 
-TENSORS_VERSION = 2
+TENSORS_VERSION = 3
 """Counts changes of the two files that older readers cannot read."""
 
 POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
@@ -70,6 +70,8 @@ ARRAYS = (
     ),
     Array("scene_offset", "int64", ("C+1",), "vehicles of scene c are [scene_offset[c], scene_offset[c + 1])", "M"),
     Array("speed_mps", "float32", ("N",), "recorded speed along the direction of travel, m/s"),
+    Array("run_length_m", "float32", ("R",), "the vehicle's length, m; NaN where the source has none"),
+    Array("run_width_m", "float32", ("R",), "its width, m; likewise"),
     Array("run_vehicle_id", "int32", ("R",), "unique within the subset"),
     Array("run_first_tick", "int32", ("R",), "tick of the run's first row; time_s = tick / rate_hz"),
     Array("run_subset", "int32", ("R",), "position in the index's `subsets`"),
@@ -87,6 +89,13 @@ ARRAYS = (
         "(int16: steps of STEPS_M from the subset's `centre_m`)",
     ),
     Array("lane", "int16", ("N",), "1 is the driver's leftmost; 0 where the source has none"),
+    Array(
+        "finding",
+        "uint8",
+        ("N",),
+        "worst severity of the vehicle's own findings in the frames after the tick before up to this one: 1 + position "
+        "in schemas.columns.SEVERITIES; 0 where there is none",
+    ),
     Array("sample_part", "uint8", ("S",), "position in schemas.columns.PARTS"),
     Array("sample_lateral", "uint8", ("S",), "position in schemas.columns.LATERAL_MANEUVERS"),
     Array("sample_longitudinal", "uint8", ("S",), "position in schemas.columns.LONGITUDINAL_MANEUVERS"),
@@ -146,4 +155,4 @@ null where unknown; last_lane, the rightmost lane (by the markings, else the hig
 carriageway (the last marking, else 12 ft a lane)."""
 
 NOMINAL_LANE_M = 3.6576
-"""12 ft: taken for a lane's width where no markings are known, and only to mirror positions."""
+"""12 ft: taken for a lane's width where no markings are known, to mirror positions and for the lanes of scenes."""

@@ -24,7 +24,7 @@ checks: `{tensors.ARRAYS_FILE}`, every array in the safetensors layout, and `{te
 
 Shapes, order and units of the batches gathered from them (numpy, torch, or on a device) are those of
 `training.batches.Batch` and `SceneBatch`. Under the protocol `{CSP.name}` a history has H = \
-{CSP.history_ticks} positions, a future F = {CSP.horizon_ticks}.
+{CSP.history_ticks} positions, a future F = {CSP.horizon_ticks}; of others see [protocols](protocols.md).
 
 ## Sizes
 """

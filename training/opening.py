@@ -70,7 +70,10 @@ def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
         raise TensorError(
             f"{file}: expected a protocol of {', '.join(sorted(known))}, got {', '.join(sorted(parameters))}; {AGAIN}"
         )
-    protocol = Protocol(**parameters)
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in parameters.items()
+    }
+    protocol = Protocol(**given)  # JSON has no tuples
     if protocol.digest != index["protocol"].get("digest"):
         raise TensorError(
             f"{file}: the protocol's digest is {index['protocol'].get('digest')}, its parameters give "

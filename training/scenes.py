@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from training.batches import Floats, Integers, SceneBatch
+from training.checks import AGAIN, TensorError
 from training.windows import place, spread, subtract
 
 if TYPE_CHECKING:
@@ -47,6 +48,25 @@ def find_lanes(subsets: Sequence[Mapping[str, Any]]) -> Lanes:
         centre_m=centre,
         lane_width_m=width,
     )
+
+
+def find_scenes_of_samples(folder: "TensorFolder") -> npt.NDArray[np.int32]:
+    """(S,) the scene that each sample stands in.
+
+    Raises:
+        TensorError: a sample stands in no scene, or in several.
+    """
+    member = np.flatnonzero(folder.scene_sample >= 0)
+    sample, samples = folder.scene_sample[member], len(folder.sample_row)
+    times = np.bincount(sample, minlength=samples)
+    if len(times) != samples or (times != 1).any():
+        raise TensorError(
+            f"{folder.path}: array `scene_sample`: expected each of {samples:,} samples in one scene, got "
+            f"{len(member):,} vehicles that are samples; {AGAIN}"
+        )
+    scene = np.empty(samples, dtype=np.int32)
+    scene[sample] = np.searchsorted(folder.scene_offset, member, side="right") - 1
+    return scene
 
 
 def gather_scenes(folder: "TensorFolder", scene: Integers, *, absolute: bool = False) -> SceneBatch:

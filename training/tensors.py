@@ -16,7 +16,7 @@ from training.batches import Batch, Bytes, Floats, Integers, SceneBatch
 from training.checks import TensorError
 from training.drawing import draw_numbers
 from training.opening import map_arrays, read_index, read_protocol
-from training.scenes import Lanes, find_lanes, gather_scenes
+from training.scenes import Lanes, find_lanes, find_scenes_of_samples, gather_scenes
 from training.windows import Masks, Windows, check_numbers, place, spread, subtract
 
 __all__ = ["Batch", "SceneBatch", "TensorError", "TensorFolder"]
@@ -41,6 +41,8 @@ class TensorFolder:
     neighbor_offset: Integers
     scene_offset: Integers
     speed_mps: Floats
+    run_length_m: Floats
+    run_width_m: Floats
     run_vehicle_id: Int32s
     run_first_tick: Int32s
     run_subset: Int32s
@@ -50,6 +52,7 @@ class TensorFolder:
     scene_sample: Int32s
     position_m: npt.NDArray[Any]
     lane: npt.NDArray[np.int16]
+    finding: Bytes
     sample_part: Bytes
     sample_lateral: Bytes
     sample_longitudinal: Bytes
@@ -84,6 +87,11 @@ class TensorFolder:
     def lanes(self) -> Lanes:
         """Where the lanes of each subset lie."""
         return find_lanes(self.index["subsets"])
+
+    @cached_property
+    def scene_of_sample(self) -> Int32s:
+        """(S,) the scene that each sample stands in."""
+        return find_scenes_of_samples(self)
 
     @cached_property
     def histories(self) -> Windows:

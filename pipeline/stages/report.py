@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.lake import Entry, Manifest, connect, load
 from pipeline.lake.files import REPORTS, remove
 from pipeline.lake.manifest import remove_leftovers
-from pipeline.settings import Settings
+from pipeline.settings import PROTOCOL_SETTINGS, Settings
 from pipeline.sources import SOURCES
 from pipeline.stages.base import Job, make_entry, make_job, recordings
 from pipeline.stages.pages import find_pages, write_report_file
@@ -33,8 +33,13 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
 
 
 def _shown(settings: Settings) -> dict[str, object]:
-    """Settings that change what is in the lake, not where it stands or how fast it is made; thresholds apart."""
-    return settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address", "thresholds"})
+    """Settings that change what is in the lake, not where it stands or how fast it is made; thresholds apart.
+
+    Those that are the protocol's where nobody sets them are shown as they are in force.
+    """
+    shown = settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address", "thresholds"})
+    protocol = settings.get_protocol()
+    return shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}
 
 
 def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:

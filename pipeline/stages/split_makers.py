@@ -67,6 +67,7 @@ def _make_flow_balanced(recipe: SplitRecipe, material: Material) -> Made:
     allocation = allocate_flow_balanced(
         material.subsets,
         split=recipe.name,
+        train_share=recipe.train_share,
         validation=recipe.validation,
         seed=recipe.seed,
         restarts=recipe.restarts,
@@ -97,12 +98,17 @@ def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
     seen, sampled = pl.concat(visits), pl.concat(weights)
     units = describe_blocks(blocks, material.subsets, seen, sampled)
     allocation = allocate_flow_balanced(
-        units, split=recipe.name, validation=recipe.validation, seed=recipe.seed, restarts=recipe.restarts
+        units,
+        split=recipe.name,
+        train_share=recipe.train_share,
+        validation=recipe.validation,
+        seed=recipe.seed,
+        restarts=recipe.restarts,
     )
     left_out = find_left_out(seen, allocation.splits)
     # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
-    written = write_up(recounted, split=recipe.name, validation=recipe.validation)
+    written = write_up(recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation)
     return Made(written, left_out, units.select("dataset", "subset", "block", "flow"))
 
 
@@ -127,7 +133,11 @@ def _make_csp(recipe: SplitRecipe, material: Material) -> Made:
 
 def _make_by_recording(recipe: SplitRecipe, material: Material) -> Made:
     allocation = divide_by_recording(
-        material.subsets, split=recipe.name, validation=recipe.validation, seed=recipe.seed
+        material.subsets,
+        split=recipe.name,
+        train_share=recipe.train_share,
+        validation=recipe.validation,
+        seed=recipe.seed,
     )
     return Made(allocation, SPLIT_LEFT_OUT.empty())
 

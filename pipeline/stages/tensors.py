@@ -10,28 +10,31 @@ import polars as pl
 from pipeline.lake import Entry, Manifest, free_path, load, scan, write_folder
 from pipeline.lake.files import TENSORS
 from pipeline.settings import Settings
-from pipeline.stages import split
+from pipeline.stages import split, validate
 from pipeline.stages.base import Job, StageError, make_entry, make_job, upstream
 from pipeline.tensor_files import write_tensors
 from pipeline.transforms.resample import put_on_clock
 from pipeline.transforms.tensors import SubsetTensors, build_subset_tensors
-from schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS
+from schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS, VEHICLES
 from schemas.protocols import Protocol
 from schemas.tensors import INDEX_FILE
 
-VERSION = 3
+VERSION = 4
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane", "speed_mps")
 SAMPLE_COLUMNS = ("protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver")
 NEIGHBOR_COLUMNS = ("protocol", "vehicle_id", "tick", "cell", "neighbor_id")
+VEHICLE_COLUMNS = ("vehicle_id", "length_m", "width_m")
+FINDING_COLUMNS = ("vehicle_id", "severity", "first_frame", "last_frame")
 """Of these tables, what tensors are made of; the others may be wide."""
 
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job over the split; the split comes before."""
+    """One job over the split and the findings; the split comes before, and validation long before it."""
     made = upstream(split.plan, root, manifest, settings)
     if not made:
         return []
+    made |= upstream(validate.plan, root, manifest, settings)
     protocol = settings.get_protocol()
     made_of = {
         **made,
@@ -110,6 +113,8 @@ def build_one(
         scan(root, manifest, SAMPLES, **values).select(SAMPLE_COLUMNS).collect(),
         scan(root, manifest, NEIGHBORS, **values).select(NEIGHBOR_COLUMNS).collect(),
         blocks,
+        vehicles=scan(root, manifest, VEHICLES, **values).select(VEHICLE_COLUMNS).collect(),
+        findings=scan(root, manifest, FINDINGS, **values).select(FINDING_COLUMNS).collect(),
         protocol=protocol,
         storage=storage,
         left_out=left_out,

@@ -5,8 +5,8 @@ import polars as pl
 
 from pipeline.transforms.csp_parts import part_by_id
 from pipeline.transforms.split_tables import Allocation, tabulate
-from pipeline.transforms.splits import THREE_PARTS, TWO_PARTS
 from schemas.columns import PARTS
+from schemas.split_recipes import find_shares
 
 
 def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = "csp-2018") -> Allocation:
@@ -43,7 +43,12 @@ def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = 
 
 
 def divide_by_recording(
-    subsets: pl.DataFrame, *, split: str = "by-recording-random", validation: bool = False, seed: int = 0
+    subsets: pl.DataFrame,
+    *,
+    split: str = "by-recording-random",
+    train_share: float = 0.8,
+    validation: bool = False,
+    seed: int = 0,
 ) -> Allocation:
     """Draw recordings at random, all subsets of one into the same part, by the shares of the flow-balanced split.
 
@@ -53,10 +58,14 @@ def divide_by_recording(
     Args:
         subsets: the columns of `split_tables.COLUMNS` and `recording`.
         split: the name to write into the tables.
+        train_share: of the recordings, to train where there is no `val`.
         validation: whether there is a part `val`.
         seed: of the draw; a dataset's draw does not depend on other datasets.
+
+    Raises:
+        ValueError: a part would have no share.
     """
-    shares = THREE_PARTS if validation else TWO_PARTS
+    shares = find_shares(train_share, validation=validation)
     drawn = [pl.DataFrame(schema={"dataset": pl.String, "recording": pl.String, "part": pl.String})]
     for (dataset,), rows in subsets.group_by("dataset"):
         names = rows["recording"].unique().sort()

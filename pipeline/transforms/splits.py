@@ -12,18 +12,14 @@ import polars as pl
 
 from pipeline.transforms.split_search import FILLED, TOLERANCE, VEHICLES, Indices, Problem, allocate, sum_facts
 from pipeline.transforms.split_tables import COLUMNS, Allocation, complete, tabulate
-
-TWO_PARTS = {"train": 800, "eval": 200}
-"""Shares of the vehicles, in thousandths (whole numbers, so that a share is met or missed exactly)."""
-
-THREE_PARTS = {"train": 700, "val": 100, "eval": 200}
-"""The same with a validation part."""
+from schemas.split_recipes import find_shares
 
 
 def allocate_flow_balanced(
     subsets: pl.DataFrame,
     *,
     split: str = "flow-balanced",
+    train_share: float = 0.8,
     validation: bool = False,
     seed: int = 0,
     restarts: int = 200,
@@ -32,7 +28,8 @@ def allocate_flow_balanced(
 
     Constraints, in the order in which they yield where not all can be met: train and eval each hold a subset with
     samples; each (site, direction) with at least two subsets has one in train and one in eval; val holds a subset with
-    samples; train holds 0.800 of the vehicles and eval 0.200 (with a validation part 0.7, 0.1 and 0.2), each +- 0.005.
+    samples; train holds `train_share` of the vehicles and eval the rest (with a validation part train 0.1 less, and val
+    0.1), each +- 0.005.
     Coverage is counted in missing (site, direction, part), shares in vehicles. What could not be met is `relaxed`, with
     the reason. Among the allocations that meet them best: the least sum, over the pairs of parts, of the absolute
     differences of the weighted mean and of the weighted standard deviation (of the population) of flow; among equals
@@ -56,34 +53,37 @@ def allocate_flow_balanced(
             entries). A subset whose flow is null or whose weight is 0 takes part in the shares and in the coverage, and
             not in the moments of flow.
         split: the name to write into the tables.
+        train_share: of the vehicles, to train where there is no `val`.
         validation: whether there is a third part, `val`.
         seed: of the search's random starts; the result depends on nothing else (not on other datasets either).
         restarts: how many random starts.
 
     Raises:
-        ValueError: a column is missing, a subset (or block) stands in two rows, or a count is null or negative.
+        ValueError: a column is missing, a subset (or block) stands in two rows, a count is null or negative, or a part
+            would have no share.
 
     Source: DESIGN section 8.
     """
     table = _check(subsets)
-    shares = THREE_PARTS if validation else TWO_PARTS
+    shares = find_shares(train_share, validation=validation)
     allocated = [table.with_columns(part=pl.lit(None, pl.String)).clear()]
     for (dataset,), rows in sorted(table.group_by("dataset"), key=lambda item: str(item[0][0])):
         part = allocate(_pose(rows, shares), np.random.default_rng([seed, *str(dataset).encode()]), restarts)
         names = pl.Series("part", [list(shares)[position] for position in part], dtype=pl.String)
         allocated.append(rows.with_columns(names))
-    return write_up(pl.concat(allocated), split=split, validation=validation)
+    return write_up(pl.concat(allocated), split=split, train_share=train_share, validation=validation)
 
 
-def write_up(units: pl.DataFrame, *, split: str, validation: bool = False) -> Allocation:
+def write_up(units: pl.DataFrame, *, split: str, train_share: float = 0.8, validation: bool = False) -> Allocation:
     """Write an allocation up, and judge by the counts given whether it is relaxed.
 
     Args:
         units: the columns of `split_tables.COLUMNS` (and `block`, where a subset has several rows), and `part`.
         split: the name to write into the tables.
+        train_share: of the vehicles, to train where there is no `val`.
         validation: whether there is a third part, `val`.
     """
-    shares = THREE_PARTS if validation else TWO_PARTS
+    shares = find_shares(train_share, validation=validation)
     units = complete(units).sort("dataset", "site", "direction", "subset", "block")
     reasons: dict[str, str | None] = {}
     for (dataset,), rows in units.group_by("dataset"):

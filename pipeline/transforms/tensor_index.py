@@ -63,7 +63,7 @@ def describe_tensors(
     return {
         "version": TENSORS_VERSION,
         "split": split[0] if len(split) == 1 else protocol.split,
-        "protocol": {**asdict(protocol), "digest": protocol.digest},
+        "protocol": {**asdict(protocol), "scored_s": list(protocol.scored_s), "digest": protocol.digest},
         "storage": storage,
         "max_error_m": [float(error) for error in max_error_m],
         "rms_error_m": [float(np.sqrt(square / max(1, sizes["N"]))) for square in squared_error_m2],

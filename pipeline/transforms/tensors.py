@@ -14,6 +14,7 @@ import polars as pl
 
 from pipeline.transforms.positions import store_positions
 from pipeline.transforms.scenes import find_scenes
+from pipeline.transforms.tensor_facts import find_sizes, mark_findings
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from schemas.protocols import Protocol
 from schemas.tensors import ARRAYS, MOST_TICKS, POSITION_STORAGES, Array
@@ -83,6 +84,8 @@ def build_subset_tensors(
     neighbors: pl.DataFrame,
     blocks: pl.DataFrame,
     *,
+    vehicles: pl.DataFrame,
+    findings: pl.DataFrame,
     first_frame: int,
     frame_rate_hz: float,
     protocol: Protocol,
@@ -102,6 +105,8 @@ def build_subset_tensors(
             protocols' rows are passed by.
         neighbors: of `schemas.samples.NEIGHBORS` protocol, vehicle_id, tick, cell, neighbor_id; likewise.
         blocks: the split's rows of `schemas.splits.SPLITS` for this subset; blocks do not overlap.
+        vehicles: of `schemas.vehicles.VEHICLES` vehicle_id, length_m, width_m, of every vehicle of the clock.
+        findings: of `schemas.findings.FINDINGS` vehicle_id, severity, first_frame, last_frame, in any order.
         first_frame: the subset's first frame, where tick 0 lies.
         frame_rate_hz: of the source; tick k lies at frame first_frame + k * frame_rate_hz / protocol.rate_hz. A tick
             between two frames belongs to a block only if both do.
@@ -111,7 +116,8 @@ def build_subset_tensors(
 
     Raises:
         ValueError: blocks overlap; the clock is not sorted; samples and neighbors name entries or a history that the
-            clock does not have (they were made from other tracks); or positions do not fit their storage.
+            clock does not have (they were made from other tracks); `vehicles` lacks one of the clock's; or positions do
+            not fit their storage.
 
     Source: DESIGN section 9.
     """
@@ -154,12 +160,19 @@ def build_subset_tensors(
     run_kept = kept[cut.first_row]
     stored = store_positions(clock["x_m"].to_numpy()[kept], clock["y_m"].to_numpy()[kept], storage=storage, where=where)
     lane = clock["lane"].fill_null(0).to_numpy()[kept]
+    length_m, width_m = find_sizes(vehicles, vehicle_id[cut.first_row[run_kept]], where=where)
+    finding = mark_findings(
+        vehicle_id, tick, findings, first_frame=first_frame, frame_rate_hz=frame_rate_hz, rate_hz=protocol.rate_hz
+    )
     arrays: dict[str, npt.ArrayLike] = {
         "position_m": stored.steps,
         "speed_mps": clock["speed_mps"].to_numpy()[kept],
         "lane": lane,
+        "finding": finding[kept],
         "run_first_row": np.append(new_row[cut.first_row[run_kept]], kept.sum()),
         "run_vehicle_id": vehicle_id[cut.first_row[run_kept]],
+        "run_length_m": length_m,
+        "run_width_m": width_m,
         "run_first_tick": tick[cut.first_row[run_kept]],
         "run_subset": np.zeros(int(run_kept.sum())),
         "sample_row": new_row[own],

@@ -6,6 +6,7 @@ import polars as pl
 from pipeline.tensor_files import write_tensors
 from pipeline.transforms.tensors import build_subset_tensors
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from schemas.findings import FINDINGS
 from schemas.protocols import Protocol
 from schemas.samples import NEIGHBORS, SAMPLES
 from schemas.splits import SPLITS
@@ -54,13 +55,13 @@ def random_clock(draw, *, vehicles=6, ticks=14, frames_per_tick=5):
     return pl.DataFrame(rows, schema=CLOCK, orient="row")
 
 
-def sample_everything(draw, clock, *, dataset, subset, protocol=TINY):
-    """Every entry with enough track before and after it, in random maneuvers; and random neighbors of each."""
+def sample_everything(draw, clock, *, dataset, subset, protocol=TINY, left_out=0.2):
+    """Entries with enough track before and after them, in random maneuvers; and random neighbors of each."""
     present = {(row[0], row[1]): row[7] for row in clock.iter_rows()}
     samples, neighbors = [], []
     for vehicle_id, tick, frame, _, _, lane, _, segment in clock.iter_rows():
         reach = range(tick - protocol.history_ticks + 1, tick + protocol.min_future_ticks + 1)
-        if any(present.get((vehicle_id, t)) != segment for t in reach) or draw.random() < 0.2:
+        if any(present.get((vehicle_id, t)) != segment for t in reach) or draw.random() < left_out:
             continue
         lateral, longitudinal = draw.choice(LATERAL_MANEUVERS), draw.choice(LONGITUDINAL_MANEUVERS)
         samples.append((protocol.name, dataset, subset, vehicle_id, tick, frame, lane, lateral, longitudinal, None))
@@ -80,8 +81,25 @@ def split_row(subset, part, *, block=0, first_frame=0, last_frame=10_000, ids=(N
     return pl.DataFrame([row], schema=SPLITS.dtypes, orient="row")
 
 
-def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=None):
+def sizes_of(clock):
+    """A length and a width of each vehicle, told by its id; every fifth has none."""
+    ids = clock["vehicle_id"].unique().sort()
+    known = pl.when(pl.col("vehicle_id") % 5 != 0)
+    return pl.DataFrame({"vehicle_id": ids}).with_columns(
+        length_m=known.then(4.0 + pl.col("vehicle_id") / 10).cast(pl.Float32),
+        width_m=known.then(1.5 + pl.col("vehicle_id") / 100).cast(pl.Float32),
+    )
+
+
+def finding(vehicle_id, severity, first_frame, last_frame, *, subset="a", rule="high_jerk"):
+    """One row of `findings`."""
+    row = ("highd", subset, vehicle_id, rule, severity, first_frame, last_frame, last_frame - first_frame + 1, 1.0)
+    return pl.DataFrame([row], schema=FINDINGS.dtypes, orient="row")
+
+
+def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=None, findings=None):
     """Facts and tensors of (subset, clock, samples, neighbors) tables; tick k lies at frame 1 + 5 k."""
+    found = FINDINGS.empty() if findings is None else findings
     rate = 5.0 * protocol.rate_hz
     for subset, clock, samples, neighbors in tables:
         facts = {"dataset": "highd", "subset": subset, "frame_rate_hz": rate, "lane_markings_m": markings}
@@ -92,6 +110,8 @@ def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=
                 samples,
                 neighbors,
                 splits.filter(pl.col("subset") == subset),
+                vehicles=sizes_of(clock),
+                findings=found.filter(pl.col("subset") == subset),
                 first_frame=1,
                 frame_rate_hz=rate,
                 protocol=protocol,
@@ -100,10 +120,10 @@ def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=
         )
 
 
-def write(folder, tables, splits, *, protocol=TINY, storage="float32", markings=None):
+def write(folder, tables, splits, *, protocol=TINY, storage="float32", markings=None, findings=None):
     """The same as a tensor folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    subsets = build_subsets(tables, splits, protocol=protocol, storage=storage, markings=markings)
+    subsets = build_subsets(tables, splits, protocol=protocol, storage=storage, markings=markings, findings=findings)
     write_tensors(folder, subsets, splits, protocol, storage=storage)
     return folder
 

@@ -1,6 +1,7 @@
 """What is not a whole tensor folder of this version is refused, with what and where; what is, is mapped."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,13 +81,20 @@ def resize(change):
     return damage
 
 
+def test_the_protocol_is_read_as_it_was_written(tmp_path):
+    given = replace(TINY, scored_s=(0.5, 1.5), headline="mae", train_share=0.7, split="mine")
+    folder = TensorFolder.open(write(tmp_path, random_tables(1), UNDIVIDED, protocol=given))
+    assert folder.protocol == given
+    assert isinstance(folder.protocol.scored_s, tuple)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (lambda folder: (folder / INDEX_FILE).unlink(), r"no tensors here \(no index.json\); run `tracklake tensors`"),
         (lambda folder: (folder / INDEX_FILE).write_text("{"), "index.json: not readable as JSON"),
-        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 2 of tensors, got list"),
-        (change_index(version=1), "expected version 2 of tensors, got 1; run `tracklake tensors` again"),
+        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 3 of tensors, got list"),
+        (change_index(version=1), "expected version 3 of tensors, got 1; run `tracklake tensors` again"),
         (drop_key, "index.json: lacks blocks, subsets: width_m; run"),
         (change_index(protocol={"name": "x"}), "expected a protocol of drop_error_findings, .*, got name"),
         (change_index(storage="float16"), "expected storage float32 or .*, got 'float16'"),

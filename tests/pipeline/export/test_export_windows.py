@@ -172,7 +172,7 @@ def test_the_card_says_what_the_files_are(lake, parquet, tmp_path):
         "Cite: U.S. Department of Transportation Federal Highway Administration (2016).",
         f"- digest: {digest}",
         f"- recipe: {Settings().get_split_recipe().digest}\n- name: flow-balanced\n- restarts: 200\n- seed: 0\n"
-        "- validation: False\n- vehicles left out of val and eval: 0\n",
+        "- train_share: 0.8\n- validation: False\n- vehicles left out of val and eval: 0\n",
         "H = 16 positions of history, the sample's own included; F = 25 of future",
         "| ngsim/i-80-1600 | 0 | ",
         "| history_x_m | fixed_size_list<float>[16] | up to the sample's tick, m |",

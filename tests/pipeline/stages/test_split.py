@@ -210,24 +210,25 @@ def test_settings_name_the_splits_that_are_made():
 def test_the_digest_covers_every_parameter():
     plain = SplitRecipe("time-blocks")
     changed = [replace(plain, **{name: value}) for name, value in
-               {"name": "csp-2018", "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0,
-                "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}.items()]  # fmt: skip
+               {"name": "csp-2018", "train_share": 0.7, "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0,
+                "purge_s": 9.0, "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0,
+                "min_future_s": 5.0}.items()]  # fmt: skip
     assert len({plain.digest, *(recipe.digest for recipe in changed)}) == 1 + len(SplitRecipe.__dataclass_fields__)
 
 
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("flow-balanced", {"validation", "seed", "restarts"}),
+        ("flow-balanced", {"train_share", "validation", "seed", "restarts"}),
         ("csp-2018", set()),
-        ("by-recording-random", {"validation", "seed"}),
+        ("by-recording-random", {"train_share", "validation", "seed"}),
     ],
 )
 def test_parameters_that_do_not_apply_are_neither_recorded_nor_hashed(name, read):
     plain = SplitRecipe(name)
     assert set(json.loads(plain.parameters)) == {"name", *read}
-    other = {"validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0, "rate_hz": 10,
-             "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}  # fmt: skip
+    other = {"train_share": 0.7, "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0, "purge_s": 9.0,
+             "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0, "min_future_s": 5.0}  # fmt: skip
     changed = {key for key, value in other.items() if replace(plain, **{key: value}).digest != plain.digest}
     assert changed == read
 

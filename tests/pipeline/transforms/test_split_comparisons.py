@@ -85,8 +85,25 @@ def carriageways(recordings, dataset="highd"):
     ],
 )
 def test_recordings_are_drawn_whole(recordings, validation, counts):
+    check_draw(recordings, counts, validation=validation)
+
+
+@pytest.mark.parametrize(
+    ("recordings", "validation", "counts"),
+    [
+        (60, False, {"train": 42, "eval": 18}),
+        (60, True, {"train": 36, "val": 6, "eval": 18}),
+        (7, False, {"train": 5, "eval": 2}),  # 2.1 of 7
+        (2, False, {"train": 1, "eval": 1}),
+    ],
+)
+def test_another_share_trains(recordings, validation, counts):
+    check_draw(recordings, counts, validation=validation, train_share=0.7)
+
+
+def check_draw(recordings, counts, *, validation, **share):
     subsets = table(*carriageways(recordings))
-    found = divide_by_recording(subsets, validation=validation)
+    found = divide_by_recording(subsets, validation=validation, **share)
     SPLITS.validate(found.splits, where="test")
     SPLIT_BALANCE.validate(found.balance, where="test")
     parts = found.splits.with_columns(recording=pl.col("subset").str.head(2))

@@ -75,10 +75,20 @@ SUBSETS = st.lists(
 
 
 @settings(max_examples=60, deadline=None)
-@given(rows=SUBSETS, validation=st.booleans())
-def test_small_allocations_are_the_best_of_all(rows, validation):
-    shares = SHARES[validation]
-    chosen = parts_of(allocate_flow_balanced(table(rows), validation=validation))
+@given(
+    rows=SUBSETS,
+    wanted=st.sampled_from(
+        [
+            ({}, SHARES[False]),
+            ({"validation": True}, SHARES[True]),
+            ({"train_share": 0.7}, {"train": 700, "eval": 300}),
+            ({"train_share": 0.7, "validation": True}, {"train": 600, "val": 100, "eval": 300}),
+        ]
+    ),
+)
+def test_small_allocations_are_the_best_of_all(rows, wanted):
+    asked, shares = wanted
+    chosen = parts_of(allocate_flow_balanced(table(rows), **asked))
     got = judge(rows, [chosen[row[0]] for row in rows], shares)
     every = [judge(rows, parts, shares) for parts in itertools.product(shares, repeat=len(rows))]
     best = min(every, key=lambda verdict: verdict[:3])
@@ -271,3 +281,18 @@ def test_no_subsets_give_empty_tables():
 def test_bad_input_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         allocate_flow_balanced(change(table([("a", "S", "upper", 10, 100, 0.3)])))
+
+
+def test_shares_are_said_where_they_are_missed():
+    rows = [(name, "S", "upper", vehicles, 10, 0.3) for name, vehicles in (("a", 80), ("b", 20))]
+    assert allocate_flow_balanced(table(rows)).relaxations == {}
+    told = (
+        "train holds 0.800 of the vehicles instead of 0.700 +- 0.005; eval holds 0.200 of the vehicles instead of 0.300"
+    )
+    assert allocate_flow_balanced(table(rows), train_share=0.7).relaxations["highd"].startswith(told)
+
+
+@pytest.mark.parametrize(("share", "validation"), [(1.0, False), (0.0, False), (0.1, True), (1.2, True)])
+def test_parts_without_a_share_are_refused(share, validation):
+    with pytest.raises(ValueError, match=rf"below 1 to train, got {share:g}"):
+        allocate_flow_balanced(table([]), train_share=share, validation=validation)

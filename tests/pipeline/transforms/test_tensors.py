@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.tensor_files import write_tensors
 from pipeline.transforms.tensors import build_subset_tensors, count_sizes, join_after
+from schemas.findings import FINDINGS
 from schemas.protocols import Protocol
 from schemas.samples import NEIGHBORS, SAMPLES
 from schemas.splits import SPLITS
@@ -56,14 +57,27 @@ def blocks(*rows):
     return pl.DataFrame([("s", "highd", "a", *row) for row in rows], schema=SPLITS.dtypes, orient="row")
 
 
+def findings(*rows):
+    facts = [("highd", "a", vehicle, "a_rule", severity, *frames, 1, 1.0) for vehicle, severity, *frames in rows]
+    return pl.DataFrame(facts, schema=FINDINGS.dtypes, orient="row")
+
+
 WHOLE = blocks((0, 1, 100, None, None, "eval"))
 SAMPLED = samples((3, 1), (TOP, 3))
 
 
-def build_tensors(sampled=SAMPLED, around=None, split=WHOLE, clock=CLOCK, **more):
-    # 25 Hz on a 2 Hz clock: tick k lies at frame 1 + 12.5 k
+VEHICLES = pl.DataFrame(
+    {"vehicle_id": [TOP, 3], "length_m": [None, 4.5], "width_m": [2.5, None]},
+    schema={"vehicle_id": pl.Int32, "length_m": pl.Float32, "width_m": pl.Float32},
+)
+AT_2_HZ = {"first_frame": 1, "frame_rate_hz": 25.0}
+"""25 Hz on a 2 Hz clock: tick k lies at frame 1 + 12.5 k."""
+GIVEN = {"vehicles": VEHICLES, "findings": FINDINGS.empty()} | AT_2_HZ
+
+
+def build_tensors(sampled=SAMPLED, around=None, split=WHOLE, clock=CLOCK, protocol=P, **more):
     around = neighbors() if around is None else around
-    return build_subset_tensors(clock, sampled, around, split, first_frame=1, frame_rate_hz=25.0, protocol=P, **more)
+    return build_subset_tensors(clock, sampled, around, split, protocol=protocol, **(GIVEN | more))
 
 
 def build(**changes):
@@ -94,6 +108,22 @@ def test_rows_runs_and_samples_by_hand():
     assert arrays["lane"].tolist() == [1, 1, 1, 1, 1, 2, 0, 2, 2, 2]
     assert arrays["position_m"].tolist() == [[x, 1.5] for x in (10, 11, 12, 14, 15, 20, 21, 22, 23, 24)]
     assert arrays["speed_mps"].tolist() == [2] * 10
+
+
+def test_sizes_of_every_run_and_nothing_where_the_source_has_none():
+    arrays = build()  # vehicle 3 has two runs and no width, vehicle TOP two runs and no length
+    np.testing.assert_array_equal(arrays["run_length_m"], np.float32([4.5, 4.5, np.nan, np.nan]))
+    np.testing.assert_array_equal(arrays["run_width_m"], np.float32([np.nan, np.nan, 2.5, 2.5]))
+
+
+def test_findings_of_rows_that_a_block_keeps():
+    # Ticks 0, 1, 2, 3, 4 lie at frames 1, 13.5, 26, 38.5, 51; tick 1 answers for frames 2 to 14.
+    found = findings((3, "warning", 2, 2), (TOP, "error", 51, 51), (TOP, "info", 20, 40), (9, "error", 1, 99))
+    assert build(findings=found)["finding"].tolist() == [0, 2, 0, 0, 0, 0, 0, 3, 3, 1]
+    after = blocks((0, 26, 60, None, None, "train"))  # vehicle 3's tick 2, and tick 4; of TOP ticks 2, 3, 4
+    arrays = build(sampled=samples(), findings=found, split=after)
+    assert ticks_of(arrays).tolist() == [2, 4, 2, 3, 4]
+    assert arrays["finding"].tolist() == [0, 0, 3, 3, 1]
 
 
 def test_scenes_by_hand():
@@ -209,6 +239,7 @@ def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
         ({"sampled": samples((3, 3))}, "1 of 1 samples have no entry or not 2 ticks of history .*vehicle 3 at tick 3"),
         ({"sampled": samples((3, 4))}, "not 2 ticks of history on the clock, for example vehicle 3 at tick 4"),
         ({"sampled": samples((9, 1))}, "vehicle 9 at tick 1; make the samples anew"),
+        ({"vehicles": VEHICLES.head(1)}, "highd/a: expected every vehicle .*, got 2 runs of others, .* vehicle 3"),
         ({"around": neighbors((3, 2, 5, TOP))}, "name a sample that is not there, for example vehicle 3 at tick 2"),
         ({"around": neighbors((3, 1, 5, 77))}, "1 neighbors have no entry on the clock, for example vehicle 77"),
         (
@@ -225,7 +256,7 @@ def test_tables_that_disagree_are_refused(change, message):
 def test_a_history_longer_than_a_byte_counts_is_refused():
     long = Protocol(name="p", rate_hz=10, history_s=30.0)
     with pytest.raises(ValueError, match="at most 255 ticks"):
-        build_subset_tensors(CLOCK, SAMPLED, neighbors(), WHOLE, first_frame=1, frame_rate_hz=25.0, protocol=long)
+        build_tensors(protocol=long)
 
 
 def test_an_empty_clock_gives_empty_arrays():

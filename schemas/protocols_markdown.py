@@ -1,0 +1,61 @@
+"""The protocols as Markdown, from their declaration: `python -m schemas.protocols_markdown > docs/protocols.md`."""
+
+import sys
+from collections.abc import Sequence
+
+from schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
+
+HEAD = """# Protocols
+
+Derived from `schemas/protocols.py`; do not edit (`make docs` writes it).
+
+A protocol is a named recipe of sampling, split and metrics, hashed: two figures may stand in one table only where the
+digests of their protocols agree. `tracklake run SOURCE --protocol NAME` makes samples, split and tensors of it (the
+setting `protocol`, or TRACKLAKE_PROTOCOL); `train`, `evaluate` and `export` take the same flag. The settings
+`min_future_s`, `drop_error_findings`, `nearest` and `split` change a protocol, and its digest with it.
+"""
+
+OWN_SHARES = {"csp-2018": 0.7}
+"""Splits that do not ask how much is to train."""
+
+HEADINGS = (
+    "protocol", "rate Hz", "history s", "horizon s", "H", "F", "least future s", "split", "trains", "scored at s",
+    "headline", "digest",
+)  # fmt: skip
+
+
+def write_protocols() -> str:
+    """The whole page."""
+    lines = [HEAD, _row(HEADINGS), _row(("---",) * len(HEADINGS))]
+    lines += [_row(_describe(protocol)) for protocol in PROTOCOLS.values()]
+    lines += ["", "H and F are positions of a history, the sample's own included, and of a future. Headlines:", ""]
+    lines += [f"- `{name}`: {meaning}" for name, meaning in HEADLINES.items()]
+    for name in PROTOCOLS:
+        lines += ["", f"## {name}", "", MEANINGS[name]]
+    return "\n".join(lines) + "\n"
+
+
+def _describe(protocol: Protocol) -> tuple[str, ...]:
+    trains = OWN_SHARES.get(protocol.split, protocol.train_share)
+    return (
+        f"`{protocol.name}`",
+        str(protocol.rate_hz),
+        f"{protocol.history_s:g}",
+        f"{protocol.horizon_s:g}",
+        str(protocol.history_ticks),
+        str(protocol.horizon_ticks),
+        f"{protocol.min_future_s:g}",
+        f"`{protocol.split}`",
+        f"{100 * trains:g} %",
+        ", ".join(f"{seconds:g}" for seconds in protocol.scored_s),
+        f"`{protocol.headline}`",
+        f"`{protocol.digest}`",
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(write_protocols())
