@@ -5,7 +5,9 @@
 - `training.augmentation`: the road mirrored, positions shifted.
 - `training.models`: the registry of models, one file each.
 - `training.train`: train a model into a run's folder.
-- `training.evaluate`: the errors of a model or run at 1 to 5 s.
+- `training.evaluate`: the errors of a model or run at each horizon, in many groups; `training.guard` comes before it.
+- `training.prediction_drawing`: samples drawn with what models say; `training.error_figure`: errors over the horizon.
+- `training.published`: what others published, to stand beside.
 
 Nothing imports torch before `training.torch_batches` or a model that needs it is asked for.
 """

@@ -1,73 +1,104 @@
-"""The errors of a model or a trained run, at 1, 2, ... s, with the number of samples behind each."""
+"""How a model or a trained run does on one part of a split, and with what evidence: samples and vehicles behind it."""
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import polars as pl
 
+from schemas.evaluations import EVALUATIONS, EVERYTHING
 from schemas.protocols import Protocol
-from training.models import MODELS, Predictor, find_model
-from training.runs import load_run, refuse_leak
-from training.tensors import Batch, TensorFolder
+from training.guard import refuse_future
+from training.latency import Latency, measure_latency
+from training.models import MODELS, Predictor, Reads, find_model
+from training.reading import NEAREST, read_samples, truth_of_ego
+from training.runs import load_run, refuse_leak, refuse_unfinished
+from training.scores import Score, Tally, find_strata
+from training.tensors import TensorFolder
 
-BATCH_SIZE = 4096
+BATCH_SIZE = 2048
 """Samples predicted at once; the errors do not depend on it."""
 
 
 @dataclass(frozen=True)
-class Horizon:
-    """Errors so many seconds ahead, over the samples whose position is known then; null where there is none.
-
-    Args:
-        seconds: ahead of the sample.
-        n: samples whose position is known then.
-        rmse_m: square root of the mean squared distance between predicted and true position.
-        rmse_longitudinal_m: the same of the distance along the direction of travel only.
-        rmse_lateral_m: the same of the distance across it only.
-        mae_m: mean distance.
-    """
-
-    seconds: int
-    n: int
-    rmse_m: float | None
-    rmse_longitudinal_m: float | None
-    rmse_lateral_m: float | None
-    mae_m: float | None
-
-
-@dataclass(frozen=True)
 class Evaluation:
-    """How a model does on one part of a split. Every sample counts the same.
+    """How a model does on one part of a split.
 
     Args:
         model: the run's or model's name.
         part: train, val or eval.
         split: the split's name.
-        protocol: its name.
+        protocol: the protocol of the tensors.
         samples: in the part.
-        horizons: by increasing seconds.
+        vehicles: that they are of.
+        scores: by dataset, group, average and horizon.
+        latency: None where it was not measured.
     """
 
     model: str
     part: str
     split: str
-    protocol: str
+    protocol: Protocol
     samples: int
-    horizons: tuple[Horizon, ...]
+    vehicles: int
+    scores: tuple[Score, ...]
+    latency: Latency | None = None
+
+    @property
+    def horizons(self) -> tuple[Score, ...]:
+        """Of everything, every sample counting the same: by increasing seconds."""
+        return tuple(
+            own for own in self.scores if (own.dataset, own.group, own.average) == (EVERYTHING, EVERYTHING, "samples")
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
-        return asdict(self) | {"horizons": [asdict(horizon) for horizon in self.horizons]}
+        """As plain values, for JSON: `horizons` alone of the scores, without what is the same in all of them."""
+        same = ("dataset", "group", "average")
+        rows = [{name: value for name, value in asdict(own).items() if name not in same} for own in self.horizons]
+        return {
+            "model": self.model,
+            "part": self.part,
+            "split": self.split,
+            "protocol": self.protocol.name,
+            "samples": self.samples,
+            "vehicles": self.vehicles,
+            "horizons": rows,
+        }
+
+    def to_table(self) -> pl.DataFrame:
+        """As rows of `schemas.evaluations.EVALUATIONS`."""
+        of_all = {
+            "protocol": self.protocol.name,
+            "protocol_digest": self.protocol.digest,
+            "split": self.split,
+            "part": self.part,
+            "origin": "measured",
+            "model": self.model,
+            "reference": "",
+        }
+        latency = asdict(self.latency) if self.latency is not None else {}
+        rows = [
+            of_all | asdict(own) | (latency if own.dataset == own.group == EVERYTHING else {}) for own in self.scores
+        ]
+        return EVALUATIONS.empty() if not rows else pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
 
 
 class EmptyPartError(ValueError):
     """The part asked for has no samples."""
 
 
-def evaluate(name: str, tensors: Path, models: Path, part: str = "eval") -> Evaluation:
+def evaluate(
+    name: str,
+    tensors: Path,
+    models: Path,
+    part: str = "eval",
+    *,
+    nearest: int = NEAREST,
+    with_latency: bool = False,
+    every_tick: bool = False,
+) -> Evaluation:
     """Evaluate a trained run, or a model that needs no training.
 
     Args:
@@ -75,33 +106,67 @@ def evaluate(name: str, tensors: Path, models: Path, part: str = "eval") -> Eval
         tensors: the tensor folder.
         models: the folder of the runs.
         part: train, val or eval.
+        nearest: vehicles around the ego that models of scenes are shown, at most.
+        with_latency: also measure how long a prediction takes.
+        every_tick: score at every tick of the horizon, not at the protocol's seconds alone.
 
     Raises:
         TensorError: the tensors are absent or broken.
         EmptyPartError: the part has no samples.
-        ValueError: neither a run nor a model of that name; or the run was trained for another protocol, or on subsets
-            that stand in this part now.
+        StaleRunError: the run was trained for another protocol, or on subsets that stand in this part now; or it is
+            unfinished or damaged.
+        ValueError: neither a run nor a model of that name.
         FileNotFoundError: a model that learns, and no run of that name.
+        FutureInputError: the model sees what comes after the moment at which it predicts.
         ImportError: torch is needed and missing.
     """
     folder = TensorFolder.open(tensors)
+    predictor: Predictor
     if name in MODELS and not MODELS[name].learns:  # as it is, whether or not it was written as a run before
-        return measure_errors(MODELS[name].build(folder.protocol), folder, part, name=name)
-    if (models / name / "config.json").is_file():
+        model = MODELS[name]
+        predictor = model.build(folder.protocol)
+    elif (models / name / "config.json").is_file():
         run = load_run(models / name, folder.protocol)
-        if part != "train" and find_model(run.config["model"]).learns:
+        model, predictor = find_model(run.config["model"]), run.predictor
+        if part != "train" and model.learns:
             refuse_leak(run.config, folder, part)
-        return measure_errors(run.predictor, folder, part, name=name)
-    find_model(name)
-    raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
+    else:
+        refuse_unfinished(models / name)
+        find_model(name)
+        raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
+    ticks, rate_hz = range(1, folder.protocol.horizon_ticks + 1), folder.protocol.rate_hz
+    seconds = [tick / rate_hz for tick in ticks] if every_tick else None
+    evaluation = measure_errors(predictor, folder, part, name=name, reads=model.reads, nearest=nearest, seconds=seconds)
+    if not with_latency:
+        return evaluation
+    return replace(evaluation, latency=measure_latency(predictor, folder, part, reads=model.reads, nearest=nearest))
 
 
-def measure_errors(predictor: Predictor, folder: TensorFolder, part: str, *, name: str) -> Evaluation:
-    """Predict every sample of a part and sum up the errors.
+def measure_errors(
+    predictor: Predictor,
+    folder: TensorFolder,
+    part: str,
+    *,
+    name: str,
+    reads: Reads = "grid",
+    nearest: int = NEAREST,
+    seconds: Sequence[float] | None = None,
+) -> Evaluation:
+    """Predict every sample of a part and sum up the errors, after `training.guard.refuse_future`.
+
+    Args:
+        predictor: given what may be seen of the samples, and nothing else.
+        folder: the tensors.
+        part: train, val or eval.
+        name: what the model is called.
+        reads: what it is given.
+        nearest: of scenes: vehicles around the ego, at most.
+        seconds: horizons to score; None: the protocol's.
 
     Raises:
         EmptyPartError: the part has no samples.
-        ValueError: a prediction is not a finite number.
+        FutureInputError: the model sees what comes after the moment at which it predicts.
+        ValueError: a prediction is not a finite number, or not of the horizon's shape.
     """
     samples = folder.samples_of(part)
     if len(samples) == 0:
@@ -110,64 +175,26 @@ def measure_errors(predictor: Predictor, folder: TensorFolder, part: str, *, nam
             f"{folder.path}: the split `{folder.split}` has no samples in `{part}` (samples: {counts}); with a single "
             "subset everything trains, and nothing honest can be evaluated: add recordings and run `tracklake split`"
         )
-    batches = folder.batches(part, BATCH_SIZE)
-    horizons = _at_seconds(sum_up((predictor.predict(batch), batch) for batch in batches), folder.protocol)
-    if any(horizon.n and horizon.rmse_m is None for horizon in horizons):
-        raise ValueError(
-            f"`{name}` predicts positions that are not finite numbers; train it again with a lower learning rate"
-        )
+    refuse_future(predictor, folder, part, name=name, reads=reads, nearest=nearest)
+    strata, protocol = find_strata(folder, samples), folder.protocol
+    tally = Tally(strata, protocol.horizon_ticks)
+    for start in range(0, len(samples), BATCH_SIZE):
+        chosen = slice(start, start + BATCH_SIZE)
+        observed, truth = read_samples(folder, samples[chosen], reads, nearest=nearest)
+        tally.add(strata.of_sample[chosen], predictor.predict(observed), truth_of_ego(truth))
+    for what, sums in tally.sums.items():
+        if not np.isfinite(sums).all():
+            said = "densities" if what == "nll" else "positions"
+            raise ValueError(
+                f"`{name}` predicts {said} that are not finite numbers; train it again with a lower learning rate"
+            )
+    at = seconds if seconds is not None else [tick / protocol.rate_hz for tick in protocol.scored_ticks]
     return Evaluation(
         model=name,
         part=part,
         split=folder.split,
-        protocol=folder.protocol.name,
+        protocol=protocol,
         samples=len(samples),
-        horizons=horizons,
+        vehicles=int(strata.vehicle[-1]) + 1,
+        scores=tally.score(at, protocol.rate_hz),
     )
-
-
-@dataclass(frozen=True)
-class ErrorSums:
-    """Sums over samples, by tick of the future: all (F,)."""
-
-    n: npt.NDArray[np.int64]
-    longitudinal2: npt.NDArray[np.float64]
-    lateral2: npt.NDArray[np.float64]
-    distance: npt.NDArray[np.float64]
-
-
-def sum_up(predictions: Iterable[tuple[npt.NDArray[np.float32], Batch]]) -> ErrorSums:
-    """Sum the errors of predictions (B, F, 2) in m over batches; masked positions count nowhere."""
-    n, longitudinal2, lateral2, distance = 0, 0.0, 0.0, 0.0
-    for predicted, batch in predictions:
-        known = batch.future_mask
-        error = np.where(known[..., None], predicted.astype(np.float64) - batch.future, 0.0)
-        squares = error**2
-        n = n + known.sum(axis=0)
-        longitudinal2 = longitudinal2 + squares[..., 0].sum(axis=0)
-        lateral2 = lateral2 + squares[..., 1].sum(axis=0)
-        distance = distance + np.sqrt(squares.sum(axis=-1)).sum(axis=0)
-    return ErrorSums(*(np.asarray(total) for total in (n, longitudinal2, lateral2, distance)))
-
-
-def _at_seconds(sums: ErrorSums, protocol: Protocol) -> tuple[Horizon, ...]:
-    """Errors at whole seconds; a horizon without samples has none."""
-
-    def root(square: np.float64, n: int) -> float | None:
-        return float(np.sqrt(square / n)) if n and np.isfinite(square) else None
-
-    rows = []
-    for seconds in range(1, int(protocol.horizon_s) + 1):
-        tick = seconds * protocol.rate_hz - 1
-        n = int(sums.n[tick])
-        rows.append(
-            Horizon(
-                seconds=seconds,
-                n=n,
-                rmse_m=root(sums.longitudinal2[tick] + sums.lateral2[tick], n),
-                rmse_longitudinal_m=root(sums.longitudinal2[tick], n),
-                rmse_lateral_m=root(sums.lateral2[tick], n),
-                mae_m=float(sums.distance[tick] / n) if n and np.isfinite(sums.distance[tick]) else None,
-            )
-        )
-    return tuple(rows)

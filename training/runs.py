@@ -1,7 +1,9 @@
-"""Trained runs on disk: `config.json` (what was trained on what), `weights.pt`, `metrics.json`."""
+"""Trained runs on disk: `config.json` (what was trained on what), `weights.pt`, `metrics.json`, and two logs."""
 
+import hashlib
 import json
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +16,14 @@ from training.tensors import TensorFolder
 if TYPE_CHECKING:
     from torch import nn
 
-RUN_VERSION = 1
-"""Counts changes of `config.json` that older runs cannot be read with."""
+RUN_VERSION = 2
+"""Counts changes of `config.json` or of the models that older runs cannot be read with."""
+
+AGAIN = "train it again"
 
 
 class StaleRunError(ValueError):
-    """A run cannot be judged on these tensors: it was made for others."""
+    """A run cannot be judged on these tensors: it was made for others, is unfinished, or is damaged."""
 
 
 @dataclass(frozen=True)
@@ -36,29 +40,52 @@ class Run:
 
 
 def describe_run(
-    model: str, parameters: dict[str, Any], config: dict[str, Any], folder: TensorFolder
+    model: str,
+    parameters: dict[str, Any],
+    config: dict[str, Any],
+    folder: TensorFolder,
+    recipe: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `config.json` holds.
+    """What `config.json` holds, as plain values.
 
     Args:
         model: its name in the registry.
         parameters: keywords of its `build`.
-        config: how it was trained.
+        config: how it was trained, as the caller said.
         folder: what it was trained on.
+        recipe: and as the model's recipe then said; None where it does not learn.
     """
-    return {
+    run = {
         "version": RUN_VERSION,
         "model": model,
         "parameters": parameters,
         "training": config,
+        "recipe": recipe,
         "protocol": folder.index["protocol"],
         "split": folder.split,
         "train_subsets": sorted(folder.subsets_of("train")),
         "blocks": folder.index["blocks"],
+        "tensors": digest_tensors(folder),
     }
+    plain: dict[str, Any] = json.loads(json.dumps(run, allow_nan=False))
+    return plain
 
 
-def save_run(out: Path, config: dict[str, Any], metrics: dict[str, Any], network: "nn.Module | None") -> None:
+def digest_tensors(folder: TensorFolder) -> str:
+    """First 12 hex digits of the sha256 of the index, the samples and all positions: what a training depends on."""
+    digest = hashlib.sha256(json.dumps(folder.index, sort_keys=True).encode())
+    for array in (folder.position_m, folder.sample_row, folder.sample_part, folder.neighbor_row):
+        digest.update(array.data)
+    return digest.hexdigest()[:12]
+
+
+def save_run(
+    out: Path,
+    config: dict[str, Any],
+    metrics: dict[str, Any],
+    network: "nn.Module | None",
+    logs: Iterable[Path] = (),
+) -> None:
     """Write a run's folder aside and put it in place at once; a run of that name is replaced.
 
     Args:
@@ -66,15 +93,18 @@ def save_run(out: Path, config: dict[str, Any], metrics: dict[str, Any], network
         config: see `describe_run`.
         metrics: plain values.
         network: the trained module; None where the model does not learn.
+        logs: files to copy into it.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     aside = out.parent / f".{out.name}.{uuid4().hex}.partial"
     aside.mkdir()
     try:
         if network is not None:
-            import torch
+            from training.torch_files import write_torch_file
 
-            torch.save(network.state_dict(), aside / "weights.pt")
+            write_torch_file(aside / "weights.pt", network.state_dict())
+        for log in logs:
+            shutil.copyfile(log, aside / log.name)
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
         (aside / "config.json").write_text(json.dumps(config, indent=1, allow_nan=False), encoding="utf-8")
         if out.exists():
@@ -93,14 +123,10 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     """Load a run for tensors of a protocol.
 
     Raises:
-        ValueError: the run is of another version, or was trained for another protocol.
+        StaleRunError: the run is of another version, was trained for another protocol, or is damaged.
         ImportError: torch is needed and missing.
     """
-    config = json.loads((path / "config.json").read_text(encoding="utf-8"))
-    if config.get("version") != RUN_VERSION:
-        raise StaleRunError(
-            f"{path / 'config.json'}: expected version {RUN_VERSION}, got {config.get('version')}; train it again"
-        )
+    config = read_config(path)
     if config["protocol"]["digest"] != protocol.digest:
         raise StaleRunError(
             f"{path}: trained for the protocol {config['protocol']['name']} ({config['protocol']['digest']}), the "
@@ -110,11 +136,53 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     predictor = model.build(protocol, **config["parameters"])
     if model.learns:
         require_torch(model.name)
-        import torch
+        from training.torch_files import DamagedFileError, load_weights, read_torch_file
 
-        predictor.load_state_dict(torch.load(path / "weights.pt", weights_only=True, map_location="cpu"))
+        weights = path / "weights.pt"
+        try:
+            load_weights(predictor, read_torch_file(weights, AGAIN), str(weights), AGAIN)
+        except DamagedFileError as damaged:
+            raise StaleRunError(str(damaged)) from None
         predictor.eval()
     return Run(config=config, predictor=predictor)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """What a run's `config.json` holds.
+
+    Raises:
+        StaleRunError: it is of another version, or damaged.
+    """
+    file = path / "config.json"
+    try:
+        config = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as broken:
+        raise StaleRunError(f"{file}: not readable as JSON ({broken}); {AGAIN}") from None
+    version = config.get("version") if isinstance(config, dict) else f"a {type(config).__name__}"
+    if version != RUN_VERSION:
+        raise StaleRunError(f"{file}: expected version {RUN_VERSION}, got {version}; {AGAIN}")
+    lacking = sorted({"model", "parameters", "protocol", "train_subsets", "blocks"} - config.keys())
+    if lacking:
+        raise StaleRunError(f"{file}: expected {', '.join(lacking)} in it; {AGAIN}")
+    return dict(config)
+
+
+def refuse_unfinished(path: Path) -> None:
+    """Refuse a run of which there is nothing but a training that was interrupted.
+
+    Args:
+        path: the run's folder.
+
+    Raises:
+        StaleRunError: saying how to go on.
+    """
+    from training.checkpoints import is_unfinished
+
+    if not (path / "config.json").is_file() and is_unfinished(path):
+        raise StaleRunError(
+            f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "
+            f"{path.name} --resume`"
+        )
 
 
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:

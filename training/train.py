@@ -1,61 +1,69 @@
-"""Train a model for a given time, write the run, and say how it does."""
+"""Train a model: one loop, and the run that comes of it."""
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
+
+from training.batches import Integers
+from training.checkpoints import (
+    CHECKPOINT_FILE,
+    TrainingState,
+    claim_folder,
+    holding_interrupts,
+    read_checkpoint,
+    refuse_other_run,
+    refuse_wrong_start,
+    restore,
+    save_checkpoint,
+)
+from training.config import Plan, TrainConfig, make_plan
 from training.evaluate import measure_errors
-from training.models import find_model, require_torch
+from training.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
+from training.memory import keep_freed_memory
+from training.models import Model, Predictor, find_model, require_torch
+from training.observed import part_batch
+from training.reading import read_samples
 from training.runs import describe_run, save_run
 from training.tensors import TensorFolder
 
 if TYPE_CHECKING:
     import torch
-    from torch import nn
+
+    from training.models.network import Network
+
+__all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]
 
 Progress = Callable[[float, float], None]
-"""Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss in m2."""
+"""Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss."""
+Read = Callable[[Integers], tuple[Any, Any]]
+"""Numbers of samples (B,) -> what may be seen of them and what came (`training.observed`), tensors on the device."""
+
+VALIDATION_BATCH = 1024
+BRIEF_S = 2.0
+"""An epoch that ends so soon after a checkpoint writes none: writing it may take longer than doing the epoch again."""
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """How a model is trained.
+class DivergedError(ValueError):
+    """The loss is no number any more; nothing good can come of going on."""
 
-    Args:
-        seconds: time budget of the training loop, reading batches included.
-        steps: optimiser steps; where given, the learning rate follows them, and the result depends on the seed (and the
-            machine's arithmetic) alone, as long as `seconds` suffices. None = as many as the time allows.
-        batch_size: samples per step.
-        learning_rate: of AdamW, at its height; it warms up over the first 2 % and decays to nothing along a cosine.
-        max_gradient_norm: gradients are scaled down to this.
-        hidden: width of the model.
-        seed: of the weights and of the order of samples.
-        threads: of torch; None = its own choice. One by default: for networks this small a second one gains little on
-            an idle machine, and on a busy one it waits for its turn at every tick: a step takes ten times as long.
-    """
 
-    seconds: float = 60.0
-    steps: int | None = None
-    batch_size: int = 128
-    learning_rate: float = 4e-3
-    max_gradient_norm: float = 5.0
-    hidden: int = 48
-    seed: int = 0
-    threads: int | None = 1
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot train anything."""
-        for name in ("seconds", "steps", "batch_size", "learning_rate", "max_gradient_norm", "hidden", "threads"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"training: expected `{name}` above 0, got {value}")
+class TrainingInterruptedError(KeyboardInterrupt):
+    """Ctrl-C, with a checkpoint to go on from."""
 
 
 def train(
-    model: str, tensors: Path, out: Path, config: TrainConfig | None = None, progress: Progress | None = None
+    model: str,
+    tensors: Path,
+    out: Path,
+    config: TrainConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    resume: bool | None = None,
 ) -> dict[str, Any]:
     """Train a model on the training part, evaluate it on the evaluation part, and write the run.
 
@@ -64,123 +72,303 @@ def train(
     Args:
         model: its name in the registry. One that does not learn is evaluated and written all the same.
         tensors: the tensor folder.
-        out: the run's folder, `models/<run>`; replaced where it exists, and only once the training is done.
-        config: how.
+        out: the run's folder, `models/<run>`; replaced where it exists, and only once the training is done. Until then
+            checkpoint and logs stand in a hidden folder beside it.
+        config: how; None = by the model's recipe, or, where it goes on, as it was begun.
         progress: told how it goes.
+        resume: True: go on from the checkpoint; False: begin anew whatever there is; None: begin, unless there is a
+            checkpoint, which would be lost.
 
     Returns:
-        What `metrics.json` holds: model, seconds, steps, samples_seen, train_samples, loss_first_m2 and loss_last_m2
-        (mean over the first and last twentieth of the steps), losses (about 100 of step, seconds, loss_m2), and
-        `evaluation` (see `training.evaluate.Evaluation`; null where the split has no evaluation part).
+        What `metrics.json` holds: see `_describe_training`, and `evaluation` (see `training.evaluate`; null where the
+        split has no evaluation part).
 
     Raises:
         TensorError: the tensors are absent or broken.
-        ValueError: unknown model, no samples to train on, no time for one step, or a loss that is not finite.
+        UnfinishedError: a checkpoint stands there and `resume` is None; there is none and it is True; it is of a
+            training with other settings or data; or another process is at it.
+        DamagedFileError: the checkpoint is not what was written.
+        DivergedError: the loss is not finite.
+        FutureInputError: the model sees what comes after the moment at which it predicts.
+        TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
+        ValueError: unknown model or parameter; not enough to train with, see `training.config.make_plan`; or no time
+            for one step.
         ImportError: torch is needed and missing.
     """
-    config = config or TrainConfig()
     entry = find_model(model)
     folder = TensorFolder.open(tensors)
-    samples = len(folder.samples_of("train"))
-    if samples == 0 and entry.learns:
-        raise ValueError(
-            f"{folder.path}: the split `{folder.split}` has no samples in `train`: nothing to learn from; see "
-            '`sample_drops` for why (`tracklake sql "FROM sample_drops"`)'
-        )
-    metrics: dict[str, Any] = {"model": model, "train_samples": samples}
-    if entry.learns:
-        require_torch(model)
-        parameters = {"hidden": config.hidden}
-        network, course = _fit(lambda: entry.build(folder.protocol, **parameters), folder, config, progress)
-        metrics |= course
-        predictor: Any = network
-    else:
-        parameters, network = {}, None
-        predictor = entry.build(folder.protocol)
-        metrics |= {"seconds": 0.0, "steps": 0, "samples_seen": 0}
-    evaluable = len(folder.samples_of("eval")) > 0
-    evaluation = measure_errors(predictor, folder, "eval", name=out.name) if evaluable else None
-    metrics["evaluation"] = evaluation.to_dict() if evaluation else None
-    save_run(out, describe_run(model, parameters, asdict(config), folder), metrics, network)
+    if not entry.learns:
+        parameters = dict(config.parameters) if config else {}
+        predictor = entry.build(folder.protocol, **parameters)
+        evaluation = _evaluate(predictor, entry, folder, out.name)
+        metrics = {"model": model, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
+        save_run(out, describe_run(model, parameters, {}, folder), metrics, None)
+        return metrics
+    require_torch(model)
+    refuse_wrong_start(out, resume=resume)
+    with claim_folder(out) as unfinished:
+        checkpoint = unfinished / CHECKPOINT_FILE
+        stored = read_checkpoint(checkpoint) if resume else None
+        if config is None:
+            config = TrainConfig(**stored["run"]["training"]) if stored else TrainConfig()
+        plan = make_plan(entry, folder, config)
+        run = plan.describe()
+        if stored:
+            refuse_other_run(checkpoint, stored["run"], run)
+        else:
+            checkpoint.unlink(missing_ok=True)
+        try:
+            network, metrics = _fit(plan, run, unfinished, stored, progress)
+            metrics["evaluation"] = _evaluate(network, entry, folder, out.name)
+            save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
+            checkpoint.unlink()
+        except DivergedError:
+            checkpoint.unlink(missing_ok=True)  # it leads to the same
+            raise
+        except KeyboardInterrupt:
+            if not checkpoint.is_file():
+                raise
+            raise TrainingInterruptedError(f"interrupted; the training stands in {checkpoint}") from None
     return metrics
 
 
+def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: str) -> dict[str, Any] | None:
+    """The evaluation part's scores; None where the split has no such part."""
+    if len(folder.samples_of("eval")) == 0:
+        return None
+    return measure_errors(predictor, folder, "eval", name=name, reads=entry.reads).to_dict()
+
+
 def _fit(
-    build: Callable[[], "nn.Module"], folder: TensorFolder, config: TrainConfig, progress: Progress | None
-) -> tuple["nn.Module", dict[str, Any]]:
-    """The training loop: (the trained network, its course)."""
+    plan: Plan, run: dict[str, Any], unfinished: Path, stored: dict[str, Any] | None, progress: Progress | None
+) -> tuple["Network", dict[str, Any]]:
+    """The training loop: (the trained network, its course in figures).
+
+    Args:
+        plan: what is done.
+        run: the same, as a checkpoint states it.
+        unfinished: the folder for checkpoint and logs.
+        stored: the checkpoint to go on from; None = begin.
+        progress: told how it goes.
+    """
     import torch
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(config.threads or threads)
-    try:
-        with torch.random.fork_rng(devices=[]):  # the caller's random numbers stay as they were
-            torch.manual_seed(config.seed)
-            network = build()
-        network.train()
-        optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate)
-        losses: list[float] = []
-        times: list[float] = []
-        smooth = math.nan
-        start, spent, epoch = time.monotonic(), 0.0, 0
-        while spent < 1.0:
-            for batch in folder.batches("train", config.batch_size, shuffle_seed=config.seed + epoch):
-                elapsed = time.monotonic() - start
-                spent = len(losses) / config.steps if config.steps is not None else elapsed / config.seconds
-                if spent >= 1.0 or elapsed >= config.seconds:
-                    spent = 1.0
+    config, recipe, checkpoint = plan.config, plan.recipe, unfinished / CHECKPOINT_FILE
+    read = _make_reader(plan)
+    with _own_torch(plan):
+        network: Network = plan.entry.build(plan.folder.protocol, **plan.parameters).to(plan.device).train()
+        adam = torch.optim.AdamW if recipe.optimizer == "adamw" else torch.optim.Adam
+        optimizer = adam(network.parameters(), lr=recipe.learning_rate)
+        state = restore(checkpoint, stored, network, optimizer, plan.device) if stored else TrainingState()
+        with (
+            holding_interrupts() as interrupted,
+            writing_rows(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
+            writing_rows(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
+        ):
+            order: Integers | None = None
+            began = time.monotonic() - state.elapsed_s
+            saved = time.monotonic()
+            while True:
+                state.elapsed_s = time.monotonic() - began
+                spent = state.elapsed_s if config.seconds else state.step
+                if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
+                phase = recipe.phase_at(spent, plan.budget)
+                if not state.phases or state.phases[-1][0] != phase.loss:
+                    if state.step > state.marked[0]:  # a row is of one phase
+                        log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
+                    state.begin_phase(phase.loss)
+
+                start = time.perf_counter()
+                epoch, place = divmod(state.step, plan.epoch_steps)
+                if order is None or place == 0:
+                    order = plan.draw_epoch(epoch)
+                samples = order[place * recipe.batch_size : (place + 1) * recipe.batch_size]
+                observed, truth = read(samples)
+                state.reading_s += time.perf_counter() - start
+
                 for group in optimizer.param_groups:
-                    group["lr"] = config.learning_rate * _rate(spent)
-                future = torch.from_numpy(batch.future)
-                known = torch.from_numpy(batch.future_mask)
-                loss = mean_squared_distance(network(batch), future, known)
+                    group["lr"] = plan.learning_rate(spent)
+                loss = network.loss(observed, truth, phase.loss)
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-                torch.nn.utils.clip_grad_norm_(network.parameters(), config.max_gradient_norm)
+                torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.max_gradient_norm)
                 optimizer.step()
-                losses.append(loss.item())
-                if not math.isfinite(losses[-1]):
-                    raise ValueError(
-                        f"the loss is {losses[-1]} after {len(losses)} steps: train with a learning rate below "
-                        f"{config.learning_rate}, and check the tensors' positions"
-                    )
-                times.append(time.monotonic() - start)
-                smooth = losses[-1] if math.isnan(smooth) else 0.98 * smooth + 0.02 * losses[-1]
-                if progress is not None:
-                    progress(spent, smooth)
-            epoch += 1
-        network.eval()
+                state.take_step(_require_finite(loss.item(), plan, state), len(samples))
+                state.stepping_s += time.perf_counter() - start
+
+                if state.step % config.log_steps == 0:
+                    log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
+                ends = place + 1 == plan.epoch_steps
+                if ends:
+                    log_epoch(_end_epoch(plan, state, network, read))
+                state.elapsed_s = time.monotonic() - began
+                since_saved = time.monotonic() - saved
+                if since_saved > config.checkpoint_s or (ends and since_saved > BRIEF_S):
+                    save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+                    saved = time.monotonic()
+                try:
+                    if progress is not None:
+                        progress(min(1.0, spent / plan.budget), state.smooth_loss)
+                    if interrupted():
+                        raise KeyboardInterrupt
+                except KeyboardInterrupt:  # whoever it comes from: the step is done, the state is whole
+                    save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+                    raise
+
+            if state.step == 0:
+                raise ValueError(f"not one step was done within {config.seconds} s: give it more time")
+            if state.step > state.marked[0]:
+                log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
+            if not state.epochs or state.epochs[-1]["step"] != state.step:
+                log_epoch(_end_epoch(plan, state, network, read))  # one that the budget cut short
+            save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+        if state.best_weights is not None:
+            network.load_state_dict(state.best_weights)
+    if progress is not None:
+        progress(1.0, state.smooth_loss)
+    return network.eval(), _describe_training(plan, state, network)
+
+
+@contextmanager
+def _own_torch(plan: Plan) -> Iterator[None]:
+    """Threads and random numbers as the plan says; the caller's are as before, afterwards."""
+    import torch
+
+    cuda = [plan.device] if plan.device.type == "cuda" else []
+    keep_freed_memory()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(plan.config.threads or threads)
+    try:
+        with torch.random.fork_rng(devices=cuda):
+            torch.default_generator.manual_seed(plan.config.seed)
+            if cuda:
+                torch.cuda.manual_seed(plan.config.seed)
+            yield
     finally:
         torch.set_num_threads(threads)
-    if progress is not None:
-        progress(1.0, smooth)
-    return network, _describe_course(losses, times, len(folder.samples_of("train")), config)
 
 
-def mean_squared_distance(predicted: "torch.Tensor", future: "torch.Tensor", known: "torch.Tensor") -> "torch.Tensor":
-    """Mean squared distance in m2 over the known positions: (B, F, 2), (B, F, 2), (B, F) -> ()."""
-    squares = ((predicted - future) ** 2).sum(dim=-1)
-    return (squares * known).sum() / known.sum().clamp(min=1)
+def _make_reader(plan: Plan) -> Read:
+    """How batches come to the device."""
+    import torch
+
+    reads, folder, device = plan.entry.reads, plan.folder, plan.device
+    if device.type != "cpu" and reads == "grid":
+        return make_resident_reader(folder, device)
+
+    def read(samples: Integers) -> tuple[Any, Any]:
+        observed, truth = read_samples(folder, samples, reads)
+        if device.type == "cpu":
+            return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
+
+        def move(array: npt.NDArray[Any]) -> torch.Tensor:
+            return torch.from_numpy(array).to(device)
+
+        return observed.each(move), truth.each(move)
+
+    return read
 
 
-def _rate(spent: float) -> float:
-    """Share of the learning rate after a share of the budget: warm-up, then a cosine."""
-    return min(1.0, spent / 0.02 + 0.05) * 0.5 * (1.0 + math.cos(math.pi * spent))
+def make_resident_reader(folder: TensorFolder, device: "torch.device") -> Read:
+    """Batches of grids gathered on a device, from tensors that stand there as a whole."""
+    import torch
+
+    from training.torch_batches import ResidentTensors
+
+    resident = ResidentTensors(folder, device)
+    return lambda samples: part_batch(resident.gather(torch.from_numpy(samples).to(device)))
 
 
-def _describe_course(losses: list[float], times: list[float], samples: int, config: TrainConfig) -> dict[str, Any]:
-    """The loop's course in figures."""
-    if not losses:
-        raise ValueError(f"not one step was done within {config.seconds} s: give it more time")
-    twentieth = max(1, len(losses) // 20)
-    shown = range(0, len(losses), max(1, len(losses) // 100))
-    full, rest = divmod(len(losses), math.ceil(samples / config.batch_size))
+def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
+    """The loss, which must be a number.
+
+    Raises:
+        DivergedError: it is none.
+    """
+    if not math.isfinite(loss):
+        raise DivergedError(
+            f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phases[-1][0]}`: train with a learning "
+            f"rate below {plan.recipe.learning_rate:g} (`--set learning_rate=...`), and check the tensors' positions"
+        )
+    return loss
+
+
+def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read) -> Row:
+    """A row of epochs.csv; where there is patience, after validating, which keeps the weights where they are better."""
+    epoch, phase = (state.step - 1) // plan.epoch_steps, state.phases[-1][0]
+    losses = state.losses[epoch * plan.epoch_steps :]
+    row: Row = {"epoch": epoch, "step": state.step, "phase": phase, "seconds": round(state.elapsed_s, 3)}
+    row |= {"loss": sum(losses) / len(losses), "validation_loss": None, "best": None}
+    if plan.config.patience is None:
+        return row
+    validation_loss = _require_finite(_measure_loss(plan, network, read, phase), plan, state)
+    better = state.best_loss is None or validation_loss < state.best_loss
+    if better:
+        state.best_loss, state.best_epoch = validation_loss, epoch
+        state.best_weights = {name: weight.detach().clone() for name, weight in network.state_dict().items()}
+    if phase == plan.recipe.phases[-1].loss:
+        state.stale_epochs = 0 if better else state.stale_epochs + 1
+    return row | {"validation_loss": validation_loss, "best": int(better)}
+
+
+def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> float:
+    """A phase's mean loss over the samples of `val`."""
+    import torch
+
+    total = 0.0
+    network.eval()
+    with torch.no_grad():
+        for first in range(0, len(plan.val), VALIDATION_BATCH):
+            samples = plan.val[first : first + VALIDATION_BATCH]
+            total += network.loss(*read(samples), phase).item() * len(samples)
+    network.train()
+    return total / len(plan.val)
+
+
+def _describe_steps(plan: Plan, state: TrainingState, learning_rate: float) -> Row:
+    """A row of course.csv, on the steps since the row before."""
+    step, samples, stepping_s, reading_s = state.marked
+    state.marked = (state.step, state.samples, state.stepping_s, state.reading_s)
+    took_s = state.stepping_s - stepping_s
     return {
-        "seconds": round(times[-1], 3),
-        "steps": len(losses),
-        "samples_seen": full * samples + rest * config.batch_size,
-        "loss_first_m2": sum(losses[:twentieth]) / twentieth,
-        "loss_last_m2": sum(losses[-twentieth:]) / twentieth,
-        "losses": [{"step": i, "seconds": round(times[i], 3), "loss_m2": losses[i]} for i in shown],
+        "step": state.step,
+        "epoch": (state.step - 1) // plan.epoch_steps,
+        "phase": state.phases[-1][0],
+        "seconds": round(state.elapsed_s, 3),
+        "loss": sum(state.losses[step:]) / (state.step - step),
+        "learning_rate": learning_rate,
+        "samples_per_s": round((state.samples - samples) / took_s, 1),
+        "data_share": round((state.reading_s - reading_s) / took_s, 4),
+    }
+
+
+def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:
+    """What `metrics.json` holds, but for the evaluation.
+
+    Returns:
+        model; train_samples, in the part; weights, how many numbers were learned; seconds, of the loop; steps;
+        samples_seen, in all steps; samples_per_s and data_share, of the steps' time (reading included) and the share of
+        it that reading took; phases (loss, steps, and loss_first and loss_last, its mean over their first and last
+        twentieth); best (epoch and validation_loss of the weights that were kept; null without patience).
+    """
+    ends = [*(first for _, first in state.phases[1:]), state.step]
+    phases = []
+    for (loss, first), end in zip(state.phases, ends, strict=True):
+        losses = state.losses[first:end]
+        some = max(1, len(losses) // 20)
+        means = {"loss_first": sum(losses[:some]) / some, "loss_last": sum(losses[-some:]) / some}
+        phases.append({"loss": loss, "steps": len(losses), **means})
+    best = {"epoch": state.best_epoch, "validation_loss": state.best_loss}
+    return {
+        "model": plan.entry.name,
+        "train_samples": len(plan.train),
+        "weights": sum(weight.numel() for weight in network.parameters()),
+        "seconds": round(state.elapsed_s, 3),
+        "steps": state.step,
+        "samples_seen": state.samples,
+        "samples_per_s": round(state.samples / state.stepping_s, 1),
+        "data_share": round(state.reading_s / state.stepping_s, 4),
+        "phases": phases,
+        "best": best if state.best_loss is not None else None,
     }

@@ -1,23 +1,25 @@
-"""The registry of models: a name, what it is, and how it is built."""
+"""The registry of models: a name, what it is, what it reads, and how it is built and trained."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 from typing import Protocol as Interface
 
-import numpy as np
-import numpy.typing as npt
-
 from schemas.protocols import Protocol
-from training.tensors import Batch
+from training.prediction import Prediction
+from training.recipes import Phase, Recipe
+
+Reads = Literal["grid", "scene"]
+"""What a model is given: `training.observed.Observed` or `ObservedScene`."""
 
 
 class Predictor(Interface):
-    """What every model can do."""
+    """What every model that predicts places can do; it is never given more than what may be seen."""
 
-    def predict(self, batch: Batch) -> npt.NDArray[np.float32]:
-        """(B, F, 2) positions in m relative to the sample's last one, axes as in `Batch.future`."""
+    def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays, as the model's `reads` says)
+        """Predict B samples."""
         ...
 
 
@@ -28,34 +30,153 @@ class Model:
     Args:
         name: what the command line calls it.
         meaning: one line.
-        learns: whether it is a torch module that is to be trained; otherwise it predicts as it is.
-        build: makes it for a protocol, with the model's own parameters as keywords.
+        source: where it is published; empty where it is ours.
+        module: of `training.models`, imported only when the model is built.
+        builder: the class there; called with the protocol, and the parameters as keywords.
+        parameters: its own, with their defaults.
+        reads: what it is given.
+        recipe: how it is trained, if it is a torch network; None: it predicts as it is.
     """
 
     name: str
     meaning: str
-    learns: bool
-    build: Callable[..., Any]
+    source: str
+    module: str
+    builder: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    reads: Reads = "grid"
+    recipe: Recipe | None = None
+
+    @property
+    def learns(self) -> bool:
+        """Whether it is to be trained before it predicts."""
+        return self.recipe is not None
+
+    def build(self, protocol: Protocol, **parameters: Any) -> Any:  # noqa: ANN401  (a Predictor; where it learns, an nn.Module too)
+        """Make it for a protocol.
+
+        Raises:
+            ValueError: a parameter that it does not have.
+            ImportError: it needs torch, which is missing.
+        """
+        unknown = sorted(set(parameters) - set(self.parameters))
+        if unknown:
+            known = ", ".join(self.parameters) or "none"
+            raise ValueError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
+        if self.learns:
+            require_torch(self.name)
+        make: Callable[..., Any] = getattr(import_module(f"training.models.{self.module}"), self.builder)
+        return make(protocol, **{**self.parameters, **parameters})
 
 
-def _build_constant_velocity(protocol: Protocol) -> Predictor:
-    from training.models.constant_velocity import ConstantVelocity
+DEO = "Deo and Trivedi 2018, Convolutional Social Pooling for Vehicle Trajectory Prediction (CVPR workshops)"
+KIM = "Kim et al. 2020, Multi-Head Attention based Probabilistic Vehicle Trajectory Prediction (IEEE IV)"
+CHOI = "Choi et al. 2021, random-forest lane change and LSTM encoder-decoder on an occupancy grid"
 
-    return ConstantVelocity(protocol)
-
-
-def _build_lstm(protocol: Protocol, hidden: int = 48) -> Predictor:
-    require_torch("lstm")
-    from training.models.lstm import EncoderDecoder
-
-    return EncoderDecoder(protocol, hidden=hidden)
-
+_SQUARED = (Phase("mse", 8),)
+_CONVOLUTIONAL = Recipe(phases=(Phase("mse", 5), Phase("nll", 3)))
+_ATTENTION = Recipe(phases=(Phase("both", 8),))
 
 MODELS = {
     model.name: model
     for model in (
-        Model("constant-velocity", "goes on as it went during its last 0.2 s", False, _build_constant_velocity),
-        Model("lstm", "LSTM encoder-decoder on the vehicle's own history", True, _build_lstm),
+        Model(
+            "constant-velocity",
+            "goes on as it went during its last 0.2 s",
+            "",
+            module="constant_velocity",
+            builder="ConstantVelocity",
+        ),
+        Model(
+            "kalman-cv",
+            "Kalman filter over the history with constant velocity and white-noise acceleration",
+            "Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2",
+            module="kalman",
+            builder="KalmanConstantVelocity",
+        ),
+        Model(
+            "ctrv",
+            "constant turn rate and velocity",
+            "Schubert, Richter and Wanielik 2008, Comparison and evaluation of advanced motion models",
+            module="ctrv",
+            builder="ConstantTurnRate",
+        ),
+        Model(
+            "lstm",
+            "small LSTM encoder-decoder on the deviation from constant velocity",
+            "",
+            module="lstm",
+            builder="DeviationLstm",
+            parameters={"hidden": 48},
+            recipe=Recipe(
+                phases=_SQUARED, learning_rate=4e-3, optimizer="adamw", schedule="cosine", max_gradient_norm=5.0
+            ),
+        ),
+        Model(
+            "v-lstm",
+            "vanilla LSTM: convolutional social pooling's encoder and decoder without the neighbors",
+            DEO,
+            module="vanilla_lstm",
+            builder="VanillaLstm",
+            parameters={"residual": True},
+            recipe=_CONVOLUTIONAL,
+        ),
+        Model(
+            "stacked-lstm",
+            "two stacked LSTM layers over the history and a linear layer to all places ahead",
+            CHOI,
+            module="stacked_lstm",
+            builder="StackedLstm",
+            parameters={"residual": True},
+            recipe=Recipe(phases=_SQUARED),
+        ),
+        Model(
+            "lstm-encoder-decoder",
+            "256-unit embedding, two stacked LSTM layers of 256 in encoder and decoder, 256-unit output layer",
+            CHOI,
+            module="encoder_decoder",
+            builder="EncoderDecoder",
+            parameters={"residual": True},
+            recipe=Recipe(phases=_SQUARED, batch_size=100),
+        ),
+        Model(
+            "cs-lstm",
+            "convolutional social pooling",
+            DEO,
+            module="social_pooling",
+            builder="SocialPooling",
+            parameters={"maneuvers": False, "residual": True},
+            recipe=_CONVOLUTIONAL,
+        ),
+        Model(
+            "cs-lstm-m",
+            "convolutional social pooling with maneuvers",
+            DEO,
+            module="social_pooling",
+            builder="SocialPooling",
+            parameters={"maneuvers": True, "residual": True},
+            recipe=_CONVOLUTIONAL,
+        ),
+        *(
+            Model(
+                f"attention-h{heads}",
+                f"vehicle and lane attention with {heads} heads, all vehicles of a scene at once",
+                KIM,
+                module="attention",
+                builder="SceneAttention",
+                parameters={
+                    "heads": heads,
+                    "hidden": 128,
+                    "dropout": 0.3,
+                    "nll_weight": 1.0,
+                    "distance_weight": 1.0,
+                    "residual": True,
+                },
+                reads="scene",
+                recipe=_ATTENTION,
+            )
+            for heads in (2, 4, 8)
+        ),
     )
 }
 

@@ -1,10 +1,13 @@
 """Constant velocity: the plainest prediction, which every other one has to beat. NumPy only."""
 
+from typing import Any
+
 import numpy as np
-import numpy.typing as npt
 
 from schemas.protocols import Protocol
-from training.tensors import Batch
+from training.batches import Floats
+from training.observed import Observed
+from training.prediction import Prediction
 
 VELOCITY_S = 0.2
 """Seconds of history that the velocity is taken from."""
@@ -13,6 +16,15 @@ VELOCITY_S = 0.2
 def velocity_ticks(protocol: Protocol) -> int:
     """Ticks of history that the velocity is taken from: one at 5 Hz, two at 10 Hz."""
     return min(max(1, round(VELOCITY_S * protocol.rate_hz)), protocol.history_ticks - 1)
+
+
+def extrapolate(history: Any, ticks: int, steps: Any) -> Any:  # noqa: ANN401  (NumPy's arrays or torch's tensors, all of one kind)
+    """Go on in a straight line, as over the last `ticks`: (..., H, 2), (F,) numbers of ticks ahead -> (..., F, 2).
+
+    In m, relative to the last position, with NumPy's arrays and torch's tensors alike.
+    """
+    velocity = (history[..., -1, :] - history[..., -1 - ticks, :]) / ticks  # m per tick
+    return velocity[..., None, :] * steps[:, None]
 
 
 class ConstantVelocity:
@@ -29,8 +41,6 @@ class ConstantVelocity:
         self.ticks = velocity_ticks(protocol)
         self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)
 
-    def predict(self, batch: Batch) -> npt.NDArray[np.float32]:
-        """(B, F, 2) positions in m relative to the sample's last one."""
-        velocity = (batch.history[:, -1] - batch.history[:, -1 - self.ticks]) / np.float32(self.ticks)  # m per tick
-        predicted: npt.NDArray[np.float32] = velocity[:, None, :] * self.steps[:, None]
-        return predicted
+    def predict(self, observed: Observed[Floats]) -> Prediction:
+        """Predict B samples."""
+        return Prediction(position_m=extrapolate(observed.history, self.ticks, self.steps))

@@ -1,19 +1,19 @@
 """LSTM encoder-decoder: what a vehicle's own history says beyond constant velocity."""
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from schemas.protocols import Protocol
 from training.models.constant_velocity import velocity_ticks
-from training.tensors import Batch
+from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from training.observed import Observed, Truth
+from training.prediction import Prediction
 
 SPEED_SCALE_MPS = 15.0
 """Speeds are divided by this: motorway traffic then lies between 0 and about 3."""
 
 
-class EncoderDecoder(nn.Module):
+class DeviationLstm(Network):
     """Encodes H positions, unrolls F steps, and predicts the deviation from constant velocity.
 
     Constant velocity (as in the model of this name) explains nearly all of where a vehicle will
@@ -42,9 +42,8 @@ class EncoderDecoder(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, batch: Batch) -> Tensor:
-        """(B, F, 2) positions in m relative to the sample's last one."""
-        history = torch.from_numpy(batch.history).to(self.out.weight.device)
+    def forward(self, history: Tensor) -> Tensor:
+        """(B, H, 2) -> (B, F, 2) positions in m relative to the sample's last one."""
         velocity = (history[:, -1:] - history[:, -1 - self.ticks : -self.ticks]) / self.ticks  # (B, 1, 2) m per tick
         back = torch.arange(1 - history.shape[1], 1, device=history.device, dtype=history.dtype)
         deviation = history - velocity * back[:, None]  # (B, H, 2) m
@@ -58,8 +57,11 @@ class EncoderDecoder(nn.Module):
         ahead = torch.arange(1, self.steps + 1, device=history.device, dtype=history.dtype)
         return velocity * ahead[:, None] + torch.cumsum(self.out(decoded), dim=1)
 
-    @torch.no_grad()
-    def predict(self, batch: Batch) -> npt.NDArray[np.float32]:
-        """(B, F, 2) positions in m relative to the sample's last one, without gradients."""
-        predicted: npt.NDArray[np.float32] = self(batch).cpu().numpy()
-        return predicted
+    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
+        """() mean squared distance in m2; the only phase is `mse`."""
+        check_phase(phase, "mse")
+        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
+
+    def say(self, observed: Observed[Tensor]) -> Prediction:
+        """Places only."""
+        return Prediction(position_m=to_numpy(self(observed.history)))

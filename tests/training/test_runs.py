@@ -1,0 +1,102 @@
+"""Finished runs: what does not fit, or is not what was written, is refused."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import polars as pl
+import pytest
+import torch
+from file_damages import DAMAGES
+from tensor_tables import TINY, split_row
+from tiny_network import PARTS, Forgetful, register, write_tiny
+
+from training.evaluate import evaluate
+from training.runs import RUN_VERSION, StaleRunError, load_run
+from training.torch_files import write_torch_file
+from training.train import TrainConfig, train
+
+CONFIG = TrainConfig(epochs=1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        register(patch)
+        train("forgetful", write_tiny(folder / "tensors"), folder / "run", CONFIG)
+    return folder
+
+
+@pytest.fixture
+def finished(trained, tmp_path, monkeypatch):
+    """A copy of a run, to be damaged."""
+    register(monkeypatch)
+    return shutil.copytree(trained / "run", tmp_path / "run")
+
+
+@pytest.mark.parametrize(("damage", "told"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
+def test_damaged_weights_are_refused_and_run_nothing(damage, told, finished):
+    damage(finished / "weights.pt")
+    with pytest.raises(StaleRunError, match=f"weights.pt: {told}.*train it again"):
+        load_run(finished, TINY)
+    assert not (finished / "was run").exists()
+
+
+def test_another_models_weights_are_refused_by_name_and_shape(finished):
+    file = finished / "weights.pt"
+    weights = torch.load(file, weights_only=True)
+    others = Forgetful(TINY, hidden=5).state_dict()
+    write_torch_file(file, others)
+    with pytest.raises(
+        StaleRunError, match=r"`first.bias`: expected \(8,\) of float32, got \(5,\) of float32; .*train it"
+    ):
+        load_run(finished, TINY)
+    write_torch_file(file, {"out.weight": weights["last.weight"], **weights})
+    with pytest.raises(StaleRunError, match=r"`out.weight` is not known"):
+        load_run(finished, TINY)
+    write_torch_file(file, weights | {"last.bias": weights["last.bias"].double()})
+    with pytest.raises(StaleRunError, match=r"`last.bias`: expected \(8,\) of float32, got \(8,\) of float64"):
+        load_run(finished, TINY)
+    file.unlink()
+    with pytest.raises(StaleRunError, match=r"weights.pt: there is no such file; train it again"):
+        load_run(finished, TINY)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"version": 1}, "expected version 2, got 1; train it again"),
+        ({"version": None}, "expected version 2, got None; train it again"),
+        (None, "not readable as JSON"),
+        ([], "expected version 2, got a list"),
+    ],
+)
+def test_runs_of_other_versions_and_broken_ones_are_refused(change, told, finished):
+    assert RUN_VERSION == 2
+    file = finished / "config.json"
+    config = json.loads(file.read_text())
+    file.write_text("{" if change is None else json.dumps({**config, **change} if change else change))
+    with pytest.raises(StaleRunError, match=f"config.json: {told}"):
+        load_run(finished, TINY)
+
+
+def test_a_run_of_another_protocol_is_refused(finished, tmp_path):
+    other = write_tiny(tmp_path / "other", protocol=replace(TINY, horizon_s=1.0))
+    with pytest.raises(StaleRunError, match=r"trained for the protocol tiny \(.*train it again"):
+        evaluate("run", other, finished.parent)
+
+
+def test_a_run_is_not_evaluated_on_what_it_was_trained_on(finished, tmp_path):
+    swapped = PARTS.with_columns(part=PARTS["part"].replace({"train": "eval", "eval": "train"}))
+    with pytest.raises(StaleRunError, match=r"1 subset\(s\) of `eval` \(highd/a\) were in its training part"):
+        evaluate("run", write_tiny(tmp_path / "swapped", swapped), finished.parent)
+    shutil.rmtree(finished)
+    train("constant-velocity", write_tiny(tmp_path / "tensors"), tmp_path / "cv")
+    assert evaluate("cv", tmp_path / "swapped", tmp_path).samples > 0, "what never learned cannot have seen anything"
+
+
+def test_a_run_meets_new_recordings(finished, tmp_path):
+    splits = pl.concat([PARTS, split_row("d", "eval")])
+    with_another = write_tiny(tmp_path / "more", splits, subsets="abcd")
+    assert evaluate("run", with_another, finished.parent).samples > 116

@@ -1,0 +1,182 @@
+"""No prediction may depend on what comes after its moment: checked before a model is scored, on the model itself.
+
+A model is given `training.observed` only, which refuses every other name. That says nothing of a model that reaches the
+tensors another way, nor of a reader that lets the future into what may be seen. So a few moments are predicted twice:
+from the tensors as they are, and from the same tensors with everything else after the moment. Nothing may change.
+
+A model that learnt the answers by heart before is not found out here: `training.runs.refuse_leak` keeps those away.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, SEVERITIES
+from training.batches import Integers
+from training.models import Predictor, Reads
+from training.observed import FutureInputError
+from training.prediction import Density, Prediction
+from training.reading import NEAREST, read_samples
+from training.tensors import TensorFolder
+
+MOMENTS = 3
+"""Predicted twice."""
+TOLERANCE = 1e-3
+"""Differences that are no leak, in the predictions' own units, and relative to them: arithmetic of another order."""
+
+Change = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+
+OF_ROWS: Mapping[str, Change] = {
+    "position_m": lambda steps: steps + np.array([61, 17], dtype=steps.dtype),  # int16 may wrap: it is another place
+    "speed_mps": lambda speed: speed + 7,
+    "lane": lambda lane: lane + 1,
+    "finding": lambda finding: (finding + 1) % (len(SEVERITIES) + 1),
+}
+"""What else could have come: of rows after the moment. All arrays by row of `schemas.tensors.ARRAYS` are here."""
+
+OF_SAMPLES: Mapping[str, Change] = {
+    "sample_lateral": lambda code: (code + 1) % len(LATERAL_MANEUVERS),
+    "sample_longitudinal": lambda code: (code + 1) % len(LONGITUDINAL_MANEUVERS),
+    "sample_future": lambda known: np.maximum(known, 2) - 1,
+}
+"""Of samples: these are made of their futures."""
+
+
+def refuse_future(
+    predictor: Predictor,
+    folder: TensorFolder,
+    part: str,
+    *,
+    name: str,
+    reads: Reads = "grid",
+    nearest: int = NEAREST,
+) -> None:
+    """Refuse a model whose predictions of some moments change with what comes after them.
+
+    The folder itself is another one meanwhile, so that a model which holds it is found out too; it is not to be read
+    from another thread at the same time.
+
+    Args:
+        predictor: the model.
+        folder: the tensors.
+        part: whose moments are predicted: a few, evenly spread over it.
+        name: what the model is called.
+        reads: what it is given.
+        nearest: of scenes: vehicles around the ego, at most.
+
+    Raises:
+        FutureInputError: a prediction changes, or already what the model is given.
+        ValueError: the model predicts otherwise each time it is asked, so that nothing can be said of it.
+    """
+    rows = {array: getattr(folder, array).copy() for array in OF_ROWS}
+    changed = {array: change(getattr(folder, array)) for array, change in OF_SAMPLES.items()}
+    for scene in choose_moments(folder, part, MOMENTS):
+        samples = samples_of_scene(folder, scene)
+        subset, tick, after = _rows_after(folder, scene)
+
+        def predict(samples: Integers = samples) -> tuple[dict[str, Any], dict[str, Any]]:
+            observed, _ = read_samples(folder, samples, reads, nearest=nearest)
+            given = {own.name: np.array(getattr(observed, own.name)) for own in fields(observed)}  # before it is used
+            return given, _arrays_of(predictor.predict(observed))
+
+        given, said = predict()
+        for array, change in OF_ROWS.items():
+            rows[array][after] = change(rows[array][after])
+        with _another(folder, rows | changed):
+            given_then, said_then = predict()
+        for array in OF_ROWS:
+            rows[array][after] = getattr(folder, array)[after]
+        where = f"at tick {tick} of {subset}"
+        differs = _find_difference(given, given_then, exactly=True)
+        if differs is not None:
+            raise FutureInputError(
+                f"what models are shown {where} changes with what comes after: `{differs[0]}` ({differs[2]}); the "
+                f"reader of `{reads}` must stop at the sample's own tick"
+            )
+        differs = _find_difference(said, said_then)
+        if differs is None:
+            continue
+        if _find_difference(said, predict()[1]) is not None:
+            raise ValueError(
+                f"`{name}` predicts otherwise each time it is asked ({where}): fix its seed, so that its scores mean "
+                "something and it can be checked that it does not see the future"
+            )
+        array, at, apart = differs
+        sample = f"sample {samples[at]}" if len(said[array]) == len(samples) else f"position {at}"
+        raise FutureInputError(
+            f"`{name}` sees the future: what it predicts {where} changes with what comes after (`{array}` of {sample}, "
+            f"{apart}). A model may use what it is given by `training.observed`, and nothing else of the tensors"
+        )
+
+
+def choose_moments(folder: TensorFolder, part: str, count: int) -> Integers:
+    """Numbers of so many scenes of a part at most, evenly spread over it."""
+    scenes = folder.scenes_of(part)
+    return scenes[np.unique(np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(np.intp))]
+
+
+def samples_of_scene(folder: TensorFolder, scene: int) -> Integers:
+    """Numbers of the samples of one scene."""
+    members = folder.scene_sample[folder.scene_offset[scene] : folder.scene_offset[scene + 1]]
+    return members[members >= 0].astype(np.int64)
+
+
+def _rows_after(folder: TensorFolder, scene: int) -> tuple[str, int, Integers]:
+    """The scene's subset and tick, and the rows of that subset at later ticks."""
+    row = int(folder.scene_row[folder.scene_offset[scene]])
+    run = int(folder.runs_of(np.array([row]))[0])
+    tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
+    runs = np.flatnonzero(folder.run_subset == folder.run_subset[run])
+    first, end = folder.run_first_row[runs], folder.run_first_row[runs + 1]
+    begin = np.minimum(first + np.maximum(0, tick + 1 - folder.run_first_tick[runs].astype(np.int64)), end)
+    counts = end - begin
+    rows = np.arange(counts.sum()) + np.repeat(begin - (counts.cumsum() - counts), counts)
+    named = folder.index["subsets"][int(folder.run_subset[run])]
+    return f"{named['dataset']}/{named['subset']}", tick, rows.astype(np.int64)
+
+
+@contextmanager
+def _another(folder: TensorFolder, arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[None]:
+    """The folder holds other arrays meanwhile, and nothing that was computed from its own."""
+    kept = dict(vars(folder))
+    own = {field.name: kept[field.name] for field in fields(folder)}
+    _put(folder, own | dict(arrays))
+    try:
+        yield
+    finally:
+        _put(folder, kept)
+
+
+def _put(folder: TensorFolder, values: Mapping[str, Any]) -> None:
+    """Replace what a folder holds; it is frozen against everybody else."""
+    vars(folder).clear()
+    vars(folder).update(values)
+
+
+def _arrays_of(prediction: Prediction) -> dict[str, npt.NDArray[Any]]:
+    """What a prediction says, by name."""
+    parts = {own.name: getattr(prediction, own.name) for own in fields(prediction) if own.name != "density"}
+    if prediction.density is not None:
+        parts |= {own.name: getattr(prediction.density, own.name) for own in fields(Density)}
+    return {name: np.array(values) for name, values in parts.items() if values is not None}
+
+
+def _find_difference(
+    one: Mapping[str, npt.NDArray[Any]], other: Mapping[str, npt.NDArray[Any]], *, exactly: bool = False
+) -> tuple[str, int, str] | None:
+    """Name of the first array that differs, where along its first axis it differs most, and how; None: none does."""
+    for name in dict.fromkeys((*one, *other)):
+        if name not in one or name not in other or one[name].shape != other[name].shape:
+            shapes = (own[name].shape if name in own else "nothing" for own in (one, other))
+            return name, 0, "shape {} or {}".format(*shapes)
+        was, now = one[name].astype(np.float64), other[name].astype(np.float64)
+        tolerance = 0.0 if exactly else TOLERANCE
+        near = np.isclose(was, now, rtol=tolerance, atol=tolerance, equal_nan=True)
+        if not near.all():
+            apart = np.where(near, 0.0, np.nan_to_num(np.abs(was - now), nan=np.inf))
+            return name, int(np.unravel_index(apart.argmax(), apart.shape)[0]), f"{apart.max():.3g} apart"
+    return None

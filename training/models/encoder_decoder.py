@@ -1,0 +1,56 @@
+"""LSTM encoder-decoder: embedding, two stacked layers that read the history, two that unroll the future."""
+
+import torch
+from torch import Tensor, nn
+
+from schemas.protocols import Protocol
+from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from training.models.straight import Straight
+from training.observed import Observed, Truth
+from training.prediction import Prediction
+
+WIDTH = 256
+"""Of the embedding, of every LSTM layer and of the output layer (Choi et al. 2021)."""
+
+
+class EncoderDecoder(Network):
+    """Embeds H positions in m (256, ReLU), encodes them (2 x 256), decodes F steps (2 x 256), puts out places.
+
+    The output layer has 256 units (ReLU) and is followed by the linear one to 2 numbers. The decoder starts from the
+    encoder's states, layer by layer, and is fed the encoder's last output at every step. What it is fed is our choice:
+    fed its own last place instead, as in translation, it would run step by step, and an error made early would be
+    carried on.
+    """
+
+    def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
+        """Prepare for a protocol's rate, history and horizon.
+
+        Args:
+            protocol: gives H and F.
+            residual: places are counted from constant velocity, see `training.models.straight`.
+        """
+        super().__init__()
+        self.steps = protocol.horizon_ticks
+        self.straight = Straight(protocol, residual=residual)
+        self.embedding = nn.Linear(2, WIDTH)
+        self.encoder = nn.LSTM(WIDTH, WIDTH, num_layers=2, batch_first=True)
+        self.decoder = nn.LSTM(WIDTH, WIDTH, num_layers=2, batch_first=True)
+        self.output = nn.Linear(WIDTH, WIDTH)
+        self.place = nn.Linear(WIDTH, 2)
+
+    def forward(self, history: Tensor) -> Tensor:
+        """(B, H, 2) -> (B, F, 2) positions in m relative to the sample's last one."""
+        _, states = self.encoder(torch.relu(self.embedding(history)))
+        fed = states[0][-1][:, None, :].expand(-1, self.steps, -1)  # (B, F, 256)
+        decoded, _ = self.decoder(fed, states)  # (B, F, 256)
+        places: Tensor = self.straight(history) + self.place(torch.relu(self.output(decoded)))
+        return places
+
+    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
+        """() mean squared distance in m2; the only phase is `mse`."""
+        check_phase(phase, "mse")
+        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
+
+    def say(self, observed: Observed[Tensor]) -> Prediction:
+        """Places only."""
+        return Prediction(position_m=to_numpy(self(observed.history)))

@@ -1,0 +1,67 @@
+"""What the training loop asks of a torch network, and the way from its tensors to a prediction."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from training.observed import Truth
+from training.prediction import Prediction
+
+
+class Network(nn.Module):
+    """A model that learns. Heirs give `loss` and `say`; `forward` is theirs to define."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
+
+    def loss(self, observed: Any, truth: Truth[Tensor], phase: str) -> Tensor:  # noqa: ANN401  (Observed or ObservedScene of tensors)
+        """() what a step of training makes smaller, over all B samples.
+
+        Args:
+            observed: `Observed` or `ObservedScene`, as the registry's `reads` says.
+            truth: what came; the one place where a model is given it.
+            phase: the recipe's `Phase.loss`.
+
+        Raises:
+            ValueError: no such phase.
+        """
+        raise NotImplementedError
+
+    def say(self, observed: Any) -> Prediction:  # noqa: ANN401  (as above)
+        """Predict; called without gradients, in evaluation mode, with tensors on the weights' device."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays)
+        """Predict B samples given as NumPy arrays."""
+        trained = self.training
+        self.eval()
+        try:
+            return self.say(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
+        finally:
+            self.train(trained)
+
+
+def check_phase(phase: str, *known: str) -> None:
+    """Refuse a loss that a model does not have.
+
+    Raises:
+        ValueError: no such phase.
+    """
+    if phase not in known:
+        raise ValueError(f"unknown phase `{phase}` of training: expected one of {', '.join(known)}")
+
+
+def to_numpy(tensor: Tensor) -> Any:  # noqa: ANN401  (an array of the tensor's dtype)
+    """A tensor of any device as an array."""
+    return tensor.detach().cpu().numpy()
+
+
+def mean_squared_distance(predicted: Tensor, future: Tensor, known: Tensor) -> Tensor:
+    """Mean squared distance in m2 over the known positions: (..., F, 2), (..., F, 2), (..., F) -> ()."""
+    squares = ((predicted - future) ** 2).sum(dim=-1)
+    return (squares * known).sum() / known.sum().clamp(min=1)

@@ -1,0 +1,90 @@
+"""Scenes as an attention network takes them in: one row of numbers per vehicle, and one per lane."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from training.observed import ObservedScene
+
+PLACE_SCALE_M = (50.0, 5.0)
+"""What last positions (along, across the road) are divided by, so that inputs are of the order of 1."""
+SPEED_SCALE_MPS = (15.0, 1.0)
+DEVIATION_SCALE_M = (5.0, 1.0)
+SIZE_SCALE_M = (5.0, 2.0)
+LANE_SCALE_M = 4.0
+
+
+def count_features(history_ticks: int) -> int:
+    """D: numbers per vehicle: 2 last position, 2 velocity, 2 H deviations, H known or not, 2 length and width."""
+    return 3 * history_ticks + 6
+
+
+@dataclass(frozen=True)
+class Vehicles:
+    """Vehicles of B scenes, all 0 where there is none, whatever stands there.
+
+    Args:
+        features: (B, V, D) inputs of the network.
+        place_m: (B, V, 2) last positions, relative to the ego's.
+        velocity: (B, V, 2) m per tick.
+    """
+
+    features: Tensor
+    place_m: Tensor
+    velocity: Tensor
+
+
+def describe_vehicles(observed: ObservedScene[Tensor], ticks: int, rate_hz: float) -> Vehicles:
+    """Positions of H ticks as last position, velocity and deviations from it: the same numbers, told apart.
+
+    Where a vehicle is, how fast it goes and how that changed differ by orders of magnitude (100 m, 5 m a tick, 0.1 m),
+    and a layer on the plain positions would have to learn their differences first. Nothing is lost where history is
+    known: position at tick -k = place - k velocity + deviation.
+
+    A velocity is the displacement over the last `ticks` ticks, or over as many of them as are known. A vehicle of
+    which only the last position is known is taken to go with its scene: the mean velocity of those that have one.
+
+    Args:
+        observed: the scenes; only what its masks call known is looked at.
+        ticks: of history that velocities are taken from.
+        rate_hz: ticks a second.
+    """
+    there = observed.vehicle_mask
+    known = observed.history_mask & there[..., None]  # (B, V, H)
+    history = observed.history.masked_fill(~known[..., None], 0.0)
+    place_m = history[..., -1, :]
+    velocity = _find_velocities(history, known, ticks).masked_fill(~there[..., None], 0.0)
+
+    back = torch.arange(1 - history.shape[2], 1, device=history.device, dtype=history.dtype)
+    straight = place_m[..., None, :] + velocity[..., None, :] * back[:, None]  # (B, V, H, 2)
+    deviation = (history - straight).masked_fill(~known[..., None], 0.0)
+    features = torch.cat(
+        [
+            place_m / history.new_tensor(PLACE_SCALE_M),
+            velocity * rate_hz / history.new_tensor(SPEED_SCALE_MPS),
+            (deviation / history.new_tensor(DEVIATION_SCALE_M)).flatten(start_dim=2),
+            known.to(history.dtype),
+            observed.size_m.masked_fill(~there[..., None], 0.0) / history.new_tensor(SIZE_SCALE_M),
+        ],
+        dim=-1,
+    )
+    return Vehicles(features, place_m, velocity)
+
+
+def _find_velocities(history: Tensor, known: Tensor, ticks: int) -> Tensor:
+    """(B, V, H, 2), (B, V, H) -> (B, V, 2) m per tick."""
+    steps = known[..., -1 - ticks : -1].sum(dim=-1)  # (B, V): known ticks are the last ones, without a gap
+    begin = (history.shape[2] - 1 - steps)[..., None, None].expand(-1, -1, 1, 2)
+    moved = history[..., -1, :] - history.gather(2, begin)[..., 0, :]
+    has = (steps > 0)[..., None]
+    own = moved / steps.clamp(min=1)[..., None]
+    mean = (own * has).sum(dim=1, keepdim=True) / has.sum(dim=1, keepdim=True).clamp(min=1)
+    return torch.where(has, own, mean)
+
+
+def describe_lanes(observed: ObservedScene[Tensor]) -> tuple[Tensor, Tensor]:
+    """(B, 3, 3) offset, width and existence as inputs, and (B, 3) which lanes exist; all 0 where one does not."""
+    exists = observed.lanes[..., 2] > 0
+    scale = observed.lanes.new_tensor([LANE_SCALE_M, LANE_SCALE_M, 1.0])
+    return (observed.lanes / scale).masked_fill(~exists[..., None], 0.0), exists

@@ -1,0 +1,44 @@
+"""Stacked LSTM: two layers over the history, and a linear layer to all places ahead at once."""
+
+from torch import Tensor, nn
+
+from schemas.protocols import Protocol
+from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from training.models.straight import Straight
+from training.observed import Observed, Truth
+from training.prediction import Prediction
+
+
+class StackedLstm(Network):
+    """Reads H positions in m, and puts out F places from its last state.
+
+    The plainest recurrent network that Choi et al. 2021 compare with; the width of 128 is ours.
+    """
+
+    def __init__(self, protocol: Protocol, *, hidden: int = 128, residual: bool = True) -> None:
+        """Prepare for a protocol's rate, history and horizon.
+
+        Args:
+            protocol: gives H and F.
+            hidden: width of both layers.
+            residual: places are counted from constant velocity, see `training.models.straight`.
+        """
+        super().__init__()
+        self.straight = Straight(protocol, residual=residual)
+        self.encoder = nn.LSTM(2, hidden, num_layers=2, batch_first=True)
+        self.out = nn.Linear(hidden, protocol.horizon_ticks * 2)
+
+    def forward(self, history: Tensor) -> Tensor:
+        """(B, H, 2) -> (B, F, 2) positions in m relative to the sample's last one."""
+        _, (state, _) = self.encoder(history)
+        places: Tensor = self.straight(history) + self.out(state[-1]).unflatten(-1, (-1, 2))  # (B, F, 2)
+        return places
+
+    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
+        """() mean squared distance in m2; the only phase is `mse`."""
+        check_phase(phase, "mse")
+        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
+
+    def say(self, observed: Observed[Tensor]) -> Prediction:
+        """Places only."""
+        return Prediction(position_m=to_numpy(self(observed.history)))
