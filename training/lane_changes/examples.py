@@ -1,0 +1,149 @@
+"""Examples of keeping and changing lanes: which samples they are, their strata, features and classes."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from training.augmentation import SWAPPED
+from training.batches import Bytes, Floats, Integers
+from training.lane_changes.cells import find_columns
+from training.lane_changes.features import describe_targets, mirror_targets, shift_targets
+from training.lane_changes.labels import KEEP, LEFT, RIGHT, find_judged, find_maneuvers, label_rows
+from training.lane_changes.settings import LaneForestSettings
+from training.reading import NEAREST
+from training.surroundings import gather_surroundings
+from training.tensors import TensorFolder
+
+STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
+"""Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: by the label."""
+SPEED_CHANGE_S = 1.0
+READ_AT_ONCE = 4096
+"""Samples; their scenes are some 20 MB."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Samples of one part whose maneuver is known. B samples.
+
+    Args:
+        sample: (B,) numbers, increasing.
+        maneuver: (B,) position in `schemas.columns.LATERAL_MANEUVERS`; from the future.
+        stratum: (B,) position in STRATA; likewise.
+        left_out: samples of the part too near to their track's end to be known.
+        changes: lane changes in the whole folder.
+    """
+
+    sample: Integers
+    maneuver: Bytes
+    stratum: Bytes
+    left_out: int
+    changes: int
+
+    def take(self, which: npt.NDArray[np.integer]) -> "Judged":
+        """Some of them."""
+        return replace(self, sample=self.sample[which], maneuver=self.maneuver[which], stratum=self.stratum[which])
+
+    def count_strata(self) -> npt.NDArray[np.intp]:
+        """(4,) samples of each."""
+        return np.bincount(self.stratum, minlength=len(STRATA))
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What a forest learns from and is scored on. B examples, T horizons.
+
+    Args:
+        feature: (B, features) in the order of `features.FEATURES`.
+        maneuver: (B,) position in `schemas.columns.LATERAL_MANEUVERS`.
+        ahead: (B, T) in which lane the vehicle is at each horizon, as seen from its lane now, in the same codes: keep,
+            left, right; two lanes away counts as one.
+    """
+
+    feature: Floats
+    maneuver: Bytes
+    ahead: Bytes
+
+    def __len__(self) -> int:
+        """B."""
+        return len(self.feature)
+
+    def take(self, which: npt.NDArray[np.integer]) -> "Examples":
+        """Some of them."""
+        return Examples(self.feature[which], self.maneuver[which], self.ahead[which])
+
+    def mirror(self) -> "Examples":
+        """The same on a road mirrored sideways: left is right, in features and classes."""
+        swapped = SWAPPED.astype(np.uint8)
+        return Examples(mirror_targets(self.feature), swapped[self.maneuver], swapped[self.ahead])
+
+    def shift(self, shift_m: Floats) -> "Examples":
+        """The same with each ego so much further behind (B,); classes stay."""
+        return replace(self, feature=shift_targets(self.feature, shift_m))
+
+
+def judge_samples(folder: TensorFolder, part: str, settings: LaneForestSettings) -> Judged:
+    """The samples of a part whose maneuver and whose whole future are known, with their strata.
+
+    Raises:
+        ValueError: no such part.
+    """
+    maneuvers = find_maneuvers(folder, start_s=settings.start_s, tolerance_m=settings.tolerance_m)
+    everything = folder.samples_of(part)
+    row = folder.sample_row[everything].astype(np.intp)
+    judged = find_judged(folder, row, start_s=settings.start_s) & (folder.lane[row] > 0)
+    judged &= folder.sample_future[everything] >= folder.protocol.horizon_ticks
+    sample, row = everything[judged], row[judged]
+    maneuver = label_rows(folder, maneuvers)[row]
+    back = min(round(SPEED_CHANGE_S * folder.protocol.rate_hz), folder.protocol.history_ticks - 1)
+    slower = folder.speed_mps[row] < folder.speed_mps[row - back]
+    stratum = (2 * slower + (maneuver != KEEP)).astype(np.uint8)
+    return Judged(sample, maneuver, stratum, len(everything) - len(sample), len(maneuvers.end_row))
+
+
+def gather_examples(folder: TensorFolder, judged: Judged) -> Examples:
+    """Read the features and classes of samples, some thousands at a time."""
+    ticks = np.array(folder.protocol.scored_ticks, dtype=np.intp) - 1
+    feature, ahead = [], []
+    for start in range(0, max(1, len(judged.sample)), READ_AT_ONCE):
+        numbers = judged.sample[start : start + READ_AT_ONCE]
+        scene, truth = gather_surroundings(folder, numbers, nearest=NEAREST)
+        feature.append(describe_targets(scene, folder.protocol.rate_hz))
+        ahead.append(name_columns(find_columns(truth.future[:, 0, ticks, 1], scene.lanes)))
+    return Examples(np.concatenate(feature), judged.maneuver, np.concatenate(ahead))
+
+
+def name_columns(column: npt.NDArray[np.int8]) -> Bytes:
+    """Columns (-2 to 2) in the codes of maneuvers: keep, left, right."""
+    return np.where(column == 0, KEEP, np.where(column < 0, LEFT, RIGHT)).astype(np.uint8)
+
+
+def draw_balanced(stratum: Bytes, most: int, random: np.random.Generator) -> Integers:
+    """Positions of `most` examples at most, increasing: as many of each stratum as there are, and as is its share.
+
+    Each stratum gives a quarter; where one has fewer, the others share what it leaves.
+    """
+    available = np.bincount(stratum, minlength=len(STRATA))
+    quota, left = np.zeros(len(STRATA), dtype=np.intp), most
+    for done, which in enumerate(np.argsort(available, kind="stable")):  # four of them, the smallest first
+        quota[which] = min(available[which], left // (len(STRATA) - done))
+        left -= quota[which]
+    order = random.permutation(len(stratum))
+    order = order[np.argsort(stratum[order], kind="stable")]  # strata one after the other, each in random order
+    place = np.arange(len(order)) - np.repeat(np.cumsum(available) - available, available)
+    return np.sort(order[place < np.repeat(quota, available)])
+
+
+def augment(examples: Examples, settings: LaneForestSettings, random: np.random.Generator) -> Examples:
+    """The examples, followed by a mirrored and a shifted copy of all of them, as the settings ask."""
+    copies = [examples]
+    if "mirror" in settings.augmentation:
+        copies.append(examples.mirror())
+    if "shift" in settings.augmentation:
+        shift_m = random.uniform(-settings.shift_m, settings.shift_m, len(examples)).astype(np.float32)
+        copies.append(examples.shift(shift_m))
+    return Examples(
+        np.concatenate([copy.feature for copy in copies]),
+        np.concatenate([copy.maneuver for copy in copies]),
+        np.concatenate([copy.ahead for copy in copies]),
+    )

@@ -1,0 +1,321 @@
+"""Scores of predicted cells: the column from a model's own place or from the forest, the row from the model's place.
+
+Truth and labels come from the future: they are compared with, and group the scores. What predicts is given samples as
+`training.observed` lets them be seen.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from schemas.columns import LATERAL_MANEUVERS
+from training.batches import Flags, Floats, Integers
+from training.guard import refuse_future
+from training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
+from training.lane_changes.examples import READ_AT_ONCE, STRATA, Judged, judge_samples
+from training.lane_changes.features import NUMBER, describe_targets
+from training.lane_changes.forest import LaneForest, decide
+from training.lane_changes.labels import KEEP, LEFT
+from training.lane_changes.settings import LaneForestSettings
+from training.models import MODELS, Predictor, Reads
+from training.models.constant_velocity import ConstantVelocity
+from training.observed import ObservedScene
+from training.prediction import Prediction
+from training.reading import read_samples, truth_of_ego
+from training.runs import refuse_leak
+from training.tensors import TensorFolder
+
+ALL = "all"
+MOST = 200_000
+"""Samples that are scored at most; where a part has more, so many of them are drawn."""
+
+
+@dataclass(frozen=True)
+class CellScore:
+    """One model at one horizon, over all samples or one stratum. Shares are None where n is 0.
+
+    Args:
+        model: its name.
+        column: where the column comes from: `place`, the model's own, or `forest`.
+        seconds: the horizon.
+        stratum: of `examples.STRATA`, or `all`.
+        n: samples behind each share.
+        cell: share of samples in the cell predicted; a true place outside of the nine is never right.
+        row: likewise of rows alone.
+        lane: likewise of columns alone.
+        cell_clipped: as `cell`, were the outer columns and rows without end.
+        majority: share of the most frequent true cell: what always saying it would reach.
+        own_lane: share of true places in the own column.
+        outside: share of true places outside of the nine cells.
+    """
+
+    model: str
+    column: str
+    seconds: float
+    stratum: str
+    n: int
+    cell: float | None
+    row: float | None
+    lane: float | None
+    cell_clipped: float | None
+    majority: float | None
+    own_lane: float | None
+    outside: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class ManeuverScore:
+    """What the forest says of the maneuver under way, over all samples or one stratum. None: no such sample.
+
+    Args:
+        stratum: as in `CellScore`.
+        n: samples.
+        accuracy: share whose most probable maneuver is the label.
+        recall: the same of the samples of each label.
+        balanced: mean of the recalls there are.
+        majority: share of the most frequent label.
+    """
+
+    stratum: str
+    n: int
+    accuracy: float | None
+    recall: dict[str, float | None]
+    balanced: float | None
+    majority: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class GridScores:
+    """All of it.
+
+    Args:
+        cells: by model, column, horizon and stratum.
+        maneuvers: by stratum.
+        left_out: samples of the part whose maneuver or future is not known to the end.
+    """
+
+    cells: list[CellScore]
+    maneuvers: list[ManeuverScore]
+    left_out: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Columns and rows of S samples at T horizons: (S, T) each."""
+
+    column: Codes
+    row: Codes
+
+    @classmethod
+    def join(cls, pieces: "list[_Cells]") -> "_Cells":
+        return cls(np.concatenate([piece.column for piece in pieces]), np.concatenate([piece.row for piece in pieces]))
+
+
+def evaluate_grid(
+    folder: TensorFolder,
+    predictors: Mapping[str, Predictor],
+    forest: LaneForest,
+    *,
+    part: str = "eval",
+    reads: Mapping[str, Reads] | None = None,
+    most: int = MOST,
+    seed: int = 0,
+) -> GridScores:
+    """Score models by the cell in which they say the vehicle will be, at every horizon that the forest knows.
+
+    Each model is scored twice: with the column of its own place, and with the forest's. Samples are those whose
+    maneuver and whole future are known (`examples.judge_samples`, with the forest's T_d).
+
+    Args:
+        folder: of the protocol that forest and models were made for.
+        predictors: by name.
+        forest: fitted.
+        part: train, val or eval.
+        reads: by name: what each is given. Where a name is missing: what the registry says of it, else `grid`.
+        most: samples at most.
+        seed: of the draw where there are more.
+
+    Raises:
+        FutureInputError: the forest or a model is found to see the future.
+        ValueError: no such part; the forest has learned from subsets of this part; or it was fitted at another rate or
+            for horizons that the folder does not score.
+    """
+    ticks = _find_ticks(folder, forest)
+    refuse_leak(forest.facts, folder, part)
+    given = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
+    known = forest.facts["settings"]
+    settings = LaneForestSettings(start_s=known["start_s"], tolerance_m=known["tolerance_m"])
+    judged = judge_samples(folder, part, settings)
+    left_out = judged.left_out
+    if len(judged.sample) > most:
+        drawn = np.random.default_rng(seed).permutation(len(judged.sample))[:most]
+        judged = judged.take(np.sort(drawn))
+    if len(judged.sample):
+        refuse_future(_Guarded(forest), folder, part, name="lane-forest", reads="scene")
+        for name, predictor in predictors.items():
+            refuse_future(predictor, folder, part, name=name, reads=given[name])
+
+    true: list[_Cells] = []
+    said: dict[tuple[str, str], list[_Cells]] = {(name, by): [] for name in predictors for by in ("place", "forest")}
+    maneuver = [np.empty(0, dtype=np.uint8)]
+    for numbers in _cut(judged.sample):
+        reader = _Reader(folder, numbers)
+        described = describe_targets(reader.see("scene"), forest.rate_hz)
+        decided = decide(forest.predict_proba(described))  # (B, 1 + T)
+        maneuver.append(decided[:, 0])
+        cells = _Grid(reader, described, ticks)
+        true.append(cells.find(reader.future[:, ticks]))
+        forest_column = turn_to_columns(decided[:, 1:])
+        for name, predictor in predictors.items():
+            own = cells.find(predictor.predict(reader.see(given[name])).position_m[:, ticks])
+            said[name, "place"].append(own)
+            said[name, "forest"].append(_Cells(forest_column, own.row))
+    strata = _find_strata(judged)
+    scores = [
+        score
+        for (name, by), pieces in said.items()
+        if pieces
+        for score in _score_cells(name, by, _Cells.join(pieces), _Cells.join(true), forest.horizons_s, strata)
+    ]
+    decided_all = np.concatenate(maneuver)
+    maneuvers = [score_maneuvers(name, decided_all[of], judged.maneuver[of]) for name, of in strata.items()]
+    return GridScores(scores, maneuvers, left_out)
+
+
+class _Guarded:
+    """A forest as the guard asks: what it says of the maneuver and of the lanes ahead, in one array."""
+
+    def __init__(self, forest: LaneForest) -> None:
+        self._forest = forest
+
+    def predict(self, observed: ObservedScene[Any]) -> Prediction:
+        odds = self._forest.predict(observed)
+        return Prediction(position_m=np.zeros((len(odds), 0, 2), np.float32), lateral=odds.reshape(len(odds), -1))
+
+
+class _Reader:
+    """Some samples, read as `grid` or `scene` once each."""
+
+    def __init__(self, folder: TensorFolder, numbers: Integers) -> None:
+        self._folder, self._numbers, self._seen = folder, numbers, dict[Reads, Any]()
+        self.see("scene")
+        self.see("grid")
+
+    def see(self, reads: Reads) -> Any:  # noqa: ANN401  (Observed or ObservedScene)
+        if reads not in self._seen:
+            self._seen[reads], truth = read_samples(self._folder, self._numbers, reads)
+            self.future: Floats = truth_of_ego(truth).future
+        return self._seen[reads]
+
+    @property
+    def protocol(self) -> Any:  # noqa: ANN401  (schemas.protocols.Protocol)
+        return self._folder.protocol
+
+
+class _Grid:
+    """The nine cells of some samples at T horizons; made of what is seen of them."""
+
+    def __init__(self, reader: _Reader, described: Floats, ticks: npt.NDArray[np.intp]) -> None:
+        straight = ConstantVelocity(reader.protocol).predict(reader.see("grid"))
+        self._middle_m = straight.position_m[:, ticks, 0]
+        self._lanes = reader.see("scene").lanes
+        self._length_m = measure_rows(described[:, NUMBER["relative_speed_mps"]], described[:, NUMBER["ego"]])
+
+    def find(self, place_m: Floats) -> _Cells:
+        """The cells of places (B, T, 2)."""
+        return _Cells(
+            find_columns(place_m[..., 1], self._lanes), find_rows(place_m[..., 0], self._middle_m, self._length_m)
+        )
+
+
+def turn_to_columns(lateral: npt.NDArray[np.uint8]) -> Codes:
+    """Columns of LATERAL_MANEUVERS' codes, any shape: keep is 0, left -1, right 1."""
+    return np.where(lateral == KEEP, 0, np.where(lateral == LEFT, -1, 1)).astype(np.int8)
+
+
+def score_maneuvers(stratum: str, decided: npt.NDArray[np.uint8], label: npt.NDArray[np.uint8]) -> ManeuverScore:
+    """Maneuvers said (B,) beside labels (B,)."""
+    right, classes = decided == label, range(len(LATERAL_MANEUVERS))
+    recall = {LATERAL_MANEUVERS[which]: _share(right[label == which]) for which in classes}
+    found = [share for share in recall.values() if share is not None]
+    return ManeuverScore(
+        stratum=stratum,
+        n=len(label),
+        accuracy=_share(right),
+        recall=recall,
+        balanced=sum(found) / len(found) if found else None,
+        majority=max((share for which in classes if (share := _share(label == which)) is not None), default=None),
+    )
+
+
+def _score_cells(
+    model: str, by: str, said: _Cells, true: _Cells, horizons_s: tuple[float, ...], strata: Mapping[str, Flags]
+) -> Iterator[CellScore]:
+    """One row for each horizon and stratum."""
+    true_cell = number_cells(true.column, true.row)
+    row, lane = ((a == b) & (np.abs(b) < OUTSIDE) for a, b in ((said.row, true.row), (said.column, true.column)))
+    clipped = (_clip(said.row) == _clip(true.row)) & (_clip(said.column) == _clip(true.column))
+    for horizon, seconds in enumerate(horizons_s):
+        for stratum, of in strata.items():
+            cells = true_cell[of, horizon]
+            inside = np.bincount(cells[cells >= 0], minlength=9)
+            yield CellScore(
+                model=model,
+                column=by,
+                seconds=seconds,
+                stratum=stratum,
+                n=len(cells),
+                cell=_share((row & lane)[of, horizon]),
+                row=_share(row[of, horizon]),
+                lane=_share(lane[of, horizon]),
+                cell_clipped=_share(clipped[of, horizon]),
+                majority=int(inside.max()) / len(cells) if len(cells) else None,
+                own_lane=_share(true.column[of, horizon] == 0),
+                outside=_share(cells < 0),
+            )
+
+
+def _clip(codes: Codes) -> Codes:
+    return np.clip(codes, -1, 1)
+
+
+def _share(flags: Flags) -> float | None:
+    return float(flags.mean()) if len(flags) else None
+
+
+def _find_strata(judged: Judged) -> dict[str, Flags]:
+    """Which samples are of each stratum; all of them first."""
+    everything = np.ones(len(judged.sample), dtype=np.bool_)
+    return {ALL: everything} | {name: judged.stratum == number for number, name in enumerate(STRATA)}
+
+
+def _cut(numbers: Integers) -> Iterator[Integers]:
+    for start in range(0, len(numbers), READ_AT_ONCE):
+        yield numbers[start : start + READ_AT_ONCE]
+
+
+def _find_ticks(folder: TensorFolder, forest: LaneForest) -> npt.NDArray[np.intp]:
+    """(T,) positions of the forest's horizons in futures."""
+    protocol = folder.protocol
+    scored = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
+    if forest.rate_hz != protocol.rate_hz or not set(forest.horizons_s) <= set(scored):
+        raise ValueError(
+            f"the forest was fitted at {forest.rate_hz} Hz for horizons of {forest.horizons_s} s; {folder.path} is of "
+            f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
+        )
+    return np.round(np.array(forest.horizons_s) * protocol.rate_hz).astype(np.intp) - 1

@@ -1,0 +1,50 @@
+"""What can be set of a lane-change forest; each value stands in the stored forest."""
+
+from dataclasses import dataclass
+
+from training.lane_changes.labels import START_S, TOLERANCE_M
+
+AUGMENTATIONS = ("mirror", "shift")
+
+
+@dataclass(frozen=True)
+class LaneForestSettings:
+    """How examples are labelled, drawn and learned from.
+
+    Args:
+        start_s: T_d, how long before its end a maneuver begins; the publication gives none.
+        tolerance_m: how near a lane's centre has reached it.
+        examples: drawn from the training part at most, before augmentation.
+        augmentation: of AUGMENTATIONS; each adds a copy of the examples, mirrored or with the ego shifted.
+        shift_m: egos are shifted by up to this, either way.
+        trees: in the forest.
+        leaf: examples that a leaf holds at least.
+        least_correlation: features that correlate less with every class are left out.
+        most_correlation: of two features that correlate more, the one that says less of the classes is left out.
+    """
+
+    start_s: float = START_S
+    tolerance_m: float = TOLERANCE_M
+    examples: int = 10_000
+    augmentation: tuple[str, ...] = AUGMENTATIONS
+    shift_m: float = 5.0
+    trees: int = 100
+    leaf: int = 20
+    least_correlation: float = 0.05
+    most_correlation: float = 0.95
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ValueError: saying what.
+        """
+        unknown = sorted(set(self.augmentation) - set(AUGMENTATIONS))
+        if unknown:
+            raise ValueError(f"augmentation is of {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
+        for name in ("start_s", "examples", "trees", "leaf"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
+        for name in ("tolerance_m", "shift_m", "least_correlation", "most_correlation"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
