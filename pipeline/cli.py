@@ -1,14 +1,13 @@
 """The command line. Heavy libraries are imported inside the commands, so that help answers at once."""
 
 import os
-import re
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pipeline import planning
+from pipeline import evaluating, lane_forest, planning, predicting, training_command
 from pipeline.allocation import keep_freed_memory
 from pipeline.export.commands import app as export_app
 from pipeline.generated import provide_sample, refuse_mixing, write_generated
@@ -64,6 +63,7 @@ def run(
     ] = None,
     lake: LakeOption = None,
     dataset: DatasetOption = None,
+    protocol: ProtocolOption = None,
     workers: WorkersOption = None,
     replace: ReplaceOption = False,
     prune: PruneOption = False,
@@ -77,7 +77,7 @@ def run(
     from pipeline.work import ALL_STEPS
 
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers)
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
         if source is None:
             if prune or rebuild:
                 raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
@@ -139,12 +139,13 @@ def _add_stage(name: str, meaning: str) -> None:
 
     def stage(
         lake: LakeOption = None,
+        protocol: ProtocolOption = None,
         workers: WorkersOption = None,
         quiet: QuietOption = False,
         json: JsonOption = False,
     ) -> None:
         with command(quiet=quiet, json=json) as terminal:
-            settings = read_settings(lake=lake, workers=workers)
+            settings = read_settings(lake=lake, workers=workers, protocol=protocol)
             outcome = carry_out(terminal, settings, (name,))
             conclude(terminal, settings, outcome, headline=False)
 
@@ -192,6 +193,7 @@ def report(
     compare: Annotated[
         Path | None, typer.Option("--compare", metavar="OTHER_LAKE", help="Also show what differs from this lake.")
     ] = None,
+    protocol: ProtocolOption = None,
     workers: WorkersOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -202,7 +204,7 @@ def report(
             from pipeline.lake import load
 
             load(compare)  # raises where there is no lake, before any work is done
-        settings = read_settings(lake=lake, workers=workers)
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
         conclude(terminal, settings, carry_out(terminal, settings, ("report",)), compare=compare)
 
 
@@ -233,83 +235,10 @@ def sql(
                 write_result(relation, format, out, terminal)
 
 
-@app.command()
-def train(
-    model: Annotated[str, typer.Argument(help="A model's name, for instance lstm.")],
-    lake: LakeOption = None,
-    protocol: ProtocolOption = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="How long to train.")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed", help="Of weights and batches.")] = 0,
-    name: Annotated[str | None, typer.Option("--name", help="Name of the run; default: the model's.")] = None,
-    quiet: QuietOption = False,
-    json: JsonOption = False,
-) -> None:
-    """Train a model on the split's training part and evaluate it once on the evaluation part."""
-    with command(quiet=quiet, json=json) as terminal:
-        from pipeline.lake import load
-        from pipeline.lake.files import MODELS
-        from pipeline.stages.score import BASELINE
-        from pipeline.stages.tensors import tensor_folder
-        from pipeline.terminal import show_scores
-        from training.models import MODELS as MODELS_KNOWN
-        from training.train import TrainConfig
-        from training.train import train as train_model
-
-        settings = read_settings(lake=lake, protocol=protocol)
-        root = settings.lake
-        run_name = model if name is None else name
-        if model not in MODELS_KNOWN:
-            raise typer.BadParameter(f"MODEL is one of {', '.join(MODELS_KNOWN)}; got {model!r}")
-        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", run_name):
-            raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {run_name!r}")
-        if run_name == BASELINE:
-            raise typer.BadParameter(f"{BASELINE} does not learn; `tracklake evaluate` scores it")
-        tensors = tensor_folder(root, load(root), settings)
-        out = root / MODELS / run_name
-        with terminal.measuring(f"train {model}") as tell:
-            metrics = train_model(model, tensors, out, TrainConfig(seconds=seconds, seed=seed), tell)
-        if metrics["evaluation"] is not None:
-            show_scores(terminal, [metrics["evaluation"]])
-        terminal.say(f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report")
-        terminal.give(metrics)
-
-
-@app.command()
-def evaluate(
-    runs: Annotated[list[str] | None, typer.Argument(help="Runs or models; none: all runs in the lake.")] = None,
-    lake: LakeOption = None,
-    part: Annotated[str, typer.Option("--part", help="train, val or eval.")] = "eval",
-    protocol: ProtocolOption = None,
-    quiet: QuietOption = False,
-    json: JsonOption = False,
-) -> None:
-    """RMSE at 1 to 5 s with the number of samples behind each."""
-    with command(quiet=quiet, json=json) as terminal:
-        from pipeline.lake import load
-        from pipeline.lake.files import MODELS
-        from pipeline.stages.score import BASELINE, finished_runs
-        from pipeline.stages.tensors import tensor_folder
-        from pipeline.terminal import show_scores
-        from schemas.columns import PARTS
-        from training.evaluate import evaluate as evaluate_model
-        from training.runs import StaleRunError
-
-        if part not in PARTS:
-            raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
-        settings = read_settings(lake=lake, protocol=protocol)
-        root = settings.lake
-        tensors = tensor_folder(root, load(root), settings)
-        names = runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))})
-        found = []
-        for name in names:
-            try:
-                found.append(evaluate_model(name, tensors, root / MODELS, part).to_dict())
-            except StaleRunError as stale:
-                if runs:
-                    raise
-                terminal.complain(str(stale), label="passed by")
-        show_scores(terminal, found)
-        terminal.give({"evaluations": found})
+app.command()(training_command.train)
+app.command()(evaluating.evaluate)
+app.command()(predicting.predict)
+app.command()(lane_forest.lane_forest)
 
 
 @app.command()

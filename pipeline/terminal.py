@@ -75,14 +75,14 @@ class Terminal:
 
     @contextmanager
     def measuring(self, title: str) -> Iterator[Callable[[float, float], None]]:
-        """Show one bar that is told the share done (0 to 1) and the loss in m2."""
+        """Show one bar that is told the share done (0 to 1) and the loss."""
         if not self.talks:
             yield lambda _share, _loss: None
             return
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
         with Progress(*columns, TextColumn("[dim]{task.fields[loss]}"), console=self.err) as progress:
             bar = progress.add_task(escape(title), total=1.0, loss="")
-            yield lambda share, loss: progress.update(bar, completed=share, loss=f"loss {loss:.3f} m2")
+            yield lambda share, loss: progress.update(bar, completed=share, loss=f"loss {loss:.3f}")
 
 
 class _Bars:
@@ -130,18 +130,22 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     }
     for score in quality["model_scores"]:
         rmse = "  ".join(
-            f"{row['seconds']} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
+            f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
         )
-        lines[f"RMSE, m ({score['model']})"] = f"{rmse}  (n = {score['rows'][0]['n']:,} at 1 s)"
+        lines[f"RMSE, m ({score['model']})"] = (
+            f"{rmse}  (n = {score['rows'][0]['n']:,} at {score['rows'][0]['seconds']:g} s)"
+        )
     width = max(map(len, lines)) + 2
     for name, value in lines.items():
         terminal.say(f"{name:<{width}}{value}")
     terminal.say(f"{'report':<{width}}{report.resolve()}", style="bold green")
     at = "" if lake == Path("lake") else f" --lake {lake}"
+    protocol = quality["provenance"]["protocol"]["name"]
+    of = "" if protocol == "csp" else f" --protocol {protocol}"
     terminal.say("\nTry next:")
     command = command_here()
     terminal.say(f'  {command} sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{at}')
-    terminal.say(f"  {command} train lstm{at}" if head["samples"] else f'  {command} sql "FROM subsets"{at}')
+    terminal.say(f"  {command} train lstm{at}{of}" if head["samples"] else f'  {command} sql "FROM subsets"{at}')
 
 
 def command_here() -> str:
@@ -210,6 +214,6 @@ def show_scores(terminal: Terminal, evaluations: Sequence[dict[str, Any]]) -> No
         for row in evaluation["horizons"]:
             values = [row[name] for name in ("rmse_m", "rmse_longitudinal_m", "rmse_lateral_m", "mae_m")]
             shown = ["-" if value is None else f"{value:.2f}" for value in values]
-            table.add_row(f"{row['seconds']} s", *shown, f"{row['n']:,}")
+            table.add_row(f"{row['seconds']:g} s", *shown, f"{row['n']:,}")
         if terminal.talks:
             terminal.out.print(table)

@@ -263,13 +263,13 @@ def test_a_model_trains_and_every_run_is_evaluated(command, lake):
     trained = command("train", "lstm", "--lake", lake.root, "--seconds", "3", "--json")
     assert trained.code == 0, trained.err
     metrics = json.loads(trained.out)
-    assert metrics["loss_last_m2"] < metrics["loss_first_m2"]
+    assert metrics["phases"][0]["loss_last"] < metrics["phases"][0]["loss_first"]
     scored = command("evaluate", "--lake", lake.root)
     assert scored.code == 0, scored.err
-    assert "lstm on eval" in scored.out
-    assert "constant-velocity on eval" in scored.out
-    for seconds in range(1, 6):
-        assert f"{seconds} s" in scored.out
+    for shown in ("constant-velocity ", "lstm ", *(f"{seconds} s" for seconds in range(1, 6))):
+        assert shown in scored.out
+    table = pl.read_csv(lake.root / "evaluations" / "csp.csv").filter(origin="measured")
+    assert set(table["model"]) == {"constant-velocity", "lstm"}
 
 
 def test_dask_workers_make_the_same_lake(command, sample, sql, tmp_path):

@@ -11,7 +11,7 @@ from pipeline.stages import tensors
 from pipeline.stages.base import Job, make_entry, make_job, upstream
 from pipeline.stages.tensors import tensor_folder
 
-VERSION = 1
+VERSION = 2
 BASELINE = "constant-velocity"
 
 
