@@ -48,6 +48,7 @@ docs: install
 	$(BIN)/python -m schemas.markdown > docs/tables.md
 	$(BIN)/python -m schemas.tensors_markdown > docs/tensors.md
 	$(BIN)/python -m schemas.protocols_markdown > docs/protocols.md
+	$(BIN)/python -m training.models_markdown > docs/models.md
 	$(BIN)/python -m quality_reports.markdown > docs/rules.md
 
 clean:

@@ -12,6 +12,7 @@ from quality_reports.markdown import write_rules
 from quality_reports.rules import RULES
 from schemas import TABLES
 from schemas.markdown import write_tables
+from training.models_markdown import write_models
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -55,6 +56,10 @@ def test_the_page_of_rules_is_current():
     for rule in RULES:
         assert f"## {rule.name}\n" in page
         assert all(f"`{threshold.name}` = " in page for threshold in rule.thresholds)
+
+
+def test_the_page_of_models_is_current():
+    assert (ROOT / "docs" / "models.md").read_text() == write_models(), "run `make docs`"
 
 
 def test_links_lead_somewhere():

