@@ -25,8 +25,7 @@ VEHICLE_HEAD_WIDTH, LANE_HEAD_WIDTH = 8, 32
 EPSILON = 1e-6
 """Of the layer normalisation."""
 DROPOUT = 0.7
-"""Probability of dropping, as published. Read as the share that is kept (a dropout of 0.3) it made little difference in
-short trials: RMSE after 5 s on generated traffic 2.95 and 3.03 m instead of 3.00 and 3.17 (two seeds, 2,000 steps)."""
+"""Probability of dropping, see `SceneAttention` for how the publication's number is read."""
 
 Gaussian = tuple[Tensor, Tensor, Tensor]
 
@@ -80,9 +79,9 @@ class SceneAttention(Network):
 
     * The weights of the loss, both 1: nats and metres are then of the same order.
     * How an embedding is made from positions, and places from the decoder's output: one hidden layer each.
-    * Whether 0.7 is dropped or kept: kept. On simulated recordings (4 heads, 2,000 steps of 128 scenes, two seeds) RMSE
-      of the samples themselves at 5 s is 2.95 and 3.03 m as against 3.00 and 3.17 m with 0.7 dropped, NLL 0.70 and 0.73
-      as against 0.73 and 0.74 nats; constant velocity has 3.43 m.
+    * Whether 0.7 is dropped or kept: dropped. On simulated recordings (4 heads, 2,000 steps of 128 scenes, two seeds)
+      RMSE of the samples themselves at 5 s is then 3.00 and 3.17 m as against 2.95 and 3.03 m with 0.7 kept, NLL 0.73
+      and 0.74 as against 0.70 and 0.73 nats; constant velocity has 3.43 m. `dropout` = 0.3 is the other reading.
 
     What differs: positions are told as last position, velocity and deviations (`training.models.scene_features`), and
     means are counted from every vehicle's own constant velocity unless `residual` is False; an untrained network then
