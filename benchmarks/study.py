@@ -103,7 +103,7 @@ def learn(arm: Arm, learner: Learner, seed: int, lake: Path, options: argparse.N
     samples = max(1, round(options.samples_per_epoch * learner.share))
     where = ("--lake", lake, "--protocol", arm.protocol, "--name", name)
     how = ("--seed", seed, "--samples-per-epoch", samples, "--threads", 1)
-    begun = any((lake / "models").glob(f"{name}/checkpoint*")) or any((lake / "models").glob(f".{name}*checkpoint*"))
+    begun = (lake / "models" / f".{name}.unfinished" / "checkpoint.pt").exists()
     run("train", learner.model, *where, *how, *settings, *(["--resume"] if begun else []), environment=arm.environment)
 
 
