@@ -1,7 +1,7 @@
 """The page's part on the lane-change forest: right cells and maneuvers, over seeds, and the learning curve."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,98 +9,128 @@ import polars as pl
 from study_tables import grid, show
 
 FOREST_SCORES = "lane_forest-seed{seed}.json"
+SHARES = {
+    "cell": "Right cell of nine, share",
+    "cell_clipped": "Right cell where the outer rows and columns have no end",
+    "lane": "Right column",
+    "row": "Right row",
+}
+ALL = "all"
 
 
 def describe_forest(lake: Path) -> str:
     """Tables of an arm's forests."""
     files = sorted(lake.glob(FOREST_SCORES.format(seed="*")))
-    records = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-    cells = _over_seeds([own["cells"] for own in records], ("model", "column", "stratum", "seconds"))
-    maneuvers = _over_seeds([own["maneuvers"] for own in records], ("stratum",), drop=("recall",))
-    curve = [own for record in records for own in record["learning_curve"]]
+    records = {int(file.stem.rpartition("seed")[2]): json.loads(file.read_text(encoding="utf-8")) for file in files}
+    cells = summarise_cells({seed: own["cells"] for seed, own in records.items()})
+    maneuvers = summarise_maneuvers([own["maneuvers"] for own in records.values()])
+    first = next(iter(records.values()))
     parts = [
         "### Lane-change forest and grid",
-        f"Features, the strongest first: {', '.join(f'`{name}`' for name in records[0]['features'])}.",
-        f"Right cell of nine, share, by horizon:\n\n{_lay_out_cells(cells)}",
-        f"Right cell at the last horizon, by stratum:\n\n{_lay_out_strata(cells)}",
-        "Maneuver under way said right by the forest, and always the commonest one:\n\n"
-        + _lay_out_maneuvers(maneuvers),
+        "`+ forest`: the column is the forest's, of the same seed as the run; else it is that of the predicted place.",
+        f"Features, the strongest first: {', '.join(f'`{name}`' for name in first['features'])}.",
+        *(f"{title}, by horizon:\n\n{lay_out_cells(cells, figure)}" for figure, title in SHARES.items()),
+        f"Right cell at the last horizon, by stratum:\n\n{lay_out_strata(cells)}",
+        f"Maneuver under way, as the forest says it:\n\n{lay_out_maneuvers(maneuvers)}",
     ]
+    curve = [own for record in records.values() for own in record["learning_curve"]]
     if curve:
-        parts.append(f"Learning curve, evaluation recordings, mean over its seeds:\n\n{_lay_out_curve(curve)}")
+        parts.append(f"Learning curve, on the evaluation recordings, mean over its seeds:\n\n{lay_out_curve(curve)}")
     return "\n\n".join(parts)
 
 
-def _over_seeds(records: Sequence[list[dict[str, Any]]], keys: Sequence[str], drop: Sequence[str] = ()) -> pl.DataFrame:
-    """Mean and spread of the figures over forests; a run's own seed is one of them."""
-    rows = pl.concat(pl.DataFrame([{k: v for k, v in row.items() if k not in drop} for row in own]) for own in records)
-    if "model" in rows.columns:
-        rows = rows.with_columns(pl.col("model").str.replace(r"-seed\d+$", ""))
-    figures = [name for name in rows.columns if name not in keys]
-    return rows.group_by(keys, maintain_order=True).agg(
+def summarise_cells(records: Mapping[int, list[dict[str, Any]]]) -> pl.DataFrame:
+    """Mean and spread over seeds, one forest and one run each.
+
+    Places do not depend on the forest: of a run, one forest's rows are taken; where a column is the forest's, those of
+    the forest with the run's seed. A model that does not learn is joined with every forest.
+    """
+    keys = ("model", "column", "stratum", "seconds")
+    rows = pl.concat(pl.DataFrame(own).with_columns(forest=pl.lit(seed)) for seed, own in records.items())
+    seed = pl.col("model").str.extract(r"-seed(\d+)$").cast(pl.Int64)
+    paired = (pl.col("forest") == seed) | (seed.is_null() & (pl.col("column") != "place"))
+    alone = seed.is_null() & (pl.col("column") == "place") & (pl.col("forest") == min(records))
+    kept = rows.filter(paired.fill_null(False) | alone).with_columns(pl.col("model").str.replace(r"-seed\d+$", ""))
+    figures = (*SHARES, "majority", "outside", "own_lane")
+    return kept.group_by(keys, maintain_order=True).agg(
+        pl.col("n").first(),
         seeds=pl.len(),
         **{name: pl.col(name).cast(pl.Float64).mean() for name in figures},
         **{f"{name}_sd": pl.col(name).cast(pl.Float64).std() for name in figures},
     )
 
 
-def _lay_out_cells(cells: pl.DataFrame) -> str:
-    everything = cells.filter(pl.col("stratum") == "all")
+def summarise_maneuvers(records: Sequence[list[dict[str, Any]]]) -> pl.DataFrame:
+    """Mean and spread over forests of what they say of maneuvers; recalls stand beside as columns of their own."""
+    flat = [{**row, **{f"of {name}": share for name, share in row["recall"].items()}} for own in records for row in own]
+    rows = pl.DataFrame([{name: value for name, value in row.items() if name != "recall"} for row in flat])
+    figures = [name for name in rows.columns if name not in ("stratum", "n")]
+    return rows.group_by("stratum", maintain_order=True).agg(
+        pl.col("n").first(),
+        seeds=pl.len(),
+        **{name: pl.col(name).cast(pl.Float64).mean() for name in figures},
+        **{f"{name}_sd": pl.col(name).cast(pl.Float64).std() for name in figures},
+    )
+
+
+def lay_out_cells(cells: pl.DataFrame, figure: str) -> str:
+    """Models by horizon; for whole cells, what stands beside them, too."""
+    everything = cells.filter(pl.col("stratum") == ALL)
     seconds = sorted(everything["seconds"].unique())
-    body = []
     lines = everything.select("model", "column").unique(maintain_order=True).rows()
+    body = []
     for model, column in lines:
         own = everything.filter((pl.col("model") == model) & (pl.col("column") == column))
-        body.append([_name(model, column), *(show(own.filter(pl.col("seconds") == at), "cell", 3) for at in seconds)])
+        body.append([name(model, column), *(show(own.filter(pl.col("seconds") == at), figure, 3) for at in seconds)])
     first = everything.filter((pl.col("model") == lines[0][0]) & (pl.col("column") == lines[0][1]))
-    for title, figure in (("always the commonest cell", "majority"), ("true place outside of the nine", "outside")):
-        body.append([title, *(show(first.filter(pl.col("seconds") == at), figure, 3) for at in seconds)])
+    beside = {"always the commonest cell": "majority", "true place outside of the nine": "outside"}
+    for title, other in beside.items() if figure == "cell" else ():
+        body.append([title, *(show(first.filter(pl.col("seconds") == at), other, 3) for at in seconds)])
+    counts = [first.filter(pl.col("seconds") == at)["n"][0] for at in seconds]
+    body.append(["samples", *(f"{count:,}" for count in counts)])
     return grid(["model", *(f"{at:g} s" for at in seconds)], body)
 
 
-def _lay_out_strata(cells: pl.DataFrame) -> str:
+def lay_out_strata(cells: pl.DataFrame) -> str:
+    """Models by stratum."""
     last = cells.filter(pl.col("seconds") == cells["seconds"].max())
     strata = last["stratum"].unique(maintain_order=True).to_list()
-    body = [
-        [
-            _name(model, column),
-            *(
-                show(
-                    last.filter(
-                        (pl.col("model") == model) & (pl.col("column") == column) & (pl.col("stratum") == stratum)
-                    ),
-                    "cell",
-                    3,
-                )
-                for stratum in strata
-            ),
-        ]
-        for model, column in last.select("model", "column").unique(maintain_order=True).rows()
-    ]
+    body = []
+    for model, column in last.select("model", "column").unique(maintain_order=True).rows():
+        own = last.filter((pl.col("model") == model) & (pl.col("column") == column))
+        body.append([name(model, column), *(show(own.filter(pl.col("stratum") == at), "cell", 3) for at in strata)])
+    body.append(["samples", *(f"{last.filter(pl.col('stratum') == at)['n'][0]:,}" for at in strata)])
     return grid(["model", *strata], body)
 
 
-def _lay_out_maneuvers(maneuvers: pl.DataFrame) -> str:
+def lay_out_maneuvers(maneuvers: pl.DataFrame) -> str:
+    """Strata by what is right."""
+    recalls = [column for column in maneuvers.columns if column.startswith("of ") and not column.endswith("_sd")]
     body = []
     for stratum in maneuvers["stratum"].to_list():
         own = maneuvers.filter(pl.col("stratum") == stratum)
-        body.append([stratum, f"{own['n'][0]:,.0f}", show(own, "accuracy", 3), show(own, "majority", 3)])
-    return grid(["stratum", "n", "right", "always the commonest"], body)
+        shown = [show(own, figure, 3) for figure in ("accuracy", "majority", *recalls)]
+        body.append([stratum, f"{own['n'][0]:,}", *shown])
+    return grid(["stratum", "samples", "right", "always the commonest", *recalls], body)
 
 
-def _lay_out_curve(curve: list[dict[str, Any]]) -> str:
+def lay_out_curve(curve: list[dict[str, Any]]) -> str:
+    """Sizes by what is right, with and without augmentation."""
     means = (
         pl.DataFrame(curve)
         .group_by("drawn", "augmented")
-        .agg(pl.col("accuracy", "balanced", "lane").cast(pl.Float64).mean())
+        .agg(pl.len(), pl.col("accuracy", "balanced", "lane").cast(pl.Float64).mean(), pl.col("n").first())
         .sort("drawn", "augmented")
     )
     body = [
-        [f"{drawn:,}", "yes" if augmented else "no", *(f"{value:.3f}" for value in figures)]
-        for drawn, augmented, *figures in means.rows()
+        [f"{drawn:,}", "yes" if augmented else "no", f"{seeds}", *(f"{value:.3f}" for value in figures), f"{n:,}"]
+        for drawn, augmented, seeds, *figures, n in means.rows()
     ]
-    return grid(["examples", "augmented", "maneuver right", "mean recall", "lane right"], body)
+    return grid(
+        ["examples", "augmented", "seeds", "maneuver right", "mean recall", "lane right", "samples scored"], body
+    )
 
 
-def _name(model: str, column: str) -> str:
+def name(model: str, column: str) -> str:
+    """What a line is called."""
     return f"`{model}`" if column == "place" else f"`{model}` + {column}"

@@ -37,6 +37,7 @@ class Arm:
         environment: settings of its lake.
         source: `sample` (generated) or `us-101` (the excerpt, where its path is given).
         forest: whether the lane-change forest and its grid belong to it.
+        scenes: models that are also shown other numbers of vehicles than they were trained with.
     """
 
     name: str
@@ -46,11 +47,15 @@ class Arm:
     environment: dict[str, str] = field(default_factory=dict)
     source: str = "sample"
     forest: bool = False
+    scenes: tuple[str, ...] = ()
 
 
 PLAIN = ("constant-velocity", "kalman-cv", "ctrv")
-SLOW = 0.1
+SLOW = 0.2
 """The encoder-decoder of 256 units takes ten times what the others take."""
+BLOCKS = {"TRACKLAKE_SPLIT": "time-blocks", "TRACKLAKE_SPLITS": '["time-blocks"]', "TRACKLAKE_SPLIT_BLOCK_S": "75"}
+"""Of ten carriageways no two carry the same traffic. Parted as wholes, evaluation would be on traffic that nothing was
+trained on; blocks of time have all kinds in both parts, and do not leak either."""
 
 ARMS = (
     Arm(
@@ -66,6 +71,7 @@ ARMS = (
             Learner("cs-lstm-m"),
             Learner("attention-h4", 0.5),
         ),
+        environment=BLOCKS,
     ),
     Arm(
         "mha-2020",
@@ -74,10 +80,12 @@ ARMS = (
         (
             Learner("v-lstm", 0.5),
             Learner("lstm-encoder-decoder", SLOW),
-            Learner("attention-h2", 0.3),
-            Learner("attention-h4", 0.3),
-            Learner("attention-h8", 0.3),
+            Learner("attention-h2", 0.5),
+            Learner("attention-h4", 0.5),
+            Learner("attention-h8", 0.5),
         ),
+        environment=BLOCKS,
+        scenes=("attention-h4",),
     ),
     Arm(
         "grid-2021",
@@ -91,12 +99,12 @@ ARMS = (
         "csp",
         PLAIN,
         (
-            Learner("lstm", 0.25),
-            Learner("v-lstm", 0.25),
-            Learner("stacked-lstm", 0.25),
+            Learner("lstm", 0.5),
+            Learner("v-lstm", 0.5),
+            Learner("stacked-lstm", 0.5),
             Learner("lstm-encoder-decoder", SLOW / 2),
         ),
-        environment={"TRACKLAKE_SPLIT": "time-blocks", "TRACKLAKE_SPLITS": '["time-blocks"]'},
+        environment={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "120"},
         source="us-101",
     ),
 )
@@ -113,7 +121,7 @@ class Claim:
         worse: than this one.
         figures: columns of the evaluation.
         seconds: at which.
-        equal: whether the same figure within the seeds' spread will do.
+        equal: whether as good will do: no worse in the mean, or better for a seed at least.
     """
 
     text: str
@@ -153,6 +161,14 @@ CLAIMS = (
         "constant-velocity",
         ("rmse_m",),
         (2.0, 3.0, 4.0, 5.0),
+    ),
+    Claim(
+        "Every learned model beats constant velocity at 2 s",
+        "grid-2021",
+        _learners("grid-2021"),
+        "constant-velocity",
+        ("rmse_m",),
+        (2.0,),
     ),
     Claim("CS-LSTM beats V-LSTM", "csp", ("cs-lstm",), "v-lstm", ("rmse_m",), (1.0, 2.0, 3.0, 4.0, 5.0)),
     Claim(

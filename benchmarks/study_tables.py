@@ -4,7 +4,18 @@ from collections.abc import Iterable, Sequence
 
 import polars as pl
 
+from schemas.evaluations import EVERYTHING
 from training.models import MODELS
+
+FEW = 30
+"""Figures over fewer samples are not shown."""
+
+
+def pick(
+    rows: pl.DataFrame, dataset: str = EVERYTHING, group: str = EVERYTHING, average: str = "samples"
+) -> pl.DataFrame:
+    """Rows of one dataset, group and average."""
+    return rows.filter((pl.col("dataset") == dataset) & (pl.col("group") == group) & (pl.col("average") == average))
 
 
 def order(models: Iterable[str]) -> list[str]:
@@ -14,21 +25,15 @@ def order(models: Iterable[str]) -> list[str]:
 
 
 def show(rows: pl.DataFrame, figure: str, digits: int = 2) -> str:
-    """Mean ± spread of the one row; a dash where there is no figure."""
-    if not rows.height or rows[figure][0] is None:
+    """Mean ± spread of the one row; a dash where there is no figure, or one of few samples."""
+    if not rows.height or rows[figure][0] is None or ("n" in rows.columns and rows["n"][0] < FEW):
         return "-"
     mean, spread = rows[figure][0], rows[f"{figure}_sd"][0]
-    return (
-        f"{mean:.{digits}f}" if spread is None or rows["seeds"][0] < 2 else f"{mean:.{digits}f} ± {spread:.{digits}f}"
-    )
+    shown = f"{mean:.{digits}f}"
+    return shown if spread is None or rows["seeds"][0] < 2 else f"{shown} ± {spread:.{digits}f}"
 
 
 def grid(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
-    return "\n".join(
-        [
-            f"| {' | '.join(head)} |",
-            f"| {' | '.join('---' for _ in head)} |",
-            *(f"| {' | '.join(row)} |" for row in body),
-        ]
-    )
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in body)])
