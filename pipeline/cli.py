@@ -238,7 +238,7 @@ def sql(
 app.command()(training_command.train)
 app.command()(evaluating.evaluate)
 app.command()(predicting.predict)
-app.command()(lane_forest.lane_forest)
+app.command("lane-forest")(lane_forest.lane_forest)
 
 
 @app.command()

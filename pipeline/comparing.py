@@ -62,7 +62,10 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
     compared_at = datetime.now(tz=UTC).isoformat(timespec="seconds")
     # That one of them has no report says nothing about what is in the lakes.
     reported = all((lake / REPORTS / DOCUMENT).exists() for lake in (root, other))
-    with _side(other, reported=reported) as then, _side(root, reported=reported, compared=compared_at) as now:
+    with (
+        _side(terminal, other, reported=reported) as then,
+        _side(terminal, root, reported=reported, compared=compared_at) as now,
+    ):
         compared = compare(then, now)
     page = root / REPORTS / COMPARISON
     page.parent.mkdir(exist_ok=True)
@@ -74,7 +77,7 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
 
 
 @contextmanager
-def _side(root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
+def _side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
     manifest = load(root)
     validated = manifest.of_stage("validate")
     with connect(root) as connection:
@@ -83,7 +86,7 @@ def _side(root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
             facts={"lake": root.resolve().name, "lake_id": manifest.lake_id, **facts},
             rules=list(dict.fromkeys(name for entry in validated for name in entry.built_from["rules"])),
             made_with=_made_with(manifest) | ({"report": _cited(root)} if reported else {}),
-            scores=collect_scores(root, manifest),
+            scores=collect_scores(root, manifest, lambda told: terminal.complain(told, label="note")),
         )
 
 

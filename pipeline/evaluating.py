@@ -3,6 +3,7 @@
 Like the other commands, it imports heavy libraries where they are used.
 """
 
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -58,7 +59,8 @@ def evaluate(
 ) -> None:
     """Errors at each horizon of runs and models, with what is behind them, and published figures beside.
 
-    The whole table goes to LAKE/evaluations/<protocol>.csv, or, where RUNS are named or another part, to --out only.
+    The whole table goes to LAKE/evaluations/<protocol>.csv, or, where RUNS are named, another part or another number
+    of vehicles around, to --out only.
     """
     with command(quiet=quiet, json=json) as terminal:
         import polars as pl
@@ -71,6 +73,7 @@ def evaluate(
         from schemas.columns import PARTS
         from schemas.evaluations import EVALUATIONS
         from training.published import published_rows
+        from training.reading import NEAREST
 
         if part not in PARTS:
             raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
@@ -79,9 +82,15 @@ def evaluate(
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         tensors = tensor_folder(root, load(root), settings)
-        names = runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))})
+        around = NEAREST if nearest is None else nearest
+        target = out
+        if out is None and not runs and part == "eval" and around == NEAREST:
+            target = root / FOLDER / f"{settings.get_protocol().name}.csv"
+        if target is not None:
+            target.parent.mkdir(parents=True, exist_ok=True)  # now: what takes long would be lost afterwards
+        names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
         found = _evaluate_all(
-            terminal, names, tensors, root / MODELS, part, nearest, every_tick=every_tick, strict=bool(runs)
+            terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
         )
         measured = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
         table = measured
@@ -91,24 +100,22 @@ def evaluate(
         table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])
-        target = out
-        if out is None and not runs and part == "eval":
-            target = root / FOLDER / f"{settings.get_protocol().name}.csv"
-            target.parent.mkdir(exist_ok=True)
         if target is not None:
             _write(target, table)
             terminal.say(f"table {target}: {table.height:,} rows", style="dim")
+        elif around != NEAREST:
+            terminal.say(f"note: the lake keeps scores of {NEAREST} vehicles around; --out writes these", style="dim")
         rows = table.to_dicts()
         terminal.give({"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target})
 
 
 def _evaluate_all(
     terminal: "Terminal",
-    names: list[str],
+    names: Iterable[str],
     tensors: Path,
     models: Path,
     part: str,
-    nearest: int | None,
+    nearest: int,
     *,
     every_tick: bool,
     strict: bool,
@@ -116,15 +123,13 @@ def _evaluate_all(
     """Score one after the other; runs made for other tensors are passed by, unless they were asked for by name."""
     from training.evaluate import evaluate as evaluate_model
     from training.observed import FutureInputError
-    from training.reading import NEAREST
     from training.runs import StaleRunError
 
-    around = NEAREST if nearest is None else nearest
     found = []
     for name in names:
         try:
             found.append(
-                evaluate_model(name, tensors, models, part, nearest=around, with_latency=True, every_tick=every_tick)
+                evaluate_model(name, tensors, models, part, nearest=nearest, with_latency=True, every_tick=every_tick)
             )
         except StaleRunError as stale:
             if strict:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption
-from pipeline.session import command, read_settings
+from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
+from pipeline.session import REFUSED, command, read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from pipeline.terminal import Terminal
+    from training.lane_changes import LaneForest, LaneForestSettings
     from training.lane_changes.grid import CellScore, GridScores
     from training.lane_changes.learning import LearningPoint
     from training.models import Predictor, Reads
@@ -26,18 +27,30 @@ FOREST, SCORES = "forest.npz", "lane_forest.json"
 """The scores are not called as those of a run: they are of cells, and the report's are of places."""
 MODELS_BESIDE = ("constant-velocity", "ctrv")
 """They need no training."""
+OPTIONS_OF_THEIR_OWN = ("examples", "augmentation")
+"""Settings of a forest that `--set` does not take."""
 
 
 def lane_forest(
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the draw, the shifts and the trees.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Of the draw, the shifts and the trees (default: 0).")
+    ] = None,
     examples: Annotated[
         int | None, typer.Option("--examples", min=4, help="Drawn from the training part at most (default: 10000).")
     ] = None,
     augment: Annotated[
-        bool, typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples.")
-    ] = True,
+        bool | None,
+        typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples (default: do)."),
+    ] = None,
+    settings_given: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Of the forest; repeatable (start_s=3, trees=200, leaf=5)."),
+    ] = None,
+    use: Annotated[
+        bool, typer.Option("--use", help="Score the stored forest, beside the runs there are now; fit none.")
+    ] = False,
     learning_curve: Annotated[
         bool, typer.Option("--learning-curve", help="Also fit fewer examples, with and without augmentation.")
     ] = False,
@@ -49,50 +62,113 @@ def lane_forest(
     Made for the protocol grid-2021; it works with any.
     """
     with command(quiet=quiet, json=json) as terminal:
-        import json as json_text
-        from dataclasses import replace
-
-        from pipeline.lake import load, write_aside
+        from pipeline.lake import load
         from pipeline.lake.files import MODELS
         from pipeline.stages.tensors import tensor_folder
         from training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
         from training.observed import FutureInputError
         from training.tensors import TensorFolder
 
+        if use and (seed, examples, augment, settings_given) != (None,) * 4:
+            raise typer.BadParameter("--use scores a forest as it is: give no --seed, --examples, --augment or --set")
+        asked = _read_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
-        asked = LaneForestSettings()
-        asked = replace(asked, examples=examples or asked.examples, augmentation=asked.augmentation if augment else ())
-        forest = fit_lane_forest(folder, seed, asked)
-        predictors, reads = _find_predictors(terminal, settings.lake / MODELS, folder)
+        out = settings.lake / MODELS / FOLDER
+        if use:
+            forest = _open_forest(out / FOREST, folder)
+            asked = LaneForestSettings.read(forest.facts["settings"])
+        else:
+            forest = fit_lane_forest(folder, seed or 0, asked)
+            out.mkdir(parents=True, exist_ok=True)
+            (out / SCORES).unlink(missing_ok=True)  # of another forest
+            forest.save(out / FOREST)
+        passed_by: dict[str, str] = {}
+
+        def pass_by(name: str, why: str) -> None:
+            passed_by[name] = why
+            terminal.complain(f"{name}: {why}", label="passed by")
+
+        predictors, reads = _find_predictors(settings.lake / MODELS, folder, pass_by)
         try:
-            scores = evaluate_grid(folder, predictors, forest, reads=reads)
+            scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
         except FutureInputError as leak:
             raise ValueError(str(leak)) from leak
-        curve = learn_curve(folder, settings=asked) if learning_curve else []
-
-        out = settings.lake / MODELS / FOLDER
-        out.mkdir(parents=True, exist_ok=True)
-        forest.save(out / FOREST)
         record = {
             "forest": forest.facts,
             "features": list(forest.names),
             **scores.to_dict(),
-            "learning_curve": [point.to_dict() for point in curve],
+            "learning_curve": [],
+            "passed_by": passed_by,
         }
-        write_aside(out / SCORES, json_text.dumps(record, indent=1, allow_nan=False).encode())
-        _show(terminal, folder, scores, curve, forest.names)
+        _write(out / SCORES, record)
+        _show(terminal, folder, scores, forest)
+        no_curve = ""
+        if learning_curve:
+            try:
+                curve = learn_curve(folder, settings=asked)
+            except ValueError as impossible:
+                no_curve = str(impossible)
+            else:
+                record["learning_curve"] = [point.to_dict() for point in curve]
+                _write(out / SCORES, record)
+                _show_curve(terminal, curve)
         terminal.say(f"forest {out / FOREST}; coefficients of all features and scores by stratum: {out / SCORES}")
         terminal.give({"lake": settings.lake, "path": out, **record})
+        if no_curve:
+            terminal.complain(f"{no_curve}. Everything else is done", label="no learning curve")
+            raise typer.Exit(REFUSED)
+
+
+def _read_settings(examples: int | None, augment: bool | None, pairs: list[str]) -> "LaneForestSettings":
+    """What was said of the forest; the rest is as it is by itself."""
+    from dataclasses import asdict
+
+    from training.lane_changes import LaneForestSettings
+
+    known = {name: value for name, value in asdict(LaneForestSettings()).items() if name not in OPTIONS_OF_THEIR_OWN}
+    given = read_pairs(pairs, known, "the forest")
+    if examples is not None:
+        given["examples"] = examples
+    if augment is False:
+        given["augmentation"] = ()
+    try:
+        return LaneForestSettings(**given)
+    except ValueError as wrong:
+        raise typer.BadParameter(f"--set {wrong}") from None
+
+
+def _open_forest(file: Path, folder: "TensorFolder") -> "LaneForest":
+    """A stored forest, for tensors of the protocol that it was fitted for."""
+    from training.lane_changes import ForestError, LaneForest
+
+    forest = LaneForest.load(file)
+    if forest.facts["protocol"] != folder.index["protocol"]:
+        raise ForestError(
+            f"{file}: fitted for another protocol than {folder.protocol.name} ({folder.protocol.digest}), that of the "
+            "tensors; run `tracklake lane-forest` without --use"
+        )
+    return forest
+
+
+def _write(file: Path, record: dict[str, Any]) -> None:
+    import json
+
+    from pipeline.lake import write_aside
+
+    write_aside(file, json.dumps(record, indent=1, allow_nan=False).encode())
 
 
 def _find_predictors(
-    terminal: "Terminal", models: Path, folder: "TensorFolder"
+    models: Path, folder: "TensorFolder", pass_by: "Callable[[str, str], None]"
 ) -> tuple[dict[str, "Predictor"], dict[str, "Reads"]]:
-    """Models that need no training, and the lake's runs that were trained on these tensors, with what each reads."""
+    """Models that need no training, and the lake's runs that were trained on these tensors, with what each reads.
+
+    What cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is passed by.
+    """
     from pipeline.stages.score import finished_runs
     from training.models import MODELS
-    from training.runs import StaleRunError, load_run, refuse_leak
+    from training.runs import load_run, refuse_leak
 
     predictors: dict[str, Predictor] = {name: MODELS[name].build(folder.protocol) for name in MODELS_BESIDE}
     reads = {name: MODELS[name].reads for name in MODELS_BESIDE}
@@ -102,22 +178,16 @@ def _find_predictors(
         try:
             run = load_run(path, folder.protocol)
             refuse_leak(run.config, folder, "eval")
-        except StaleRunError as stale:
-            terminal.complain(str(stale), label="passed by")
+        except (ValueError, OSError, ImportError) as refused:
+            pass_by(path.name, str(refused))
             continue
         predictors[path.name] = run.predictor
         reads[path.name] = MODELS[run.config["model"]].reads
     return predictors, reads
 
 
-def _show(
-    terminal: "Terminal",
-    folder: "TensorFolder",
-    scores: "GridScores",
-    curve: "list[LearningPoint]",
-    features: tuple[str, ...],
-) -> None:
-    """Print cell accuracies by horizon, those of the last by stratum, what the forest says of maneuvers, the curve."""
+def _show(terminal: "Terminal", folder: "TensorFolder", scores: "GridScores", forest: "LaneForest") -> None:
+    """Print cell accuracies by horizon, those of the last by stratum, and what the forest says of maneuvers."""
     protocol = folder.protocol
     terminal.say(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
     _show_cells(terminal, scores.cells, protocol.name)
@@ -127,16 +197,36 @@ def _show(
     ]
     recalls = [f"of {name} %" for name in scores.maneuvers[0].recall]
     _show_table(terminal, "maneuver right", ["n", "all %", *recalls, "always the commonest %"], rows)
-    terminal.say(f"{scores.left_out:,} samples are not scored: what they do is not recorded to the end", style="dim")
-    terminal.say(f"features, the strongest first: {', '.join(features)}", style="dim")
-    if curve:
-        points = [
-            [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_percent, figures)]
-            for own in curve
-            for figures in [(own.accuracy, own.balanced, own.lane)]
-        ]
-        headings = ["augmented", "seed", "maneuver right %", "mean recall %", "lane right %"]
-        _show_table(terminal, "learning curve, examples drawn", headings, points)
+    _show_left_out(terminal, protocol.horizon_s, forest.facts["settings"]["start_s"], scores)
+    terminal.say(f"features, the strongest first: {', '.join(forest.names)}", style="dim")
+
+
+def _show_left_out(terminal: "Terminal", horizon_s: float, start_s: float, scores: "GridScores") -> None:
+    """How many samples are not scored, and why."""
+    told = {
+        "no lane": "no lane now",
+        "future unknown": f"not recorded for {horizon_s:g} s",
+        "maneuver unknown": f"recorded for {horizon_s:g} s but not for the {start_s:g} s in which a change would begin "
+        "(left out of the cells, too, whose strata are by maneuver)",
+        "speed unknown": "of unknown speed",
+    }
+    why = "; ".join(f"{count:,} {told[reason]}" for reason, count in scores.left_out_by_reason.items() if count)
+    terminal.say(f"{scores.left_out:,} samples are not scored{': ' * bool(why)}{why}", style="dim")
+
+
+def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
+    from training.lane_changes.learning import SIZES
+
+    points = [
+        [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_percent, figures)]
+        for own in curve
+        for figures in [(own.accuracy, own.balanced, own.lane)]
+    ]
+    headings = ["augmented", "seed", "maneuver right %", "mean recall %", "lane right %"]
+    _show_table(terminal, "learning curve, examples drawn", headings, points)
+    last = max((own.drawn for own in curve), default=0)
+    if last < max(SIZES):
+        terminal.say(f"it ends at {last:,} examples, with which the smallest stratum is used up", style="dim")
 
 
 def _show_cells(terminal: "Terminal", cells: "list[CellScore]", protocol: str) -> None:

@@ -59,7 +59,7 @@ def predict(
     seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: of the draw.")] = 0,
     count: Annotated[int, typer.Option("--count", min=1, max=100, help="With --pick: how many samples.")] = 1,
     all_vehicles: Annotated[
-        bool, typer.Option("--all-vehicles", help="Predict every sample of the moment, not one only.")
+        bool, typer.Option("--all-vehicles", help="Predict every sample of the moment; a model of scenes: everyone.")
     ] = False,
     attention: Annotated[
         bool, typer.Option("--attention", help="Also draw what a model with attention looks at, per head.")
@@ -224,7 +224,7 @@ def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_
 
     try:
         if all_vehicles:
-            return take_picture(folder, sample, forecast_scene(folder, sample, asked))
+            return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
         run = folder.runs_of(folder.sample_row[[sample]])
         own = int(folder.run_vehicle_id[run[0]])
         return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})

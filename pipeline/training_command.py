@@ -3,14 +3,13 @@
 Like the other commands, it imports heavy libraries where they are used.
 """
 
-import json as json_text
 import re
 import shlex
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption
+from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
 from pipeline.session import command, failure, read_settings
 
 if TYPE_CHECKING:
@@ -125,28 +124,10 @@ def _read_settings_of_model(entry: "Model", settings: list[str]) -> dict[str, An
 
     recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS}
     known = {**recipe, **entry.parameters}
-    read: dict[str, Any] = {}
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        if not equals or name not in known:
-            raise typer.BadParameter(f"--set NAME=VALUE: {entry.name} has {', '.join(known)}; got {setting!r}")
-        read[name] = _read_value(setting, text, known[name])
+    read = read_pairs(settings, known, entry.name)
     config = {name: value for name, value in read.items() if name in recipe}
     parameters = {name: value for name, value in read.items() if name not in recipe}
     return {**config, **({"parameters": parameters} if parameters else {})}
-
-
-def _read_value(setting: str, text: str, default: object) -> object:
-    """A value of the kind that the default is of."""
-    try:
-        value = json_text.loads(text)
-    except ValueError:
-        value = text
-    if isinstance(default, float) and type(value) is int:
-        value = float(value)
-    if default is not None and type(value) is not type(default):
-        raise typer.BadParameter(f"--set {setting}: expected {type(default).__name__} like {default}")
-    return value
 
 
 def _make_config(given: dict[str, Any], *, resume: bool | None) -> "TrainConfig | None":

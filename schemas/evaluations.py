@@ -24,8 +24,12 @@ AVERAGES = ("samples", "vehicles")
 EVERYTHING = "all"
 """The dataset and the group of rows that leave nothing out."""
 
-TOUCHING_SEVERITY = "warning"
-"""A window is touched where its own vehicle breaks a rule of this severity or worse in the history or known future."""
+FINDING_GROUPS = {
+    "warning": ("findings=touched", "findings=untouched"),
+    "error": ("findings=error", "findings=no error"),
+}
+"""Groups by severity, from the mildest on: windows whose own vehicle breaks a rule of this severity or worse in the
+history or the known future, and the others."""
 
 _OF_TICK = "at `seconds`"
 
@@ -68,7 +72,7 @@ FIGURES = tuple(_FIGURES)
 EVALUATIONS = Table(
     "evaluations",
     "One row per model, dataset, group, average and horizon: errors, and how likely the truth was held.",
-    key=("origin", "model", "reference", "dataset", "group", "average", "seconds"),
+    key=("origin", "model", "reference", "nearest", "dataset", "group", "average", "seconds"),
     partition=(),
     columns={
         "protocol": column(pl.String, "of the tensors; of a published row, the protocol that it is put beside"),
@@ -78,11 +82,17 @@ EVALUATIONS = Table(
         "origin": column(pl.String, "measured here, or published elsewhere, on other data", isin=ORIGINS),
         "model": column(pl.String, "the run's name; of a published row, the registry's name where there is one"),
         "reference": column(pl.String, "where a published row stands; empty: measured"),
+        "nearest": column(
+            pl.Int64,
+            "vehicles around the ego that the model was shown, at most; null: it reads the grid, or published",
+            nullable=True,
+            ge=0,
+        ),
         "dataset": column(pl.String, "ngsim, highd, or all of the part; of a published row, as published"),
         "group": column(
             pl.String,
-            "`all`; samples by their true maneuver, for instance `lateral=left`; `findings=touched` (see "
-            "TOUCHING_SEVERITY) and `findings=untouched`",
+            "`all`; samples by their true maneuver, for instance `lateral=left`; by findings on their windows: "
+            + ", ".join(f"`{group}`" for groups in FINDING_GROUPS.values() for group in groups),
         ),
         "average": column(pl.String, "what counts the same: samples or vehicles", isin=AVERAGES),
         "seconds": column(pl.Float64, "ahead of the sample", unit="s", gt=0),

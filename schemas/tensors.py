@@ -151,8 +151,9 @@ SUBSET_KEYS = {
 
 SUBSET_MEANING = """\
 Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,
-null where unknown; last_lane, the rightmost lane (by the markings, else the highest that any entry has); width_m of the
-carriageway (the last marking, else 12 ft a lane)."""
+null where unknown; last_lane, the rightmost lane (by the markings, else the highest that any entry has: knowledge of
+the map taken from the whole recording, later moments included); width_m of the carriageway (the last marking, else
+12 ft a lane)."""
 
 NOMINAL_LANE_M = 3.6576
 """12 ft: taken for a lane's width where no markings are known, to mirror positions and for the lanes of scenes."""

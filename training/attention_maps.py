@@ -1,14 +1,12 @@
 """Who attends to whom in chosen samples: the attention of every head, as a table and as a drawing."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
 from training.attention_drawing import draw_attention
 from training.attention_rows import AttentionMap
 from training.observed import ObservedScene
@@ -17,8 +15,6 @@ from training.reading import NEAREST
 from training.surroundings import find_around, gather_surroundings
 from training.tensors import TensorFolder
 
-LEAST_NEIGHBORS = 5
-"""In the grid of a sample that is shown as an example: with nobody around there is little to attend to."""
 SUFFIX = ".svg"
 
 
@@ -47,49 +43,6 @@ class Looking(Protocol):
     def look(self, observed: ObservedScene[Any]) -> Weights:
         """Who attends to what."""
         ...
-
-
-@dataclass(frozen=True)
-class Examples:
-    """Samples that are shown; None where the part has none.
-
-    Args:
-        change: the first with a lane change.
-        keep: the first that keeps its lane.
-    """
-
-    change: int | None
-    keep: int | None
-
-    @property
-    def samples(self) -> list[int]:
-        """Those that there are."""
-        return [sample for sample in (self.change, self.keep) if sample is not None]
-
-
-def choose_examples(folder: TensorFolder, part: str, *, least_neighbors: int = LEAST_NEIGHBORS) -> Examples:
-    """The first lane change and the first lane keep of a part, with enough neighbors around.
-
-    True maneuvers choose what is drawn; no model is told of them.
-
-    Args:
-        folder: where.
-        part: train, val or eval.
-        least_neighbors: in the sample's grid; where no sample has so many, the first with any number.
-
-    Raises:
-        ValueError: no such part.
-    """
-    samples = folder.samples_of(part)
-    neighbors = folder.neighbor_offset[samples + 1] - folder.neighbor_offset[samples]
-    keeps = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
-
-    def first(of: npt.NDArray[np.bool_]) -> int | None:
-        found = samples[of & (neighbors >= least_neighbors)]
-        found = found if len(found) else samples[of]
-        return int(found[0]) if len(found) else None
-
-    return Examples(change=first(~keeps), keep=first(keeps))
 
 
 def map_attention(

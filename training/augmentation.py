@@ -1,4 +1,11 @@
-"""Augmentation: the road mirrored sideways, and positions shifted along it."""
+"""Augmentation: the road mirrored sideways, and positions shifted along it.
+
+`tracklake train` uses none of it: its networks learn the samples as recorded. In a training loop of one's own,
+`training.torch_batches.BatchStream(folder, part, size, change=...)` calls a function of a batch for every batch as it
+is read: one that returns `mirror(folder, batch, draw_mirrored(len(batch), random))`, for instance. (How it is to draw
+where there are workers stands there.) The lane-change forest mirrors and shifts its own features
+(`training.lane_changes`).
+"""
 
 from dataclasses import replace
 

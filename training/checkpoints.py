@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from training.config import TrainConfig
 from training.logs import Row
 from training.torch_files import PARTIAL, DamagedFileError, load_weights, read_torch_file, write_torch_file
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 """Counts changes of the file, and of how a training goes on, that older checkpoints do not fit."""
 CHECKPOINT_FILE = "checkpoint.pt"
 LOCK_FILE = "lock"
@@ -194,6 +195,32 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != _FIELDS:
         raise DamagedFileError(f"{path}: expected a checkpoint, got a file of {', '.join(sorted(content))}; {ANEW}")
     return content
+
+
+def find_config(path: Path, content: dict[str, Any]) -> TrainConfig:
+    """How the training of a checkpoint was begun.
+
+    Args:
+        path: of the file, for messages.
+        content: as read.
+
+    Raises:
+        DamagedFileError: it does not say, or with settings that this version does not know.
+    """
+    run = content["run"]
+    settings = run.get("training") if isinstance(run, dict) else None
+    if not isinstance(settings, dict):
+        raise DamagedFileError(f"{path}: expected the settings of a training in it, got {settings!r}; {ANEW}")
+    unknown = sorted(map(str, settings.keys() - {own.name for own in fields(TrainConfig)}))
+    if unknown:
+        raise DamagedFileError(
+            f"{path}: this training was begun with settings that this version does not know: {', '.join(unknown)}; go "
+            f"on with the version that began it, or {ANEW}"
+        )
+    try:
+        return TrainConfig(**settings)
+    except (TypeError, ValueError) as wrong:
+        raise DamagedFileError(f"{path}: expected the settings of a training, got others ({wrong}); {ANEW}") from None
 
 
 def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:

@@ -21,6 +21,10 @@ ScheduleName = Literal["constant", "cosine"]
 RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm")
 """What may be set of a model's recipe."""
 BUDGETS = ("seconds", "steps", "epochs")
+NUMBERS = (
+    *BUDGETS, "samples_per_epoch", "patience", "batch_size", "learning_rate", "max_gradient_norm", "seed", "threads",
+    "log_steps", "checkpoint_s",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class TrainConfig:
     Args:
         seconds: time budget of the training loop, all that it does included; the learning rate follows the time.
         steps: optimiser steps. With these, or with epochs, the result depends on the seed (and on the machine's
-            arithmetic, and on the number of threads) alone.
+            arithmetic, and on the number of threads) alone; but for `device`.
         epochs: of all phases together. None of the three = the recipe's epochs.
         samples_per_epoch: an epoch takes so many samples at most, drawn anew for each.
         patience: end the last phase after so many epochs without a smaller loss on the part `val`, and keep the weights
@@ -46,7 +50,10 @@ class TrainConfig:
         seed: of the weights, of the order of samples, and of what the network drops.
         threads: of torch; None = its own choice. One by default: for networks this small a second one gains little on
             an idle machine, and on a busy one it waits for its turn at every tick: a step takes ten times as long.
-        device: `cpu`; or `cuda`, where batches of grids are gathered from tensors that stand there as a whole.
+        device: `cpu`; or `cuda`, where batches of grids are gathered from tensors that stand there as a whole, while
+            those of scenes are gathered on the CPU and moved there. On `cuda` the seed does not decide the
+            weights bit for bit, interrupted or not: some sums (of pooled neighbors, for one) are added up in whatever
+            order the threads come.
         log_steps: a row of course.csv every so many steps.
         checkpoint_s: a checkpoint at least so often, besides those at the ends of epochs.
     """
@@ -76,8 +83,12 @@ class TrainConfig:
         """
         for own in fields(self):
             value = getattr(self, own.name)
+            if own.name in NUMBERS and not isinstance(value, int | float | None):
+                raise ValueError(f"training: expected a number for `{own.name}`, got {value!r}")
             if own.name != "seed" and isinstance(value, int | float) and not value > 0:
                 raise ValueError(f"training: expected `{own.name}` above 0, got {value}")
+        if not isinstance(self.parameters, Mapping):
+            raise ValueError(f"training: expected `parameters` by name, got {self.parameters!r}")
         if self.seed < 0:
             raise ValueError(f"training: expected `seed` 0 or above, got {self.seed}")
         given = [f"{name} {getattr(self, name)}" for name in BUDGETS if getattr(self, name) is not None]

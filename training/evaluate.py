@@ -10,11 +10,11 @@ import polars as pl
 
 from schemas.evaluations import EVALUATIONS, EVERYTHING
 from schemas.protocols import Protocol
+from training.forecasters import open_forecaster
 from training.guard import refuse_future
 from training.latency import Latency, measure_latency
-from training.models import MODELS, Predictor, Reads, find_model
+from training.models import Predictor, Reads
 from training.reading import NEAREST, read_samples, truth_of_ego
-from training.runs import load_run, refuse_leak, refuse_unfinished
 from training.scores import Score, Tally, find_strata
 from training.tensors import TensorFolder
 
@@ -34,6 +34,7 @@ class Evaluation:
         samples: in the part.
         vehicles: that they are of.
         scores: by dataset, group, average and horizon.
+        nearest: vehicles around the ego that the model was shown, at most; None where it reads the grid.
         latency: None where it was not measured.
     """
 
@@ -44,6 +45,7 @@ class Evaluation:
     samples: int
     vehicles: int
     scores: tuple[Score, ...]
+    nearest: int | None = None
     latency: Latency | None = None
 
     @property
@@ -77,6 +79,7 @@ class Evaluation:
             "origin": "measured",
             "model": self.model,
             "reference": "",
+            "nearest": self.nearest,
         }
         latency = asdict(self.latency) if self.latency is not None else {}
         rows = [
@@ -115,31 +118,21 @@ def evaluate(
         EmptyPartError: the part has no samples.
         StaleRunError: the run was trained for another protocol, or on subsets that stand in this part now; or it is
             unfinished or damaged.
-        ValueError: neither a run nor a model of that name.
+        ValueError: neither a run nor a model of that name; the runs and models that there are.
         FileNotFoundError: a model that learns, and no run of that name.
         FutureInputError: the model sees what comes after the moment at which it predicts.
         ImportError: torch is needed and missing.
     """
     folder = TensorFolder.open(tensors)
-    predictor: Predictor
-    if name in MODELS and not MODELS[name].learns:  # as it is, whether or not it was written as a run before
-        model = MODELS[name]
-        predictor = model.build(folder.protocol)
-    elif (models / name / "config.json").is_file():
-        run = load_run(models / name, folder.protocol)
-        model, predictor = find_model(run.config["model"]), run.predictor
-        if part != "train" and model.learns:
-            refuse_leak(run.config, folder, part)
-    else:
-        refuse_unfinished(models / name)
-        find_model(name)
-        raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
+    own = open_forecaster(name, folder, models, frozenset({part}))
     ticks, rate_hz = range(1, folder.protocol.horizon_ticks + 1), folder.protocol.rate_hz
     seconds = [tick / rate_hz for tick in ticks] if every_tick else None
-    evaluation = measure_errors(predictor, folder, part, name=name, reads=model.reads, nearest=nearest, seconds=seconds)
+    evaluation = measure_errors(
+        own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds
+    )
     if not with_latency:
         return evaluation
-    return replace(evaluation, latency=measure_latency(predictor, folder, part, reads=model.reads, nearest=nearest))
+    return replace(evaluation, latency=measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest))
 
 
 def measure_errors(
@@ -197,4 +190,5 @@ def measure_errors(
         samples=len(samples),
         vehicles=int(strata.vehicle[-1]) + 1,
         scores=tally.score(at, protocol.rate_hz),
+        nearest=nearest if reads == "scene" else None,
     )

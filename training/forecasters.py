@@ -24,7 +24,7 @@ class Forecaster:
 
 
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
-    """Open a trained run, or a model that needs no training.
+    """Open a trained run, or a model that needs no training: that one as it is, whether or not it was written as a run.
 
     Args:
         name: a run's folder in `models`, or the name of a model that does not learn.

@@ -93,24 +93,34 @@ def forecast_samples(
     return found
 
 
-def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaster]) -> dict[int, list[Forecast]]:
+def forecast_scene(
+    folder: TensorFolder, sample: int, models: Sequence[Forecaster], *, nearest: int | None = NEAREST
+) -> dict[int, list[Forecast]]:
     """What every model says of a sample's moment; by vehicle id, in the models' order.
 
     A model of scenes is asked once, about the sample's vehicle and those around it that it is shown; any other about
     all samples of the moment, each as it sees the others.
 
+    Args:
+        folder: of the sample.
+        sample: its number.
+        models: whom to ask.
+        nearest: vehicles around the sample's that models of scenes are shown, at most; None: everyone at that moment.
+            What they say of one vehicle may depend on how many they are shown.
+
     Raises:
         IndexError: a number below 0, or not below S.
-        ValueError: a place is not a finite number.
+        ValueError: a place is not a finite number, or `nearest` is negative.
     """
     scene = int(folder.scene_of_sample[check_numbers([sample], len(folder.sample_row), "sample")[0]])
     members = slice(int(folder.scene_offset[scene]), int(folder.scene_offset[scene + 1]))
     samples = folder.scene_sample[members]
     ids = folder.run_vehicle_id[folder.runs_of(folder.scene_row[members])].tolist()
     found: dict[int, list[Forecast]] = {vehicle: [] for vehicle in ids}
+    shown = len(ids) - 1 if nearest is None else nearest
     for model in models:
         if isinstance(model.predictor, ScenePredictor):
-            for vehicle, said in _forecast_around(folder, sample, model.name, model.predictor).items():
+            for vehicle, said in _forecast_around(folder, sample, model.name, model.predictor, shown).items():
                 found[vehicle].append(said)
         else:
             of_sample = forecast_samples(folder, samples[samples >= 0], [model])
@@ -128,11 +138,13 @@ class ScenePredictor(Interface):
         ...
 
 
-def _forecast_around(folder: TensorFolder, sample: int, name: str, model: ScenePredictor) -> dict[int, Forecast]:
+def _forecast_around(
+    folder: TensorFolder, sample: int, name: str, model: ScenePredictor, nearest: int
+) -> dict[int, Forecast]:
     """What a model of scenes says of every vehicle that it is shown, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = read_samples(folder, number, "scene")
-    said, around = model.predict_scene(observed), find_around(folder, number, NEAREST)
+    observed, _ = read_samples(folder, number, "scene", nearest=nearest)
+    said, around = model.predict_scene(observed), find_around(folder, number, nearest)
     ids = folder.run_vehicle_id[folder.runs_of(around.row[0])]
     origin = find_origins(folder, number)[0]
     variance = np.diagonal(said.covariance_m2[0], axis1=-2, axis2=-1)

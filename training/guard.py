@@ -2,9 +2,16 @@
 
 A model is given `training.observed` only, which refuses every other name. That says nothing of a model that reaches the
 tensors another way, nor of a reader that lets the future into what may be seen. So a few moments are predicted twice:
-from the tensors as they are, and from the same tensors with everything else after the moment. Nothing may change.
+from the tensors as they are, and from the same tensors with another future: other places, speeds, lanes and findings,
+none of them by the same amount as a later one; other maneuvers; and no track that goes on. Nothing may change.
 
-A model that learnt the answers by heart before is not found out here: `training.runs.refuse_leak` keeps those away.
+What is not found out:
+
+- a model that learnt the answers by heart before; `training.runs.refuse_leak` keeps those away;
+- one that reads the files anew (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
+- one that looks up, in the folder that it holds, who else is a sample, a neighbor (in which cell) or in a scene later;
+- one that uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;
+- one that sees the future at other moments only than the few that are looked at.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, SEVERITIES
+from schemas.tensors import ARRAYS
 from training.batches import Integers
 from training.models import Predictor, Reads
 from training.observed import FutureInputError
@@ -30,11 +38,36 @@ TOLERANCE = 1e-3
 
 Change = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 
+GREATEST_STEP, TURN = 7, 4093
+"""Of `_grow`: TURN is more than what 255 steps, the longest horizon, add up to."""
+
+
+def _grow(count: int) -> Integers:
+    """(count,) whole numbers from 1 to TURN that grow by 1 to GREATEST_STEP, irregularly, and begin anew after TURN.
+
+    Two of them within a horizon of each other are never the same, so that differences between later rows change too.
+    """
+    steps = np.random.default_rng(0).integers(1, GREATEST_STEP + 1, count)
+    return 1 + np.cumsum(steps) % TURN
+
+
+def _shift(places: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Other places (n, 2); int16 may wrap: that is another place as well."""
+    moved: npt.NDArray[Any] = places + np.multiply.outer(_grow(len(places)), np.array([61, 17]))
+    return moved.astype(places.dtype)
+
+
+def _find_others(finding: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Other findings (n,)."""
+    others: npt.NDArray[Any] = (finding + 1 + _grow(len(finding)) % len(SEVERITIES)) % (1 + len(SEVERITIES))
+    return others.astype(finding.dtype)
+
+
 OF_ROWS: Mapping[str, Change] = {
-    "position_m": lambda steps: steps + np.array([61, 17], dtype=steps.dtype),  # int16 may wrap: it is another place
-    "speed_mps": lambda speed: speed + 7,
-    "lane": lambda lane: lane + 1,
-    "finding": lambda finding: (finding + 1) % (len(SEVERITIES) + 1),
+    "position_m": _shift,
+    "speed_mps": lambda speed: speed + _grow(len(speed)).astype(speed.dtype),
+    "lane": lambda lane: lane + _grow(len(lane)).astype(lane.dtype),
+    "finding": _find_others,
 }
 """What else could have come: of rows after the moment. All arrays by row of `schemas.tensors.ARRAYS` are here."""
 
@@ -76,7 +109,7 @@ def refuse_future(
     changed = {array: change(getattr(folder, array)) for array, change in OF_SAMPLES.items()}
     for scene in choose_moments(folder, part, MOMENTS):
         samples = samples_of_scene(folder, scene)
-        subset, tick, after = _rows_after(folder, scene)
+        subset, tick, begin, after = _rows_after(folder, scene)
 
         def predict(samples: Integers = samples) -> tuple[dict[str, Any], dict[str, Any]]:
             observed, _ = read_samples(folder, samples, reads, nearest=nearest)
@@ -86,7 +119,7 @@ def refuse_future(
         given, said = predict()
         for array, change in OF_ROWS.items():
             rows[array][after] = change(rows[array][after])
-        with _another(folder, rows | changed):
+        with _another(folder, rows | changed | _cut_runs(folder, begin)):
             given_then, said_then = predict()
         for array in OF_ROWS:
             rows[array][after] = getattr(folder, array)[after]
@@ -114,9 +147,13 @@ def refuse_future(
 
 
 def choose_moments(folder: TensorFolder, part: str, count: int) -> Integers:
-    """Numbers of so many scenes of a part at most, evenly spread over it."""
+    """Numbers of so many scenes of a part at most: the middle ones of as many equal stretches of it.
+
+    The very last scenes are not among them, where futures end after a tick.
+    """
     scenes = folder.scenes_of(part)
-    return scenes[np.unique(np.linspace(0, len(scenes) - 1, min(count, len(scenes))).round().astype(np.intp))]
+    count = min(count, len(scenes))
+    return scenes[(2 * np.arange(count) + 1) * len(scenes) // (2 * max(count, 1))]
 
 
 def samples_of_scene(folder: TensorFolder, scene: int) -> Integers:
@@ -125,18 +162,46 @@ def samples_of_scene(folder: TensorFolder, scene: int) -> Integers:
     return members[members >= 0].astype(np.int64)
 
 
-def _rows_after(folder: TensorFolder, scene: int) -> tuple[str, int, Integers]:
-    """The scene's subset and tick, and the rows of that subset at later ticks."""
+def _rows_after(folder: TensorFolder, scene: int) -> tuple[str, int, Integers, Integers]:
+    """The scene's subset and tick, and of that subset's rows those at later ticks.
+
+    Returns:
+        `dataset/subset`; the tick; (R,) where the later rows of each run begin, the run's end where it has none (all
+        runs of other subsets); the later rows.
+    """
     row = int(folder.scene_row[folder.scene_offset[scene]])
     run = int(folder.runs_of(np.array([row]))[0])
     tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
-    runs = np.flatnonzero(folder.run_subset == folder.run_subset[run])
-    first, end = folder.run_first_row[runs], folder.run_first_row[runs + 1]
-    begin = np.minimum(first + np.maximum(0, tick + 1 - folder.run_first_tick[runs].astype(np.int64)), end)
+    first, end = folder.run_first_row[:-1], folder.run_first_row[1:]
+    begin = np.minimum(first + np.maximum(0, tick + 1 - folder.run_first_tick.astype(np.int64)), end)
+    begin = np.where(folder.run_subset == folder.run_subset[run], begin, end)
     counts = end - begin
     rows = np.arange(counts.sum()) + np.repeat(begin - (counts.cumsum() - counts), counts)
     named = folder.index["subsets"][int(folder.run_subset[run])]
-    return f"{named['dataset']}/{named['subset']}", tick, rows.astype(np.int64)
+    return f"{named['dataset']}/{named['subset']}", tick, begin, rows.astype(np.int64)
+
+
+def _cut_runs(folder: TensorFolder, begin: Integers) -> dict[str, npt.NDArray[Any]]:
+    """All arrays by run of a folder whose runs end at the moment; what follows are runs of vehicles unheard of.
+
+    Rows keep their places and their ticks, so that nothing changes in what can be seen of them at the moment.
+
+    Args:
+        folder: the tensors.
+        begin: (R,) see `_rows_after`.
+    """
+    first, end = folder.run_first_row[:-1], folder.run_first_row[1:]
+    cut = np.flatnonzero((first < begin) & (begin < end))
+    arrays = {
+        array.name: np.insert(getattr(folder, array.name), cut + 1, getattr(folder, array.name)[cut])
+        for array in ARRAYS
+        if array.shape[0] == "R"
+    }
+    later = np.insert(begin == first, cut + 1, True)
+    arrays["run_first_row"] = np.insert(folder.run_first_row, cut + 1, begin[cut])
+    arrays["run_first_tick"][later] += np.insert(np.zeros_like(first), cut + 1, (begin - first)[cut])[later]
+    arrays["run_vehicle_id"][later] = -1 - arrays["run_vehicle_id"][later]
+    return arrays
 
 
 @contextmanager

@@ -76,7 +76,10 @@ class ObservedScene(_Blind, Generic[Array]):
         vehicle_mask: (B, V) True where there is a vehicle; the first always is.
         size_m: (B, V, 2) length and width; 0 where unknown.
         lanes: (B, 3, 3) lanes left of, under and right of the ego: the centre's offset from the ego's last position
-            (m, positive to the right), the width (m), and 1 where the lane exists; all 0 where it does not.
+            (m, positive to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is
+            knowledge of the map, not of the moment: where no markings are known, the rightmost lane is the highest that
+            anybody drives in during the whole recording (`last_lane` of `schemas.tensors`), so that a lane may exist
+            here because somebody is in it later.
     """
 
     history: Array

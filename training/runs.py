@@ -5,11 +5,15 @@ import json
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+import numpy as np
+
 from schemas.protocols import Protocol
+from schemas.tensors import ARRAYS
 from training.models import Predictor, find_model, require_torch
 from training.tensors import TensorFolder
 
@@ -20,6 +24,10 @@ RUN_VERSION = 2
 """Counts changes of `config.json` or of the models that older runs cannot be read with."""
 
 AGAIN = "train it again"
+TRAINED_BY = ("tracklake", "torch")
+"""Distributions whose versions a run names."""
+HASHED_BYTES = 1 << 22
+"""At a time: Ctrl-C does not wait for a whole array."""
 
 
 class StaleRunError(ValueError):
@@ -46,7 +54,7 @@ def describe_run(
     folder: TensorFolder,
     recipe: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `config.json` holds, as plain values.
+    """What `config.json` holds (but for the versions, see `save_run`), as plain values.
 
     Args:
         model: its name in the registry.
@@ -72,11 +80,27 @@ def describe_run(
 
 
 def digest_tensors(folder: TensorFolder) -> str:
-    """First 12 hex digits of the sha256 of the index, the samples and all positions: what a training depends on."""
-    digest = hashlib.sha256(json.dumps(folder.index, sort_keys=True).encode())
-    for array in (folder.position_m, folder.sample_row, folder.sample_part, folder.neighbor_row):
-        digest.update(array.data)
+    """First 12 hex digits of the sha256 of the index and of every array: all that a training can depend on.
+
+    A training is gone on with on tensors of the same digest only; finished runs are judged without it.
+    """
+    digest = hashlib.sha256(json.dumps(folder.index, sort_keys=True).encode())  # says each array's dtype and shape
+    for array in ARRAYS:
+        data = getattr(folder, array.name).reshape(-1).view(np.uint8)
+        for first in range(0, len(data), HASHED_BYTES):
+            digest.update(data[first : first + HASHED_BYTES])
     return digest.hexdigest()[:12]
+
+
+def find_versions() -> dict[str, str | None]:
+    """Versions that are installed of what trains; None of what is not."""
+    found: dict[str, str | None] = {}
+    for name in TRAINED_BY:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
 
 
 def save_run(
@@ -90,7 +114,8 @@ def save_run(
 
     Args:
         out: the run's folder.
-        config: see `describe_run`.
+        config: see `describe_run`. `config.json` also says, for whoever wonders why two runs differ, the `versions` of
+            `find_versions` that ended the training; nothing compares them.
         metrics: plain values.
         network: the trained module; None where the model does not learn.
         logs: files to copy into it.
@@ -106,7 +131,8 @@ def save_run(
         for log in logs:
             shutil.copyfile(log, aside / log.name)
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
-        (aside / "config.json").write_text(json.dumps(config, indent=1, allow_nan=False), encoding="utf-8")
+        said = config | {"versions": find_versions()}
+        (aside / "config.json").write_text(json.dumps(said, indent=1, allow_nan=False), encoding="utf-8")
         if out.exists():
             # A folder cannot be renamed over a full one: the old one steps aside first.
             old = aside.with_suffix(".old")

@@ -1,6 +1,6 @@
 """Errors summed up over batches, and the figures made of the sums: by vehicle and maneuver, and over everything.
 
-Samples are summed by stratum: those of one vehicle, with the same maneuvers, touched by findings or not. Every group is
+Samples are summed by stratum: those of one vehicle, with the same maneuvers and equally severe findings. Every group is
 a union of strata, so that one pass over the samples serves all of them.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from schemas.evaluations import AVERAGES, EVERYTHING, TOUCHING_SEVERITY
+from schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
 from training.batches import Flags, Integers
 from training.densities import find_nll
 from training.findings import touched
@@ -67,7 +67,7 @@ class Strata:
         dataset: (P,) position in `datasets`.
         lateral: (P,) true maneuver, position in LATERAL_MANEUVERS.
         longitudinal: (P,) likewise.
-        touched: (P,) whether findings touch the samples.
+        findings: (P,) how many of the severities of FINDING_GROUPS the samples' worst finding reaches; 0 has none.
         datasets: of the part, sorted.
     """
 
@@ -76,7 +76,7 @@ class Strata:
     dataset: Integers
     lateral: Integers
     longitudinal: Integers
-    touched: Flags
+    findings: Integers
     datasets: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -90,7 +90,8 @@ class Strata:
         groups |= {
             f"longitudinal={name}": self.longitudinal == code for code, name in enumerate(LONGITUDINAL_MANEUVERS)
         }
-        groups |= {"findings=touched": self.touched, "findings=untouched": ~self.touched}
+        for below, (found, others) in enumerate(FINDING_GROUPS.values()):
+            groups |= {found: self.findings > below, others: self.findings <= below}
         for code, dataset in enumerate((EVERYTHING, *self.datasets), start=-1):
             within = groups[EVERYTHING] if code < 0 else self.dataset == code
             for group, members in groups.items():
@@ -105,19 +106,20 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     maneuvers = (len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS))
     code = vehicle * maneuvers[0] + folder.sample_lateral[samples]
     code = code * maneuvers[1] + folder.sample_longitudinal[samples]
-    code = code * 2 + touched(folder, samples, TOUCHING_SEVERITY)
+    levels = 1 + len(FINDING_GROUPS)
+    code = code * levels + sum(touched(folder, samples, severity).astype(np.int64) for severity in FINDING_GROUPS)
     found, first, of_sample = np.unique(code, return_index=True, return_inverse=True)
     names = [str(named["dataset"]) for named in folder.index["subsets"]]
     datasets = tuple(sorted({names[number] for number in np.unique(subset)}))
     dataset_of_subset = np.array([datasets.index(name) if name in datasets else -1 for name in names], dtype=np.int64)
-    rest, maneuver = found // 2, found // 2 % maneuvers[1]
+    rest, maneuver = found // levels, found // levels % maneuvers[1]
     return Strata(
         of_sample=of_sample.astype(np.int64),
         vehicle=rest // (maneuvers[0] * maneuvers[1]),
         dataset=dataset_of_subset[subset[first]],
         lateral=rest // maneuvers[1] % maneuvers[0],
         longitudinal=maneuver,
-        touched=found % 2 == 1,
+        findings=found % levels,
         datasets=datasets,
     )
 

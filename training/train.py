@@ -4,16 +4,15 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy.typing as npt
-
-from training.batches import Integers
 from training.checkpoints import (
     CHECKPOINT_FILE,
     TrainingState,
     claim_folder,
+    find_config,
     holding_interrupts,
     read_checkpoint,
     refuse_other_run,
@@ -23,11 +22,12 @@ from training.checkpoints import (
 )
 from training.config import Plan, TrainConfig, make_plan
 from training.evaluate import measure_errors
+from training.feeding import Batches, Read, make_reader, read_batches
+from training.guard import refuse_future
 from training.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
 from training.memory import keep_freed_memory
 from training.models import Model, Predictor, find_model, require_torch
-from training.observed import part_batch
-from training.reading import read_samples
+from training.observed import FutureInputError
 from training.runs import describe_run, save_run
 from training.tensors import TensorFolder
 
@@ -40,8 +40,6 @@ __all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]
 
 Progress = Callable[[float, float], None]
 """Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss."""
-Read = Callable[[Integers], tuple[Any, Any]]
-"""Numbers of samples (B,) -> what may be seen of them and what came (`training.observed`), tensors on the device."""
 
 VALIDATION_BATCH = 1024
 BRIEF_S = 2.0
@@ -89,7 +87,8 @@ def train(
             training with other settings or data; or another process is at it.
         DamagedFileError: the checkpoint is not what was written.
         DivergedError: the loss is not finite.
-        FutureInputError: the model sees what comes after the moment at which it predicts.
+        FutureInputError: the model sees what comes after the moment at which it predicts; told before the first step
+            where it does so untrained, else after the last. No checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
         ValueError: unknown model or parameter; not enough to train with, see `training.config.make_plan`; or no time
             for one step.
@@ -109,9 +108,8 @@ def train(
     with claim_folder(out) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
         stored = read_checkpoint(checkpoint) if resume else None
-        if config is None:
-            config = TrainConfig(**stored["run"]["training"]) if stored else TrainConfig()
-        plan = make_plan(entry, folder, config)
+        begun = find_config(checkpoint, stored) if stored else TrainConfig()
+        plan = make_plan(entry, folder, config or begun)
         run = plan.describe()
         if stored:
             refuse_other_run(checkpoint, stored["run"], run)
@@ -122,8 +120,8 @@ def train(
             metrics["evaluation"] = _evaluate(network, entry, folder, out.name)
             save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
             checkpoint.unlink()
-        except DivergedError:
-            checkpoint.unlink(missing_ok=True)  # it leads to the same
+        except (DivergedError, FutureInputError):
+            checkpoint.unlink(missing_ok=True)  # it leads to the same, or was learnt from what came after
             raise
         except KeyboardInterrupt:
             if not checkpoint.is_file():
@@ -151,21 +149,17 @@ def _fit(
         stored: the checkpoint to go on from; None = begin.
         progress: told how it goes.
     """
-    import torch
-
-    config, recipe, checkpoint = plan.config, plan.recipe, unfinished / CHECKPOINT_FILE
-    read = _make_reader(plan)
+    config, checkpoint = plan.config, unfinished / CHECKPOINT_FILE
     with _own_torch(plan):
-        network: Network = plan.entry.build(plan.folder.protocol, **plan.parameters).to(plan.device).train()
-        adam = torch.optim.AdamW if recipe.optimizer == "adamw" else torch.optim.Adam
-        optimizer = adam(network.parameters(), lr=recipe.learning_rate)
-        state = restore(checkpoint, stored, network, optimizer, plan.device) if stored else TrainingState()
+        network, optimizer, state = _begin(plan, checkpoint, stored)
+        save = partial(save_checkpoint, checkpoint, run, network, optimizer, state, plan.device)
+        read = make_reader(plan)
+        batches = read_batches(plan, read, state.step)
         with (
             holding_interrupts() as interrupted,
             writing_rows(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
             writing_rows(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
         ):
-            order: Integers | None = None
             began = time.monotonic() - state.elapsed_s
             saved = time.monotonic()
             while True:
@@ -173,39 +167,20 @@ def _fit(
                 spent = state.elapsed_s if config.seconds else state.step
                 if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
-                phase = recipe.phase_at(spent, plan.budget)
+                phase = plan.recipe.phase_at(spent, plan.budget)
                 if not state.phases or state.phases[-1][0] != phase.loss:
-                    if state.step > state.marked[0]:  # a row is of one phase
-                        log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
+                    _log_steps(plan, state, optimizer, log_steps)  # a row is of one phase
                     state.begin_phase(phase.loss)
-
-                start = time.perf_counter()
-                epoch, place = divmod(state.step, plan.epoch_steps)
-                if order is None or place == 0:
-                    order = plan.draw_epoch(epoch)
-                samples = order[place * recipe.batch_size : (place + 1) * recipe.batch_size]
-                observed, truth = read(samples)
-                state.reading_s += time.perf_counter() - start
-
-                for group in optimizer.param_groups:
-                    group["lr"] = plan.learning_rate(spent)
-                loss = network.loss(observed, truth, phase.loss)
-                optimizer.zero_grad(set_to_none=True)
-                loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
-                torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.max_gradient_norm)
-                optimizer.step()
-                state.take_step(_require_finite(loss.item(), plan, state), len(samples))
-                state.stepping_s += time.perf_counter() - start
-
+                _take_step(plan, state, network, optimizer, batches, spent)
                 if state.step % config.log_steps == 0:
-                    log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
-                ends = place + 1 == plan.epoch_steps
+                    _log_steps(plan, state, optimizer, log_steps)
+                ends = state.step % plan.epoch_steps == 0
                 if ends:
                     log_epoch(_end_epoch(plan, state, network, read))
                 state.elapsed_s = time.monotonic() - began
                 since_saved = time.monotonic() - saved
                 if since_saved > config.checkpoint_s or (ends and since_saved > BRIEF_S):
-                    save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+                    save()
                     saved = time.monotonic()
                 try:
                     if progress is not None:
@@ -213,21 +188,66 @@ def _fit(
                     if interrupted():
                         raise KeyboardInterrupt
                 except KeyboardInterrupt:  # whoever it comes from: the step is done, the state is whole
-                    save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+                    save()
                     raise
 
             if state.step == 0:
                 raise ValueError(f"not one step was done within {config.seconds} s: give it more time")
-            if state.step > state.marked[0]:
-                log_steps(_describe_steps(plan, state, optimizer.param_groups[0]["lr"]))
+            _log_steps(plan, state, optimizer, log_steps)
             if not state.epochs or state.epochs[-1]["step"] != state.step:
                 log_epoch(_end_epoch(plan, state, network, read))  # one that the budget cut short
-            save_checkpoint(checkpoint, run, network, optimizer, state, plan.device)
+            save()
         if state.best_weights is not None:
             network.load_state_dict(state.best_weights)
     if progress is not None:
         progress(1.0, state.smooth_loss)
     return network.eval(), _describe_training(plan, state, network)
+
+
+def _begin(
+    plan: Plan, checkpoint: Path, stored: dict[str, Any] | None
+) -> tuple["Network", "torch.optim.Optimizer", TrainingState]:
+    """Network, optimiser and state before the first step, or as a checkpoint says.
+
+    Raises:
+        FutureInputError: the network sees the future before it has learnt anything.
+        DamagedFileError: the checkpoint is not of this network.
+    """
+    import torch
+
+    network: Network = plan.entry.build(plan.folder.protocol, **plan.parameters).to(plan.device).train()
+    adam = torch.optim.AdamW if plan.recipe.optimizer == "adamw" else torch.optim.Adam
+    optimizer = adam(network.parameters(), lr=plan.recipe.learning_rate)
+    if stored:  # looked at when it began
+        return network, optimizer, restore(checkpoint, stored, network, optimizer, plan.device)
+    # On `train`: that tells as much, and the evaluation part is left alone until the end.
+    refuse_future(network, plan.folder, "train", name=plan.entry.name, reads=plan.entry.reads)
+    return network, optimizer, TrainingState()
+
+
+def _take_step(
+    plan: Plan,
+    state: TrainingState,
+    network: "Network",
+    optimizer: "torch.optim.Optimizer",
+    batches: Batches,
+    spent: float,
+) -> None:
+    """One step of the optimiser on the next batch, after so much of the budget is spent."""
+    import torch
+
+    start = time.perf_counter()
+    samples, observed, truth = next(batches)
+    state.reading_s += time.perf_counter() - start
+    for group in optimizer.param_groups:
+        group["lr"] = plan.learning_rate(spent)
+    loss = network.loss(observed, truth, state.phases[-1][0])
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
+    torch.nn.utils.clip_grad_norm_(network.parameters(), plan.recipe.max_gradient_norm)
+    optimizer.step()
+    state.take_step(_require_finite(loss.item(), plan, state), samples)
+    state.stepping_s += time.perf_counter() - start
 
 
 @contextmanager
@@ -247,37 +267,6 @@ def _own_torch(plan: Plan) -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _make_reader(plan: Plan) -> Read:
-    """How batches come to the device."""
-    import torch
-
-    reads, folder, device = plan.entry.reads, plan.folder, plan.device
-    if device.type != "cpu" and reads == "grid":
-        return make_resident_reader(folder, device)
-
-    def read(samples: Integers) -> tuple[Any, Any]:
-        observed, truth = read_samples(folder, samples, reads)
-        if device.type == "cpu":
-            return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
-
-        def move(array: npt.NDArray[Any]) -> torch.Tensor:
-            return torch.from_numpy(array).to(device)
-
-        return observed.each(move), truth.each(move)
-
-    return read
-
-
-def make_resident_reader(folder: TensorFolder, device: "torch.device") -> Read:
-    """Batches of grids gathered on a device, from tensors that stand there as a whole."""
-    import torch
-
-    from training.torch_batches import ResidentTensors
-
-    resident = ResidentTensors(folder, device)
-    return lambda samples: part_batch(resident.gather(torch.from_numpy(samples).to(device)))
 
 
 def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
@@ -326,21 +315,27 @@ def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> flo
     return total / len(plan.val)
 
 
-def _describe_steps(plan: Plan, state: TrainingState, learning_rate: float) -> Row:
-    """A row of course.csv, on the steps since the row before."""
+def _log_steps(
+    plan: Plan, state: TrainingState, optimizer: "torch.optim.Optimizer", log: Callable[[Row], None]
+) -> None:
+    """A row of course.csv on the steps since the row before, if there are any."""
     step, samples, stepping_s, reading_s = state.marked
+    if state.step == step:
+        return
     state.marked = (state.step, state.samples, state.stepping_s, state.reading_s)
     took_s = state.stepping_s - stepping_s
-    return {
-        "step": state.step,
-        "epoch": (state.step - 1) // plan.epoch_steps,
-        "phase": state.phases[-1][0],
-        "seconds": round(state.elapsed_s, 3),
-        "loss": sum(state.losses[step:]) / (state.step - step),
-        "learning_rate": learning_rate,
-        "samples_per_s": round((state.samples - samples) / took_s, 1),
-        "data_share": round((state.reading_s - reading_s) / took_s, 4),
-    }
+    log(
+        {
+            "step": state.step,
+            "epoch": (state.step - 1) // plan.epoch_steps,
+            "phase": state.phases[-1][0],
+            "seconds": round(state.elapsed_s, 3),
+            "loss": sum(state.losses[step:]) / (state.step - step),
+            "learning_rate": optimizer.param_groups[0]["lr"],
+            "samples_per_s": round((state.samples - samples) / took_s, 1),
+            "data_share": round((state.reading_s - reading_s) / took_s, 4),
+        }
+    )
 
 
 def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:

@@ -91,7 +91,8 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     # No overview leads to a page that is not there, and no page is of a subset that is gone.
     made = manifest.of_stage("pages")
     with connect(root) as connection:
-        scores = collect_scores(root, manifest)
+        notes: list[str] = []
+        scores = collect_scores(root, manifest, notes.append)
         report = build_report(connection, provenance, scores=scores, pages=find_pages(root, made))
     files = [write_report_file(root, PAGE, report.html), write_report_file(root, DOCUMENT, report.json)]
     if report.splits_html is not None:
@@ -102,4 +103,4 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
         remove_leftovers(folder)
-    return make_entry(job, {REPORTS: files}, {})
+    return make_entry(job, {REPORTS: files}, {"notes": notes})

@@ -1,6 +1,7 @@
 """Score: the error of the simplest model on the evaluation part, the first number for others to stand beside."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,21 +45,47 @@ def finished_runs(root: Path) -> list[Path]:
     return sorted(path for path in (root / MODELS).glob("*/metrics.json") if not path.parent.name.startswith("."))
 
 
-def collect_scores(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
+def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None]) -> list[dict[str, Any]]:
     """What the runs in the lake scored, of those that were made from the tensors that are live now.
+
+    Args:
+        root: the lake.
+        manifest: its live files.
+        pass_by: told of each run that is damaged or of another version: which, and why.
 
     Returns:
         {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
     """
+    from training.runs import StaleRunError, read_config
+
     if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
         return []
     index = json.loads((root / manifest.entries[TENSORS].info["path"] / "index.json").read_text(encoding="utf-8"))
     scores = []
     for path in finished_runs(root):
-        config = json.loads(path.with_name("config.json").read_text(encoding="utf-8"))
-        evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
-        if evaluation is None or (config["protocol"], config["blocks"]) != (index["protocol"], index["blocks"]):
+        try:
+            config, scored = read_config(path.parent), _read_score(path)
+        except (StaleRunError, FileNotFoundError) as stale:
+            pass_by(f"a run is passed by: {stale}")
             continue
-        rows = [{name: horizon[name] for name in ("seconds", "rmse_m", "n")} for horizon in evaluation["horizons"]]
-        scores.append({"model": path.parent.name, "part": evaluation["part"], "rows": rows})
+        if scored is not None and (config["protocol"], config["blocks"]) == (index["protocol"], index["blocks"]):
+            scores.append({"model": path.parent.name, **scored})
     return scores
+
+
+def _read_score(path: Path) -> dict[str, Any] | None:
+    """Part and rows of a run's metrics.json; None where the part had no samples.
+
+    Raises:
+        StaleRunError: the file is damaged.
+    """
+    from training.runs import AGAIN, StaleRunError
+
+    try:
+        evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
+        if evaluation is None:
+            return None
+        rows = [{name: horizon[name] for name in ("seconds", "rmse_m", "n")} for horizon in evaluation["horizons"]]
+        return {"part": evaluation["part"], "rows": rows}
+    except (ValueError, KeyError, TypeError) as broken:
+        raise StaleRunError(f"{path}: expected what a training scored, got {broken!r}; {AGAIN}") from None

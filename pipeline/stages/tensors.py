@@ -147,9 +147,11 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
         )
     protocol = settings.get_protocol()
     if entry.built_from["protocol"] != protocol.digest:
+        made = json.loads((root / str(entry.info["path"]) / INDEX_FILE).read_text(encoding="utf-8"))["protocol"]
         raise StageError(
             f"{root}: the tensors were made by another protocol than {protocol.name} ({protocol.digest}) as it is set "
-            "now. Run `tracklake run` with these settings, or set what they were made with."
+            f"now: by {made['name']} ({made['digest']}). Run `tracklake run` with these settings, or set what they "
+            "were made with."
         )
     recipe, found = settings.get_split_recipe(), entry.built_from.get("split_recipe", {"digest": "unknown"})
     if found["digest"] != recipe.digest:

@@ -5,17 +5,14 @@ import re
 from dataclasses import dataclass, replace
 
 import numpy as np
-import polars as pl
 import pytest
 from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, open_moment
-from tensor_tables import CLOCK, TINY, split_row, write
+from tensor_tables import TINY
 
-from schemas.samples import NEIGHBORS, SAMPLES
 from training.attention_drawing import compose_attention, draw_attention
-from training.attention_maps import choose_examples, export_attention, map_attention
+from training.attention_maps import export_attention, map_attention
 from training.attention_rows import list_bands, list_boxes, list_cells, span_road, tell_head
 from training.models import find_model
-from training.tensors import TensorFolder
 
 HEADS = 2
 
@@ -140,37 +137,3 @@ def test_a_network_is_exported(tmp_path, markings):
     assert export_attention(folder, network, [], tmp_path / "out") == []
     with pytest.raises(IndexError):
         export_attention(folder, network, [99], tmp_path / "out")
-
-
-def make_examples(path, kinds):
-    """Vehicles 1, 2, ... stand as samples in the order of (maneuver, neighbors in the grid)."""
-    ids = range(1, len(kinds) + 1)
-    clock = [(v, t, 1 + 5 * t, 20.0 * t, float(v), 1, 20.0, v) for v in ids for t in range(TINY.history_ticks + 2)]
-    tick = TINY.history_ticks - 1
-    samples = [
-        (TINY.name, "highd", "b", v, tick, 1 + 5 * tick, 1, lateral, "normal", None)
-        for v, (lateral, _) in zip(ids, kinds, strict=True)
-    ]
-    neighbors = [
-        (TINY.name, "highd", "b", v, tick, other, other, 5.0)
-        for v, (_, count) in zip(ids, kinds, strict=True)
-        for other in [each for each in ids if each != v][:count]
-    ]
-    tables = (
-        "b",
-        pl.DataFrame(clock, schema=CLOCK, orient="row"),
-        pl.DataFrame(samples, schema=SAMPLES.dtypes, orient="row"),
-        pl.DataFrame(neighbors, schema=NEIGHBORS.dtypes, orient="row"),
-    )
-    return TensorFolder.open(write(path, [tables], split_row("b", "eval")))
-
-
-def test_examples_are_the_first_change_and_keep_with_enough_around(tmp_path):
-    kinds = [("keep", 1), ("left", 2), ("keep", 3), ("right", 3), ("keep", 3), ("left", 3)]
-    folder = make_examples(tmp_path / "six", kinds)
-    many = choose_examples(folder, "eval", least_neighbors=3)
-    assert (many.change, many.keep, many.samples) == (3, 2, [3, 2])
-    assert choose_examples(folder, "eval").samples == [1, 0], "nobody has 5: the first of each kind"
-    assert choose_examples(folder, "train").samples == []
-    quiet = choose_examples(make_examples(tmp_path / "two", kinds[:1] * 2), "eval")
-    assert (quiet.change, quiet.samples) == (None, [0])

@@ -126,6 +126,18 @@ def test_killed_between_checkpoints_it_goes_on_from_the_last_one(tensors, tmp_pa
     assert read_run(run) == undisturbed
 
 
+@pytest.mark.parametrize("model", ["attention-h2", "cs-lstm"])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_models_of_the_registry_end_the_same(model, steps, tensors, tmp_path):
+    """One drops at random what it attends to; one has gradients written by hand. Stopped within an epoch of four."""
+    config = TrainConfig(steps=5, log_steps=2, patience=2, seed=2, batch_size=8, samples_per_epoch=32)
+    train(model, tensors, tmp_path / "whole", config)
+    with pytest.raises(TrainingInterruptedError):
+        train(model, tensors, tmp_path / "run", config, stop_after(steps))
+    train(model, tensors, tmp_path / "run", resume=True)
+    assert without_name(read_run(tmp_path / "run")) == without_name(read_run(tmp_path / "whole"))
+
+
 class PressesKeys(Forgetful):
     """Presses Ctrl-C while a step is under way, as often as the list says for the step."""
 
@@ -299,16 +311,26 @@ def test_damaged_checkpoints_are_refused_and_run_nothing(damage, told, interrupt
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"version": 0}, "expected version 1 of checkpoints, got 0"),
+        ({"version": 0}, "expected version 2 of checkpoints, got 0"),
         ({"more": 1}, "expected a checkpoint, got a file of device_random, more, network"),
         ({"state": {"step": 3}}, "expected a checkpoint, got a file of"),
         ({"network": {}}, r"not the weights of this model: `first.bias` \(8,\) of float32 is missing; .*and 1 more"),
         ({"optimizer": {}}, "not a checkpoint of this training"),
         ({"random": torch.zeros(3)}, "not a checkpoint of this training"),
+        ({"run": 3}, "expected the settings of a training in it, got None"),
+        ({"run": {"training": [1]}}, r"expected the settings of a training in it, got \[1\]"),
+        (
+            {"run": {"training": {"steps": 3, "pace": 2, "gait": 1}}},
+            "this training was begun with settings that this version does not know: gait, pace; go on with",
+        ),
+        ({"run": {"training": {"seed": "x"}}}, "expected the settings of a training, got others"),
+        ({"run": {"training": {"steps": 0}}}, "expected the settings of a training, got others .*`steps` above 0"),
     ],
 )
 def test_checkpoints_of_other_contents_are_refused(change, told, interrupted, tensors):
     run, checkpoint = interrupted
     write_torch_file(checkpoint, torch.load(checkpoint, weights_only=True) | change)
-    with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {told}.*begin anew"):
-        train("forgetful", tensors, run, resume=True)
+    for config in (None, CONFIG):
+        with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {told}.*begin anew"):
+            train("forgetful", tensors, run, config, resume=True)
+    assert checkpoint.is_file(), "left as it is"

@@ -104,7 +104,8 @@ def test_errors_equal_a_loop_over_samples(tmp_path, monkeypatch):
         assert horizon.mae_m == pytest.approx(sum(math.hypot(dx, dy) for dx, dy in errors) / n, rel=1e-5)
 
 
-def test_rows_of_a_part_by_vehicle_maneuver_findings_and_dataset(tmp_path):
+@pytest.mark.parametrize("severity", ["info", "warning", "error"])
+def test_rows_of_a_part_by_vehicle_maneuver_findings_and_dataset(tmp_path, severity):
     """Vehicle 1 of subset b stops 3 m short of where it is said to be, vehicle 1 of subset c 1 m; b's has a finding."""
     stops = [(0.0, 0.0)] * 5
     tables = [
@@ -113,7 +114,7 @@ def test_rows_of_a_part_by_vehicle_maneuver_findings_and_dataset(tmp_path):
         ("c", track(1, stops), sample_at(1, 2, subset="c", maneuvers=("left", "brake")), NEIGHBORS.empty()),
     ]
     splits = pl.concat([BOTH, split_row("c", "eval")])
-    findings = finding(1, "warning", 1 + 5 * 3, 1 + 5 * 3, subset="b")
+    findings = finding(1, severity, 1 + 5 * 3, 1 + 5 * 3, subset="b")
     plain = TensorFolder.open(write(tmp_path, tables, splits, findings=findings))
     subsets = [
         own | {"dataset": dataset}
@@ -141,12 +142,15 @@ def test_rows_of_a_part_by_vehicle_maneuver_findings_and_dataset(tmp_path):
         ("all", "lateral=right"): (0, None),
         ("all", "longitudinal=normal"): (1, 3.0),
         ("all", "longitudinal=brake"): (1, 1.0),
-        ("all", "findings=touched"): (1, 3.0),
-        ("all", "findings=untouched"): (1, 1.0),
+        ("all", "findings=touched"): (0, None) if severity == "info" else (1, 3.0),
+        ("all", "findings=untouched"): (2, 2.0) if severity == "info" else (1, 1.0),
+        ("all", "findings=error"): (1, 3.0) if severity == "error" else (0, None),
+        ("all", "findings=no error"): (1, 1.0) if severity == "error" else (2, 2.0),
         ("highd", "all"): (1, 3.0),
         ("highd", "lateral=left"): (0, None),
         ("ngsim", "all"): (1, 1.0),
         ("ngsim", "findings=touched"): (0, None),
+        ("ngsim", "findings=no error"): (1, 1.0),
     }
     for (dataset, group), (n, mae_m) in expected.items():
         for average in ("samples", "vehicles"):
@@ -172,8 +176,8 @@ def test_the_table_of_an_evaluation(tmp_path):
     tensors = two_samples(tmp_path / "tensors")
     result = evaluate("constant-velocity", tensors, tmp_path / "models", with_latency=True)
     table = EVALUATIONS.validate(result.to_table(), where="here")
-    # 1 + 3 lateral + 2 longitudinal + 2 by findings; over all and of highd; two averages; 1 and 2 s.
-    assert table.height == 8 * 2 * 2 * 2
+    # 1 + 3 lateral + 2 longitudinal + 2 by findings twice; over all and of highd; two averages; 1 and 2 s.
+    assert table.height == 10 * 2 * 2 * 2
     assert table.select(
         "protocol", "protocol_digest", "split", "part", "origin", "model", "reference"
     ).unique().rows() == [(TINY.name, TINY.digest, "mine", "eval", "measured", "constant-velocity", "")]
@@ -227,6 +231,13 @@ def test_other_horizons_can_be_asked_for(tmp_path):
     assert [(row.seconds, row.n) for row in result.horizons] == [(0.5, 2), (1.5, 1)]
 
 
+def test_every_tick_of_the_horizon_can_be_asked_for(tmp_path):
+    result = evaluate("constant-velocity", two_samples(tmp_path / "tensors"), tmp_path, every_tick=True)
+    # After a second the first is 5 m off; otherwise both are where they are said to be, as long as they are known.
+    expected = [(0.5, 2, 0.0), (1.0, 2, 2.5), (1.5, 1, 0.0), (2.0, 1, 0.0)]
+    assert [(row.seconds, row.n, pytest.approx(row.mae_m, abs=1e-6)) for row in result.horizons] == expected
+
+
 def test_a_model_of_scenes_is_scored_by_its_egos(tmp_path):
     """Two vehicles side by side, each the other's neighbor; a model that says everybody goes on as it went."""
     folder = TensorFolder.open(two_samples(tmp_path))
@@ -242,6 +253,8 @@ def test_a_model_of_scenes_is_scored_by_its_egos(tmp_path):
     by_grid = measure_errors(ConstantVelocity(TINY), folder, "eval", name="grid")
     assert by_scene.horizons == by_grid.horizons
     assert by_scene.horizons[0].mae_m == pytest.approx(2.5, rel=1e-6)
+    assert by_scene.to_table()["nearest"].unique().to_list() == [3]
+    assert by_grid.to_table()["nearest"].unique().to_list() == [None], "a model of the grid is shown no more or fewer"
 
 
 def test_a_horizon_that_no_sample_reaches_has_no_error(tmp_path):
@@ -264,7 +277,9 @@ def test_predictions_that_are_not_numbers_are_refused(tmp_path):
 
 def test_unknown_and_untrained_models(tmp_path):
     tensors = two_samples(tmp_path / "tensors")
-    with pytest.raises(ValueError, match="unknown model `cv`: expected one of constant-velocity, "):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "config.json").touch()
+    with pytest.raises(ValueError, match=r"no run or model `cv`: expected one of the runs mine, .*constant-velocity"):
         evaluate("cv", tensors, tmp_path)
     with pytest.raises(FileNotFoundError, match="no trained run; run `tracklake train lstm` first"):
         evaluate("lstm", tensors, tmp_path)

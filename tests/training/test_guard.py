@@ -7,12 +7,12 @@ import polars as pl
 import pytest
 from tensor_tables import TINY, drive, random_clock, sample_everything, split_row, write
 
-from schemas.tensors import ARRAYS
+from schemas.tensors import ARRAYS, MOST_TICKS
 from training import guard
 from training.evaluate import measure_errors
 from training.guard import OF_ROWS, OF_SAMPLES, choose_moments, refuse_future, samples_of_scene
 from training.models.constant_velocity import ConstantVelocity
-from training.observed import FutureInputError, Observed
+from training.observed import FutureInputError
 from training.prediction import Density, Prediction
 from training.reading import read_samples
 from training.tensors import TensorFolder
@@ -107,6 +107,54 @@ class KnowsWhenTheTrackEnds(Still):
         return Prediction(super().predict(observed).position_m + self.folder.sample_future[numbers][:, None, None])
 
 
+class Compares(Still):
+    """Looks at differences between what follows only, and never beyond a track: an offset of it all does not show."""
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self.known = folder.sample_future.copy()
+
+
+class AddsUpLaterSteps(Compares):
+    def predict(self, observed):
+        said = super().predict(observed).position_m
+        _, numbers = self.recognise(observed)
+        for i, number in enumerate(numbers):
+            row, known = self.folder.sample_row[number], self.known[number]
+            steps = np.diff(self.folder.position_m[row + 1 : row + 1 + known].astype(np.float64), axis=0)
+            said[i, 1:known] = np.cumsum(steps, axis=0)
+        return Prediction(said)
+
+
+class CountsLaterLanes(Compares):
+    """The lane at the end of the future minus the one at its beginning."""
+
+    def predict(self, observed):
+        _, numbers = self.recognise(observed)
+        row, lane = self.folder.sample_row[numbers], self.folder.lane
+        changes = lane[row + self.known[numbers]] - lane[row + 1]
+        return Prediction(super().predict(observed).position_m + changes[:, None, None])
+
+
+class ReadsWhereTheRunEnds(Still):
+    def predict(self, observed):
+        _, numbers = self.recognise(observed)
+        row = self.folder.sample_row[numbers]
+        left = self.folder.run_first_row[self.folder.runs_of(row) + 1] - row
+        return Prediction(super().predict(observed).position_m + left[:, None, None])
+
+
+class LooksForTheVehicleLater(Still):
+    """Rows of all runs of the same vehicle: how long it will be seen, whatever the gaps."""
+
+    def predict(self, observed):
+        _, numbers = self.recognise(observed)
+        run = self.folder.runs_of(self.folder.sample_row[numbers])
+        same = self.folder.run_vehicle_id[:, None] == self.folder.run_vehicle_id[run]
+        rows = (np.diff(self.folder.run_first_row)[:, None] * same).sum(axis=0)
+        return Prediction(super().predict(observed).position_m + rows[:, None, None])
+
+
 @pytest.mark.parametrize("cheat", [AsksForTheFuture, AsksForTheManeuver])
 def test_asking_for_what_comes_is_refused(folder, cheat):
     with pytest.raises(FutureInputError, match="is not known when a model predicts: it sees history, neighbor_history"):
@@ -121,12 +169,21 @@ def test_asking_for_what_comes_is_refused(folder, cheat):
         (IsSureWhereItBrakes, "sigma_m"),
         (ReadsTheFutureSpeed, "position_m"),
         (KnowsWhenTheTrackEnds, "position_m"),
+        (ReadsWhereTheRunEnds, "position_m"),
+        (LooksForTheVehicleLater, "position_m"),
     ],
 )
 def test_a_model_that_reaches_the_tensors_another_way_is_found_out(folder, cheat, array):
     told = rf"`cheat` sees the future: what .* at tick \d+ of highd/b changes .*\(`{array}` of sample \d+, .* apart"
     with pytest.raises(FutureInputError, match=told):
         measure_errors(cheat(folder), folder, "eval", name="cheat")
+
+
+@pytest.mark.parametrize("cheat", [AddsUpLaterSteps, CountsLaterLanes])
+def test_a_model_that_looks_at_differences_between_later_rows_is_found_out(stored, cheat):
+    """No two histories of these tracks are the same, so that it looks at later rows of the moment only."""
+    with pytest.raises(FutureInputError, match="`cheat` sees the future"):
+        refuse_future(cheat(stored), stored, "eval", name="cheat")
 
 
 def test_a_model_that_reads_on_in_the_array_behind_its_own_is_found_out(folder, monkeypatch):
@@ -221,9 +278,52 @@ def test_everything_that_is_told_by_row_is_another_thing_afterwards(folder):
     assert OF_SAMPLES["sample_future"](np.array([1, 2, 4], dtype=np.uint8)).tolist() == [1, 1, 3]
 
 
-def test_moments_are_spread_over_the_part(folder):
+@pytest.mark.parametrize("name", ["position_m", "speed_mps", "lane"])
+def test_differences_between_later_rows_change_as_well(name):
+    """Whatever stood there: of two rows within a horizon of each other, not even the difference stays."""
+    dtypes = {"position_m": np.int16, "speed_mps": np.float32, "lane": np.int16}
+    still = np.zeros((20_000, 2) if name == "position_m" else 20_000, dtype=dtypes[name])
+    other = OF_ROWS[name](still)
+    for apart in range(1, MOST_TICKS + 1):
+        assert (other[apart:] != other[:-apart]).all()
+    assert len(np.unique(np.diff(other, axis=0).reshape(len(other) - 1, -1)[:, 0])) > 2, "nor does it grow evenly"
+
+
+def test_runs_end_at_the_moment_and_what_can_be_seen_of_them_stays(stored):
+    """Every row keeps its subset, tick and size; later ones are of nobody who was seen."""
+    for scene in stored.scenes_of("eval"):
+        _, tick, begin, after = guard._rows_after(stored, scene)
+        kept = dict(vars(stored))
+        rows = np.arange(len(stored.position_m))
+
+        def look_up(rows=rows):
+            run = stored.runs_of(rows)
+            ticks = stored.run_first_tick[run] + rows - stored.run_first_row[run]
+            facts = stored.run_subset[run], ticks, stored.run_length_m[run], stored.run_width_m[run]
+            return np.stack(facts), stored.run_vehicle_id[run], stored.run_first_row[run + 1]
+
+        facts, vehicle, _ = look_up()
+        here = facts[0] == facts[0][stored.scene_row[stored.scene_offset[scene]]]
+        assert after.tolist() == rows[here & (facts[1] > tick)].tolist()
+        with guard._another(stored, guard._cut_runs(stored, begin)):
+            facts_then, vehicle_then, end = look_up()
+            of_runs = [own.name for own in ARRAYS if own.shape == ("R",)]
+            assert {len(getattr(stored, name)) for name in of_runs} == {len(stored.run_first_row) - 1}
+        assert np.array_equal(facts_then, facts, equal_nan=True)
+        later = np.isin(rows, after)
+        assert np.array_equal(vehicle_then[~later], vehicle[~later])
+        assert not set(vehicle_then[later]) & set(vehicle)
+        present = here & (facts[1] == tick)
+        assert present.any()
+        assert (end[present] == rows[present] + 1).all()
+        assert all(vars(stored)[name] is values for name, values in kept.items())
+
+
+def test_moments_are_spread_over_the_part_and_are_not_its_ends(folder):
     scenes = folder.scenes_of("eval")
-    assert choose_moments(folder, "eval", 3).tolist() == [scenes[0], scenes[(len(scenes) - 1) // 2], scenes[-1]]
+    # In the middle of each third: 11 scenes, from the 3rd tick to the 13th, of which the last have short futures.
+    assert len(scenes) == 11
+    assert choose_moments(folder, "eval", 3).tolist() == [scenes[1], scenes[5], scenes[9]]
     assert choose_moments(folder, "eval", 1000).tolist() == scenes.tolist()
     assert len(choose_moments(folder, "val", 3)) == 0
     together = np.concatenate([samples_of_scene(folder, scene) for scene in scenes])
@@ -231,6 +331,12 @@ def test_moments_are_spread_over_the_part(folder):
 
 
 def test_what_may_be_seen_has_no_other_names(folder):
-    observed, _ = read_samples(folder, [0], "grid")
-    assert set(observed.__dataclass_fields__) == set(Observed.__dataclass_fields__)
-    assert not hasattr(observed, "future")
+    observed, truth = read_samples(folder, [0], "grid")
+    known = {"history", "neighbor_history", "neighbor_mask", "neighbor_sample", "neighbor_cell"}
+    assert set(vars(observed)) == known
+    scene, _ = read_samples(folder, [0], "scene")
+    assert set(vars(scene)) == {"history", "history_mask", "vehicle_mask", "size_m", "lanes"}
+    for given in (observed, scene):
+        for name in vars(truth):
+            with pytest.raises(FutureInputError, match=f"`{name}` is not known"):
+                getattr(given, name)

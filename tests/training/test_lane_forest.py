@@ -1,7 +1,7 @@
 """A forest's arrays say what scikit-learn's trees say; stored, they come back, and what is damaged is refused."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import BytesIO
 
 import numpy as np
@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, random_examples, track
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from training.lane_changes.examples import (
+    LEFT_OUT,
     STRATA,
     Examples,
     augment,
@@ -24,13 +27,14 @@ from training.lane_changes.forest import ForestError, LaneForest, decide
 from training.lane_changes.settings import LaneForestSettings
 from training.surroundings import gather_surroundings
 
+FACTS = {"protocol": {"name": "short"}, "blocks": [], "train_subsets": ["highd/a"]}
 FEW = LaneForestSettings(trees=7, leaf=3, augmentation=(), examples=400)
 HORIZONS_S = (0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
 def forest():
-    return grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts={"split": "here"})
+    return grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts=FACTS)
 
 
 @pytest.mark.parametrize("missing", [None, "r", "l"])
@@ -65,7 +69,7 @@ def test_it_learns_what_there_is_to_learn(forest):
 
 
 def test_same_seed_same_forest(forest):
-    again = grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts={"split": "here"})
+    again = grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts=FACTS)
     other = grow(random_examples(1, 300), FEW, 4, rate_hz=10, horizons_s=HORIZONS_S)
     np.testing.assert_array_equal(again.threshold, forest.threshold)
     assert again.facts == forest.facts
@@ -107,6 +111,10 @@ def in_header(**changes):
     return lambda file: rewrite(file, header=change)
 
 
+def with_settings(settings):
+    return in_header(facts={**FACTS, "settings": settings})
+
+
 def set_at(position, value):
     def change(array):
         array = array.copy()
@@ -138,6 +146,11 @@ DAMAGES = {
     "a negative rate": (in_header(rate_hz=-1), "a rate in Hz"),
     "too few features": (in_header(features=["speed_mps"]), "features 0 to 0"),
     "too many horizons": (in_header(horizons_s=[0.5, 1.0, 2.0]), r"odds in the shape \(\d+, 4, 3\)"),
+    "unknown origin": (in_header(facts={"settings": {}}), "facts of settings, protocol, .*, got settings;"),
+    "no settings": (with_settings([]), "settings by name, got list"),
+    "an unknown setting": (with_settings({"depth": 3}), "expected settings of start_s, .*; got depth = 3"),
+    "a setting of another kind": (with_settings({"trees": "many"}), "got trees = 'many'"),
+    "a setting that cannot be": (with_settings({"trees": 0}), "trees: expected more than 0"),
     "a circle": (lambda file: rewrite(file, left=set_at(0, 0)), "nodes that lead on"),
     "a way out": (lambda file: rewrite(file, right=set_at(0, 10**6)), "nodes that lead on"),
     "a tree that begins in the middle": (lambda file: rewrite(file, root=set_at(0, 1)), "first node in order"),
@@ -226,6 +239,8 @@ def test_samples_are_judged_where_the_track_goes_on(tmp_path):
     judged = judge_samples(found, "train", replace(FEW, start_s=3.0))
     # 20 ticks each: two of history before, and six (3 s, longer than the horizon of 2 s) after; 2 x 12 of 2 x 17.
     assert (len(judged.sample), judged.left_out, judged.changes) == (24, 10, 1)
+    # Samples are ticks 2 to 18 of 0 to 19: 16 to 18 lack the horizon of four ticks, 14 and 15 the six of T_d.
+    assert judged.reasons == dict(zip(LEFT_OUT, (0, 6, 4, 0), strict=True))
     ticks = found.sample_row[judged.sample] % 20
     assert ticks.tolist() == [*range(2, 14)] * 2
     changing = [3 <= tick <= 9 for tick in range(2, 14)] + [False] * 12  # from 3 s before the centre, tick 9
@@ -244,6 +259,19 @@ def test_samples_are_judged_where_the_track_goes_on(tmp_path):
     assert not examples.ahead[12:].any()
 
 
+def test_samples_without_a_lane_or_a_speed_are_left_out_and_counted(tmp_path):
+    """T_d of 1 s is shorter than the horizon of 2 s: ticks 2 to 9 of 14 are judged but for what is damaged here."""
+    lane = [1] * 14
+    lane[3] = 0
+    rows = track(1, [2.0] * 14, lane=lane)
+    rows = [(*row[:6], np.nan if row[1] == 6 else 20.0, row[7]) for row in rows]
+    judged = judge_samples(open_tracks(tmp_path / "t", {"a": rows}), "train", replace(FEW, start_s=1.0))
+    # Tick 3 has no lane; 10 to 12 lack the future; 6 has no speed, nor has 8 one to compare with, 1 s before.
+    assert judged.reasons == dict(zip(LEFT_OUT, (1, 3, 0, 2), strict=True))
+    assert len(judged.sample) == 5
+    assert [STRATA[code] for code in judged.stratum] == ["accelerating, keeping"] * 5
+
+
 def test_a_folder_is_learned_from(folder):
     fitted = fit_lane_forest(folder, 7, replace(FEW, start_s=3.0, augmentation=("mirror", "shift")))
     assert fitted.facts["train_subsets"] == ["highd/a"]
@@ -259,6 +287,24 @@ def test_a_folder_is_learned_from(folder):
     examples = gather_examples(folder, judged)
     np.testing.assert_array_equal(decided, decide(fitted.predict_proba(examples.feature)))
     assert (decided[:, 0] == examples.maneuver).mean() > (examples.maneuver == CODES["k"]).mean() + 0.1
+
+
+def test_without_evaluation_recordings_the_forest_stays_and_the_curve_is_explained(tmp_path, monkeypatch):
+    """The command, as where there is a single recording: everything trains."""
+    draw = np.random.default_rng(5)
+    rows = change_lanes(0, 6, to_right=True, draw=draw) + change_lanes(20, 6, to_right=False, draw=draw)
+    folder = open_tracks(tmp_path / "t", {"a": rows})
+    monkeypatch.setattr("pipeline.lake.load", lambda root: root)
+    monkeypatch.setattr("pipeline.stages.tensors.tensor_folder", lambda *_: folder.path)
+    settings = [part for own in ("trees=3", "leaf=2", "start_s=3") for part in ("--set", own)]
+    asked = ["lane-forest", "--lake", str(tmp_path / "lake"), "--learning-curve", *settings]
+    done = CliRunner().invoke(app, asked, catch_exceptions=False)
+    assert done.exit_code == 3
+    assert "no learning curve:" in done.stderr
+    assert "has no samples in `eval`; with a single recording everything trains" in done.stderr
+    out = tmp_path / "lake" / "models" / "lane-forest"
+    assert len(LaneForest.load(out / "forest.npz").root) == 3
+    assert json.loads((out / "lane_forest.json").read_text())["learning_curve"] == []
 
 
 def test_what_cannot_be_learned_from_is_refused(tmp_path):
@@ -279,11 +325,20 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path):
         ({"augmentation": ("rotate",)}, "augmentation is of mirror, shift; got rotate"),
         ({"start_s": 0.0}, "start_s: expected more than 0, got 0.0"),
         ({"shift_m": -1.0}, "shift_m: expected 0 or more, got -1.0"),
+        ({"start_s": float("inf")}, "start_s: expected more than 0, got inf"),
+        ({"shift_m": float("nan")}, "shift_m: expected 0 or more, got nan"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         LaneForestSettings(**wrong)
+
+
+def test_stored_settings_are_read_back():
+    asked = LaneForestSettings(start_s=3.0, trees=7, augmentation=("shift",))
+    stored = json.loads(json.dumps(asdict(asked)))
+    assert LaneForestSettings.read(stored) == asked
+    assert LaneForestSettings.read({"start_s": 3}) == LaneForestSettings(start_s=3.0)
 
 
 def test_int16_storage_gives_the_same_examples(tmp_path):

@@ -1,6 +1,7 @@
 """Cells by hand; and scores of models of which it is known where they are right."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from lane_tracks import CODES, SHORT, open_tracks, track
 from schemas.tensors import NOMINAL_LANE_M
 from training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
 from training.lane_changes.cells import find_columns, find_rows, measure_rows, number_cells
-from training.lane_changes.examples import STRATA, judge_samples
+from training.lane_changes.examples import LEFT_OUT, STRATA, judge_samples
 from training.lane_changes.forest import LaneForest
 from training.models.constant_velocity import ConstantVelocity
 from training.observed import FutureInputError
@@ -107,6 +108,7 @@ def test_scores_by_hand(one_change):
     predictors = {"straight": ConstantVelocity(SHORT), "short": Says([9.2, 17.2, 27, 36], 0.0)}
     scores = evaluate_grid(one_change, predictors, constant_forest("r", "k", "r", "r"))
     assert scores.left_out == 2 * 3, "ticks 7, 8 and 9"
+    assert scores.left_out_by_reason == dict(zip(LEFT_OUT, (0, 6, 0, 0), strict=True))
     assert len(scores.cells) == 2 * 2 * 3 * 5
     own_columns, forest_columns = {0.5: 5 + 5, 1.0: 2 + 5, 2.0: 1 + 5}, {0.5: 4 + 5, 1.0: 2, 2.0: 3}
     short_rows = {0.5: 5 + 5, 1.0: 0, 2.0: 5}
@@ -149,11 +151,47 @@ def test_a_true_place_outside_is_never_right(tmp_path):
         assert row.majority == 0.8
 
 
+class SaysNothing:
+    def predict(self, observed):
+        return Prediction(np.full((len(observed.history), 4, 2), np.nan, np.float32))
+
+
+class Short:
+    def predict(self, observed):
+        return Prediction(np.zeros((len(observed.history), 3, 2), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (SaysNothing(), r"`wrong`.* not finite numbers"),
+        (Says([9, 18, 27, np.inf], 0.0), r"`wrong`.* not finite numbers"),
+        (Short(), r"expected places of shape \(10, 4, 2\), got \(10, 3, 2\)"),
+    ],
+)
+def test_places_that_are_none_are_refused_or_their_model_is_passed_by(one_change, model, message):
+    """A cell of NaN would be the middle one."""
+    forest, straight = constant_forest("k", "k", "k", "k"), {"straight": ConstantVelocity(SHORT)}
+    with pytest.raises(ValueError, match=message):
+        evaluate_grid(one_change, {"wrong": model}, forest)
+    told = []
+    scores = evaluate_grid(
+        one_change, {"wrong": model, **straight}, forest, pass_by=lambda name, why: told.append((name, why))
+    )
+    [(name, why)] = told
+    assert (name, re.search(message, why) is not None) == ("wrong", True)
+    assert scores == evaluate_grid(one_change, straight, forest)
+
+
 def test_who_sees_the_future_is_found_out(one_change):
     class Peeks:
         def predict(self, observed):
             return Prediction(np.zeros((len(observed.history), 4, 2), np.float32) + one_change.position_m[-1, 0])
 
+    told = {}
+    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), pass_by=told.__setitem__)
+    assert (scores.cells, list(told)) == ([], ["peeks"])
+    assert "`peeks` sees the future" in told["peeks"]
     with pytest.raises(FutureInputError, match="`peeks` sees the future"):
         evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest("k", "k", "k", "k"))
 
@@ -211,7 +249,11 @@ def test_a_drawn_part_is_scored_in_part(busy):
 
 def test_the_learning_curve(busy):
     points = learn_curve(busy, sizes=(20, 60, 10**6), seeds=(0, 1), settings=SMALL)
-    pool = len(judge_samples(busy, "train", SMALL).sample)
+    counts = judge_samples(busy, "train", SMALL).count_strata()
+    assert (counts[:2] > 0).tolist() == [True, True], "everybody keeps his speed: two of the strata are empty"
+    assert not counts[2:].any()
+    pool = 2 * min(counts[:2])
+    assert 60 < pool < sum(counts)
     truth = judge_samples(busy, "eval", SMALL)
     sizes = sorted({(point.drawn, point.augmented, point.seed) for point in points})
     assert sizes == [(size, more, seed) for size in (20, 60, pool) for more in (False, True) for seed in (0, 1)]
@@ -226,5 +268,9 @@ def test_the_learning_curve(busy):
 
 def test_no_curve_without_an_evaluation_part(tmp_path):
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2.0] * 20)})
+    with pytest.raises(ValueError, match=r"split `mine` has no samples in `eval`; with a single recording everything"):
+        learn_curve(folder, settings=SMALL)
+    brief = {"a": track(1, [2.0] * 20), "b": track(1, [2.0] * 5)}
+    folder = open_tracks(tmp_path / "brief", brief, parts={"b": "eval"})
     with pytest.raises(ValueError, match=r"no sample of eval has a lane and a track"):
         learn_curve(folder, settings=SMALL)

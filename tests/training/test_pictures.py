@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M, open_moment, sure
+from lane_tracks import open_tracks, track
 
 from training.forecasters import Forecaster, open_forecaster
 from training.forecasts import forecast_samples, forecast_scene
@@ -130,6 +131,18 @@ def test_a_model_of_scenes_is_asked_once_about_everybody_it_is_shown(folder):
         [only] = said.alternatives
         assert only.sigma_m.tolist() == [[2, 3]] * 4
         assert only.correlation == pytest.approx([0.5] * 4)
+
+
+@pytest.mark.parametrize(("nearest", "told"), [(1, 2), (10, 11), (11, 12), (None, 14)])
+def test_a_model_of_scenes_is_shown_as_many_as_asked_for_or_everyone(tmp_path, nearest, told):
+    """Vehicles 0 to 13, each 7 m behind the one before; they are asked about the first, by the sample of tick 2."""
+    rows = [row for number in range(14) for row in track(number, [2.0] * 8, x_m=[90 - 7 * number] * 8)]
+    crowd, model = open_tracks(tmp_path / "t", {"a": rows}), Everybody()
+    found = forecast_scene(crowd, 0, [Forecaster("everybody", model, "scene")], nearest=nearest)
+    assert {vehicle: said[0].position_m[0].tolist() for vehicle, said in found.items()} == {
+        number: [90 - 7 * number + 7, 2] for number in range(told)
+    }
+    assert model.seen[0].vehicle_mask.tolist() == [[True] * told]
 
 
 class Curious:

@@ -1,9 +1,12 @@
 """Finished runs: what does not fit, or is not what was written, is refused."""
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
+from importlib.metadata import version
 
+import numpy as np
 import polars as pl
 import pytest
 import torch
@@ -11,8 +14,10 @@ from file_damages import DAMAGES
 from tensor_tables import TINY, split_row
 from tiny_network import PARTS, Forgetful, register, write_tiny
 
+from schemas.tensors import ARRAYS
 from training.evaluate import evaluate
-from training.runs import RUN_VERSION, StaleRunError, load_run
+from training.runs import RUN_VERSION, StaleRunError, digest_tensors, find_versions, load_run
+from training.tensors import TensorFolder
 from training.torch_files import write_torch_file
 from training.train import TrainConfig, train
 
@@ -100,3 +105,47 @@ def test_a_run_meets_new_recordings(finished, tmp_path):
     splits = pl.concat([PARTS, split_row("d", "eval")])
     with_another = write_tiny(tmp_path / "more", splits, subsets="abcd")
     assert evaluate("run", with_another, finished.parent).samples > 116
+
+
+def test_a_run_says_what_trained_it_and_is_not_judged_by_it(finished, trained):
+    """Older runs lack the versions, and told their tensors apart by fewer arrays."""
+    file = finished / "config.json"
+    config = json.loads(file.read_text())
+    assert config["versions"] == {"tracklake": version("tracklake"), "torch": version("torch")}
+    wanted = evaluate("run", trained / "tensors", finished.parent)
+    for versions in ({"versions": {"tracklake": "0.0.1", "torch": None}}, {}):
+        rest = {name: value for name, value in config.items() if name != "versions"}
+        file.write_text(json.dumps(rest | versions | {"tensors": "0123456789ab"}))
+        assert evaluate("run", trained / "tensors", finished.parent) == wanted
+
+
+def test_versions_of_what_is_not_installed_are_none(monkeypatch):
+    monkeypatch.setattr("training.runs.TRAINED_BY", ("tracklake", "no-such-distribution"))
+    assert find_versions() == {"tracklake": version("tracklake"), "no-such-distribution": None}
+
+
+# What tells tensors apart
+
+
+def test_the_digest_is_of_the_index_and_of_every_array(trained, monkeypatch):
+    folder = TensorFolder.open(trained / "tensors")
+    content = json.dumps(folder.index, sort_keys=True).encode()
+    content += b"".join(getattr(folder, array.name).tobytes() for array in ARRAYS)
+    wanted = hashlib.sha256(content).hexdigest()[:12]
+    assert digest_tensors(folder) == wanted
+    monkeypatch.setattr("training.runs.HASHED_BYTES", 1000)
+    assert digest_tensors(folder) == wanted, "in pieces as in one"
+
+
+@pytest.mark.parametrize("array", [array.name for array in ARRAYS])
+def test_one_number_of_any_array_is_told(array, trained):
+    folder = TensorFolder.open(trained / "tensors")
+    other = getattr(folder, array).copy()
+    other.view(np.uint8).reshape(-1)[-1] ^= 1
+    assert digest_tensors(replace(folder, **{array: other})) != digest_tensors(folder)
+
+
+def test_arrays_without_rows_have_a_digest(tmp_path):
+    folder = TensorFolder.open(write_tiny(tmp_path, PARTS[:0], subsets=""))
+    assert len(folder.position_m) == 0
+    assert len(digest_tensors(folder)) == 12

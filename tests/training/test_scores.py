@@ -28,7 +28,7 @@ class Case:
     dataset_of_vehicle: np.ndarray
     lateral: np.ndarray
     longitudinal: np.ndarray
-    touched: np.ndarray
+    findings: np.ndarray
     known: np.ndarray
     future: np.ndarray
     said: Prediction
@@ -43,15 +43,15 @@ class Case:
     @property
     def strata(self):
         keys = [
-            (int(v), int(a), int(o), bool(t))
-            for v, a, o, t in zip(self.vehicle, self.lateral, self.longitudinal, self.touched, strict=True)
+            (int(v), int(a), int(o), int(f))
+            for v, a, o, f in zip(self.vehicle, self.lateral, self.longitudinal, self.findings, strict=True)
         ]
         order = sorted(set(keys))
-        vehicle, lateral, longitudinal, touched = (np.array(column) for column in zip(*order, strict=True))
+        vehicle, lateral, longitudinal, findings = (np.array(column) for column in zip(*order, strict=True))
         here = sorted({DATASETS[self.dataset_of_vehicle[v]] for v in vehicle})
         dataset = np.array([here.index(DATASETS[self.dataset_of_vehicle[v]]) for v in vehicle])
         of_sample = np.array([order.index(key) for key in keys])
-        return Strata(of_sample, vehicle, dataset, lateral, longitudinal, touched, tuple(here))
+        return Strata(of_sample, vehicle, dataset, lateral, longitudinal, findings, tuple(here))
 
 
 def random_case(seed, samples, vehicles, *, alternatives=2):
@@ -65,7 +65,7 @@ def random_case(seed, samples, vehicles, *, alternatives=2):
         dataset_of_vehicle=np.sort(draw.integers(0, 2, vehicles)),
         lateral=draw.integers(0, 3, samples),
         longitudinal=draw.integers(0, 2, samples),
-        touched=draw.random(samples) < 0.4,
+        findings=draw.integers(0, 3, samples),
         known=draw.integers(1, TICKS + 1, samples),
         future=future,
         said=said,
@@ -97,7 +97,8 @@ def groups_of(case, i):
         "all",
         f"lateral={LATERAL_MANEUVERS[case.lateral[i]]}",
         f"longitudinal={LONGITUDINAL_MANEUVERS[case.longitudinal[i]]}",
-        "findings=touched" if case.touched[i] else "findings=untouched",
+        ("findings=untouched", "findings=touched", "findings=touched")[case.findings[i]],
+        ("findings=no error", "findings=no error", "findings=error")[case.findings[i]],
     }
 
 
@@ -169,7 +170,7 @@ def test_every_row_is_what_a_loop_over_samples_finds(seed, samples, vehicles, ba
         *(f"lateral={n}" for n in LATERAL_MANEUVERS),
         *(f"longitudinal={n}" for n in LONGITUDINAL_MANEUVERS),
     }
-    groups |= {"findings=touched", "findings=untouched"}
+    groups |= {"findings=touched", "findings=untouched", "findings=error", "findings=no error"}
     assert found.keys() == {(d, g, a, s) for d in {"all", *present} for g in groups for a in AVERAGES for s in SECONDS}
     nll = look_up_all(case)
     for key, row in found.items():
@@ -191,9 +192,7 @@ def plain(errors_by_vehicle, *, known=TICKS):
     position[..., 0] = errors[:, None]
     zeros = np.zeros(len(errors), dtype=np.int64)
     known = np.broadcast_to(known, len(errors))
-    return Case(
-        vehicle, np.zeros(len(vehicle), dtype=int), zeros, zeros, zeros > 0, known, future, Prediction(position)
-    )
+    return Case(vehicle, np.zeros(len(vehicle), dtype=int), zeros, zeros, zeros, known, future, Prediction(position))
 
 
 def test_vehicles_count_the_same_by_hand():

@@ -201,7 +201,9 @@ def test_who_comes_and_goes_is_seen_though_it_is_no_sample(tmp_path):
     assert not truth.future_mask[0, 1].any()
 
 
-def test_the_same_is_seen_whatever_the_others_do_later(tmp_path):
+@pytest.mark.parametrize("markings", [MARKINGS, None], ids=["markings", "no markings"])
+def test_the_same_is_seen_whatever_the_others_do_later(tmp_path, markings):
+    """But for lanes without markings: that one is to the right is known from the vehicle that drives there later."""
     now = [
         *stand(1, 0.0, 5.0, ticks=range(7)),
         *stand(2, 3.0, 5.0, ticks=range(3)),
@@ -210,11 +212,13 @@ def test_the_same_is_seen_whatever_the_others_do_later(tmp_path):
     later = [(2, tick, 90.0, 1.0, 3) for tick in range(3, 7)]
     seen = []
     for name, rows in (("gone", now), ("there", [*now, *later])):
-        folder = open_rows(tmp_path / name, rows)
+        folder = open_rows(tmp_path / name, rows, markings=markings)
         first = np.flatnonzero(folder.run_vehicle_id[folder.runs_of(folder.sample_row)] == 1)[0]
         seen.append(gather_surroundings(folder, [first], nearest=2)[0])
-    for own in ("history", "history_mask", "vehicle_mask", "size_m"):
+    for own in ("history", "history_mask", "vehicle_mask", "size_m", *(["lanes"] if markings else [])):
         np.testing.assert_array_equal(getattr(seen[0], own), getattr(seen[1], own))
+    right = [scene.lanes[0, 2, 2] for scene in seen]
+    assert right == ([1, 1] if markings else [0, 1])
 
 
 @pytest.mark.parametrize(

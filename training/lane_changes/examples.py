@@ -18,6 +18,9 @@ from training.tensors import TensorFolder
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: by the label."""
 SPEED_CHANGE_S = 1.0
+LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
+"""Why a sample is not judged: it has no lane now; its track ends before the horizon, or before T_d, so that a change
+would not have been seen; or its speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
 READ_AT_ONCE = 4096
 """Samples; their scenes are some 20 MB."""
 
@@ -30,15 +33,20 @@ class Judged:
         sample: (B,) numbers, increasing.
         maneuver: (B,) position in `schemas.columns.LATERAL_MANEUVERS`; from the future.
         stratum: (B,) position in STRATA; likewise.
-        left_out: samples of the part too near to their track's end to be known.
+        reasons: samples of the part that are left out, by LEFT_OUT.
         changes: lane changes in the whole folder.
     """
 
     sample: Integers
     maneuver: Bytes
     stratum: Bytes
-    left_out: int
+    reasons: dict[str, int]
     changes: int
+
+    @property
+    def left_out(self) -> int:
+        """Samples of the part that are none of these."""
+        return sum(self.reasons.values())
 
     def take(self, which: npt.NDArray[np.integer]) -> "Judged":
         """Some of them."""
@@ -83,7 +91,10 @@ class Examples:
 
 
 def judge_samples(folder: TensorFolder, part: str, settings: LaneForestSettings) -> Judged:
-    """The samples of a part whose maneuver and whose whole future are known, with their strata.
+    """The samples of a part whose maneuver, whole future and change of speed are known, with their strata.
+
+    One choice for everything that is scored: cells would need the horizon alone, but are told apart by maneuvers, whose
+    strata must be of the same samples.
 
     Raises:
         ValueError: no such part.
@@ -91,14 +102,22 @@ def judge_samples(folder: TensorFolder, part: str, settings: LaneForestSettings)
     maneuvers = find_maneuvers(folder, start_s=settings.start_s, tolerance_m=settings.tolerance_m)
     everything = folder.samples_of(part)
     row = folder.sample_row[everything].astype(np.intp)
-    judged = find_judged(folder, row, start_s=settings.start_s) & (folder.lane[row] > 0)
-    judged &= folder.sample_future[everything] >= folder.protocol.horizon_ticks
+    back = min(round(SPEED_CHANGE_S * folder.protocol.rate_hz), folder.protocol.history_ticks - 1)
+    gained_mps = folder.speed_mps[row] - folder.speed_mps[row - back]
+    lacks = np.stack(  # in the order of LEFT_OUT
+        [
+            folder.lane[row] <= 0,
+            folder.sample_future[everything] < folder.protocol.horizon_ticks,
+            ~find_judged(folder, row, start_s=settings.start_s),
+            np.isnan(gained_mps),
+        ]
+    )
+    judged = ~lacks.any(axis=0)
+    first = np.bincount(lacks.argmax(axis=0)[~judged], minlength=len(LEFT_OUT))
     sample, row = everything[judged], row[judged]
     maneuver = label_rows(folder, maneuvers)[row]
-    back = min(round(SPEED_CHANGE_S * folder.protocol.rate_hz), folder.protocol.history_ticks - 1)
-    slower = folder.speed_mps[row] < folder.speed_mps[row - back]
-    stratum = (2 * slower + (maneuver != KEEP)).astype(np.uint8)
-    return Judged(sample, maneuver, stratum, len(everything) - len(sample), len(maneuvers.end_row))
+    stratum = (2 * (gained_mps[judged] < 0) + (maneuver != KEEP)).astype(np.uint8)
+    return Judged(sample, maneuver, stratum, dict(zip(LEFT_OUT, first.tolist(), strict=True)), len(maneuvers.end_row))
 
 
 def gather_examples(folder: TensorFolder, judged: Judged) -> Examples:

@@ -44,6 +44,7 @@ def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSetting
         "train_subsets": sorted(folder.subsets_of("train")),
         "lane_changes": judged.changes,
         "left_out": judged.left_out,
+        "left_out_by_reason": judged.reasons,
         "samples_by_stratum": dict(zip(STRATA, judged.count_strata().tolist(), strict=True)),
         "drawn_by_stratum": dict(zip(STRATA, drawn.count_strata().tolist(), strict=True)),
     }

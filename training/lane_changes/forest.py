@@ -16,6 +16,7 @@ import numpy.typing as npt
 from schemas.columns import LATERAL_MANEUVERS
 from training.batches import Bytes, Floats
 from training.lane_changes.features import NAMES, NUMBER, describe_targets
+from training.lane_changes.settings import LaneForestSettings
 from training.observed import ObservedScene
 
 VERSION = 1
@@ -29,6 +30,8 @@ ARRAYS = {
     "threshold": np.dtype(np.float64),
     "leaf_odds": np.dtype(np.float64),
 }
+NEEDED_FACTS = ("settings", "protocol", "blocks", "train_subsets")
+"""Without these nobody can say what a forest may be scored on."""
 WALKED_AT_ONCE = 4096
 
 
@@ -73,6 +76,9 @@ class LaneForest:
 
     def predict_proba(self, described: Floats) -> Floats:
         """(B, 1 + T, 3) probabilities of keep, left and right: of the maneuver, then of the lane at each horizon.
+
+        They hold for the mix that the forest was fitted on, in which changes of lanes are drawn far more often than
+        they occur on the road: there, the probabilities of changes are lower.
 
         Args:
             described: (B, candidates) in the order of `features.FEATURES`.
@@ -125,7 +131,8 @@ class LaneForest:
         """Read what `save` wrote; nothing of it is executed.
 
         Raises:
-            ForestError: there is no such file, it is damaged or another, or its nodes do not make trees.
+            ForestError: there is no such file, it is damaged or another, its nodes do not make trees, or it does not
+                say what it was fitted on.
         """
         header, arrays = _read(file)
         if header.get("version") != VERSION:
@@ -140,6 +147,12 @@ class LaneForest:
                 f"{file}: expected horizons in s, a rate in Hz and facts, got {header.get('horizons_s')!r}, "
                 f"{header.get('rate_hz')!r} and {type(facts).__name__}{AGAIN}"
             )
+        if not set(NEEDED_FACTS) <= facts.keys():
+            raise ForestError(f"{file}: expected facts of {', '.join(NEEDED_FACTS)}, got {', '.join(facts)}{AGAIN}")
+        try:
+            LaneForestSettings.read(facts["settings"])
+        except ValueError as wrong:
+            raise ForestError(f"{file}: {wrong}{AGAIN}") from None
         _check_trees(file, arrays, len(names), len(horizons))
         return cls(tuple(names), int(rate_hz[0]), horizons, facts, **arrays)
 

@@ -4,7 +4,8 @@ Truth and labels come from the future: they are compared with, and group the sco
 `training.observed` lets them be seen.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,10 +23,11 @@ from training.lane_changes.labels import KEEP, LEFT
 from training.lane_changes.settings import LaneForestSettings
 from training.models import MODELS, Predictor, Reads
 from training.models.constant_velocity import ConstantVelocity
-from training.observed import ObservedScene
+from training.observed import FutureInputError, Observed, ObservedScene, part_batch
 from training.prediction import Prediction
-from training.reading import read_samples, truth_of_ego
+from training.reading import NEAREST
 from training.runs import refuse_leak
+from training.surroundings import gather_surroundings
 from training.tensors import TensorFolder
 
 ALL = "all"
@@ -102,12 +104,14 @@ class GridScores:
     Args:
         cells: by model, column, horizon and stratum.
         maneuvers: by stratum.
-        left_out: samples of the part whose maneuver or future is not known to the end.
+        left_out: samples of the part that are not scored.
+        left_out_by_reason: the same by `examples.LEFT_OUT`.
     """
 
     cells: list[CellScore]
     maneuvers: list[ManeuverScore]
     left_out: int
+    left_out_by_reason: dict[str, int]
 
     def to_dict(self) -> dict[str, Any]:
         """As plain values."""
@@ -135,6 +139,7 @@ def evaluate_grid(
     reads: Mapping[str, Reads] | None = None,
     most: int = MOST,
     seed: int = 0,
+    pass_by: Callable[[str, str], None] | None = None,
 ) -> GridScores:
     """Score models by the cell in which they say the vehicle will be, at every horizon that the forest knows.
 
@@ -149,52 +154,69 @@ def evaluate_grid(
         reads: by name: what each is given. Where a name is missing: what the registry says of it, else `grid`.
         most: samples at most.
         seed: of the draw where there are more.
+        pass_by: told the name of a model that cannot be scored, and why; it is left out. None: the first one is raised.
 
     Raises:
         FutureInputError: the forest or a model is found to see the future.
         ValueError: no such part; the forest has learned from subsets of this part; or it was fitted at another rate or
-            for horizons that the folder does not score.
+            for horizons that the folder does not score; or a model predicts places that are not finite numbers, or not
+            of the horizon's shape.
     """
     ticks = _find_ticks(folder, forest)
     refuse_leak(forest.facts, folder, part)
     given = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
     known = forest.facts["settings"]
+    asked = dict(predictors)
     settings = LaneForestSettings(start_s=known["start_s"], tolerance_m=known["tolerance_m"])
     judged = judge_samples(folder, part, settings)
-    left_out = judged.left_out
+    reasons = judged.reasons
     if len(judged.sample) > most:
         drawn = np.random.default_rng(seed).permutation(len(judged.sample))[:most]
         judged = judged.take(np.sort(drawn))
     if len(judged.sample):
         refuse_future(_Guarded(forest), folder, part, name="lane-forest", reads="scene")
-        for name, predictor in predictors.items():
-            refuse_future(predictor, folder, part, name=name, reads=given[name])
+        for name in predictors:
+            with _passing_by(name, asked, pass_by):
+                refuse_future(asked[name], folder, part, name=name, reads=given[name])
 
     true: list[_Cells] = []
     said: dict[tuple[str, str], list[_Cells]] = {(name, by): [] for name in predictors for by in ("place", "forest")}
     maneuver = [np.empty(0, dtype=np.uint8)]
     for numbers in _cut(judged.sample):
-        reader = _Reader(folder, numbers)
-        described = describe_targets(reader.see("scene"), forest.rate_hz)
+        seen = _Seen.read(folder, numbers)
+        described = describe_targets(seen.scene, forest.rate_hz)
         decided = decide(forest.predict_proba(described))  # (B, 1 + T)
         maneuver.append(decided[:, 0])
-        cells = _Grid(reader, described, ticks)
-        true.append(cells.find(reader.future[:, ticks]))
+        cells = _Grid(ConstantVelocity(folder.protocol).predict(seen.grid), seen.scene, described, ticks)
+        true.append(cells.find(seen.future[:, ticks]))
         forest_column = turn_to_columns(decided[:, 1:])
-        for name, predictor in predictors.items():
-            own = cells.find(predictor.predict(reader.see(given[name])).position_m[:, ticks])
-            said[name, "place"].append(own)
-            said[name, "forest"].append(_Cells(forest_column, own.row))
+        for name in list(asked):
+            with _passing_by(name, asked, pass_by):
+                own = cells.find(_ask(name, asked[name], seen, given[name])[:, ticks])
+                said[name, "place"].append(own)
+                said[name, "forest"].append(_Cells(forest_column, own.row))
     strata = _find_strata(judged)
     scores = [
         score
         for (name, by), pieces in said.items()
-        if pieces
+        if name in asked and pieces
         for score in _score_cells(name, by, _Cells.join(pieces), _Cells.join(true), forest.horizons_s, strata)
     ]
     decided_all = np.concatenate(maneuver)
     maneuvers = [score_maneuvers(name, decided_all[of], judged.maneuver[of]) for name, of in strata.items()]
-    return GridScores(scores, maneuvers, left_out)
+    return GridScores(scores, maneuvers, sum(reasons.values()), reasons)
+
+
+@contextmanager
+def _passing_by(name: str, asked: dict[str, Predictor], pass_by: Callable[[str, str], None] | None) -> Iterator[None]:
+    """Leave a model out that is refused, where somebody is told of it."""
+    try:
+        yield
+    except (FutureInputError, ValueError) as refused:
+        if pass_by is None:
+            raise
+        del asked[name]
+        pass_by(name, str(refused))
 
 
 class _Guarded:
@@ -208,32 +230,45 @@ class _Guarded:
         return Prediction(position_m=np.zeros((len(odds), 0, 2), np.float32), lateral=odds.reshape(len(odds), -1))
 
 
-class _Reader:
-    """Some samples, read as `grid` or `scene` once each."""
+@dataclass(frozen=True)
+class _Seen:
+    """Some samples, read in both ways, and what came of them."""
 
-    def __init__(self, folder: TensorFolder, numbers: Integers) -> None:
-        self._folder, self._numbers, self._seen = folder, numbers, dict[Reads, Any]()
-        self.see("scene")
-        self.see("grid")
+    grid: Observed[Any]
+    scene: ObservedScene[Any]
+    future: Floats
 
-    def see(self, reads: Reads) -> Any:  # noqa: ANN401  (Observed or ObservedScene)
-        if reads not in self._seen:
-            self._seen[reads], truth = read_samples(self._folder, self._numbers, reads)
-            self.future: Floats = truth_of_ego(truth).future
-        return self._seen[reads]
+    @classmethod
+    def read(cls, folder: TensorFolder, numbers: Integers) -> "_Seen":
+        grid, truth = part_batch(folder.gather(numbers))
+        scene, _ = gather_surroundings(folder, numbers, nearest=NEAREST)
+        return cls(grid, scene, truth.future)
 
-    @property
-    def protocol(self) -> Any:  # noqa: ANN401  (schemas.protocols.Protocol)
-        return self._folder.protocol
+
+def _ask(name: str, predictor: Predictor, seen: _Seen, reads: Reads) -> Floats:
+    """(B, F, 2) the places that a model says.
+
+    Raises:
+        ValueError: they are not finite numbers, or not of the horizon's shape.
+    """
+    place_m = predictor.predict(seen.scene if reads == "scene" else seen.grid).position_m
+    if place_m.shape != seen.future.shape:
+        raise ValueError(f"`{name}`: expected places of shape {seen.future.shape}, got {place_m.shape}")
+    if not np.isfinite(place_m).all():
+        raise ValueError(
+            f"`{name}` predicts positions that are not finite numbers; train it again with a lower learning rate"
+        )
+    return place_m
 
 
 class _Grid:
     """The nine cells of some samples at T horizons; made of what is seen of them."""
 
-    def __init__(self, reader: _Reader, described: Floats, ticks: npt.NDArray[np.intp]) -> None:
-        straight = ConstantVelocity(reader.protocol).predict(reader.see("grid"))
+    def __init__(
+        self, straight: Prediction, scene: ObservedScene[Any], described: Floats, ticks: npt.NDArray[np.intp]
+    ) -> None:
         self._middle_m = straight.position_m[:, ticks, 0]
-        self._lanes = reader.see("scene").lanes
+        self._lanes = scene.lanes
         self._length_m = measure_rows(described[:, NUMBER["relative_speed_mps"]], described[:, NUMBER["ego"]])
 
     def find(self, place_m: Floats) -> _Cells:
@@ -268,7 +303,8 @@ def _score_cells(
 ) -> Iterator[CellScore]:
     """One row for each horizon and stratum."""
     true_cell = number_cells(true.column, true.row)
-    row, lane = ((a == b) & (np.abs(b) < OUTSIDE) for a, b in ((said.row, true.row), (said.column, true.column)))
+    row = (said.row == true.row) & (np.abs(true.row) < OUTSIDE)
+    lane = (said.column == true.column) & (np.abs(true.column) < OUTSIDE)
     clipped = (_clip(said.row) == _clip(true.row)) & (_clip(said.column) == _clip(true.column))
     for horizon, seconds in enumerate(horizons_s):
         for stratum, of in strata.items():

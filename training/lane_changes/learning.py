@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from training.batches import Bytes
-from training.lane_changes.examples import Examples, draw_balanced, gather_examples, judge_samples
+from training.lane_changes.examples import Examples, Judged, draw_balanced, gather_examples, judge_samples
 from training.lane_changes.fitting import grow
 from training.lane_changes.forest import decide
 from training.lane_changes.grid import score_maneuvers
@@ -56,21 +56,29 @@ def learn_curve(
 ) -> list[LearningPoint]:
     """Fit forests on more and more of the training part, score each on the evaluation part.
 
-    The larger draws of a seed hold the smaller ones as far as the strata go. Where the training part has fewer samples
-    than a size asks for, what it has is taken, once.
+    All points of a curve are of the same mix, as many examples of each stratum, or the curve would show how the mix
+    changes. So it ends where the smallest stratum is used up: at 4 times its samples (of fewer strata, where some are
+    empty, as many times). Sizes beyond are that size, once. The larger draws of a seed hold the smaller ones.
 
     Args:
         folder: with a training and an evaluation part.
-        sizes: examples drawn, before augmentation.
+        sizes: examples drawn, before augmentation; each at most.
         seeds: each gives a curve.
         settings: of the forests; `examples` is taken from `sizes`, and augmentation is on (as it is set) and off.
 
     Raises:
-        ValueError: one of the parts has no sample whose maneuver is known.
+        ValueError: one of the parts has no samples, or none whose maneuver is known; or see `fitting.grow`.
     """
     settings = settings or LaneForestSettings()
     pools = {part: judge_samples(folder, part, settings) for part in ("train", "eval")}
     empty = [part for part, pool in pools.items() if not len(pool.sample)]
+    without = [part for part in empty if not len(folder.samples_of(part))]
+    if without:
+        raise ValueError(
+            f"{folder.path}: a learning curve is fitted on `train` and scored on `eval`, and the split "
+            f"`{folder.split}` has no samples in {' and '.join(f'`{part}`' for part in without)}; with a single "
+            "recording everything trains: add recordings and run `tracklake split`"
+        )
     if empty:
         raise ValueError(
             f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
@@ -80,15 +88,17 @@ def learn_curve(
     if len(scored.sample) > MOST_SCORED:
         drawn = np.random.default_rng(0).permutation(len(scored.sample))[:MOST_SCORED]
         scored = scored.take(np.sort(drawn))
+    most = count_even(pool)
+    sizes = sorted({min(size, most) for size in sizes})
     # Read once what any of the draws may need.
-    largest = {seed: draw_balanced(pool.stratum, max(sizes), np.random.default_rng(seed)) for seed in seeds}
+    largest = {seed: draw_balanced(pool.stratum, sizes[-1], np.random.default_rng(seed)) for seed in seeds}
     needed = np.unique(np.concatenate(list(largest.values())))
     examples, truth = gather_examples(folder, pool.take(needed)), gather_examples(folder, scored)
     points = []
     for seed in seeds:
         own = np.searchsorted(needed, largest[seed])
         stratum = pool.stratum[largest[seed]]
-        for size in sorted({min(size, len(own)) for size in sizes}):
+        for size in sizes:
             drawn = own[draw_balanced(stratum, size, np.random.default_rng(seed))]
             for augmentation in dict.fromkeys([(), settings.augmentation]):
                 changed = replace(settings, augmentation=augmentation, examples=size)
@@ -96,6 +106,13 @@ def learn_curve(
                 if point is not None:
                     points.append(point)
     return points
+
+
+def count_even(pool: Judged) -> int:
+    """How many samples can be drawn with as many of each stratum that is not empty."""
+    counts = pool.count_strata()
+    counts = counts[counts > 0]
+    return int(len(counts) * counts.min())
 
 
 def _fit_and_score(

@@ -1,6 +1,9 @@
 """What can be set of a lane-change forest; each value stands in the stored forest."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 from training.lane_changes.labels import START_S, TOLERANCE_M
 
@@ -43,8 +46,27 @@ class LaneForestSettings:
         if unknown:
             raise ValueError(f"augmentation is of {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
         for name in ("start_s", "examples", "trees", "leaf"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
         for name in ("tolerance_m", "shift_m", "least_correlation", "most_correlation"):
-            if getattr(self, name) < 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+    @classmethod
+    def read(cls, stored: object) -> Self:
+        """What a forest's facts hold; a setting that they lack is as it is by itself.
+
+        Raises:
+            ValueError: it is no object, or a value is none of these, of another kind, or cannot be.
+        """
+        if not isinstance(stored, Mapping):
+            raise ValueError(f"expected settings by name, got {type(stored).__name__}")
+        known = {own.name: own.default for own in fields(cls)}
+        read: dict[str, Any] = {}
+        for name, value in stored.items():
+            given = tuple(value) if isinstance(value, list) else value
+            given = float(given) if type(given) is int and isinstance(known.get(name), float) else given
+            if name not in known or type(given) is not type(known[name]):
+                raise ValueError(f"expected settings of {', '.join(known)}, each as by itself; got {name} = {value!r}")
+            read[name] = given
+        return cls(**read)

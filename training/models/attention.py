@@ -159,7 +159,7 @@ class SceneAttention(Network):
 
     def predict_scene(self, observed: ObservedScene[Any]) -> SceneForecast:
         """Means and covariances of all vehicles at once, as NumPy arrays; ObservedScene of NumPy arrays."""
-        mean, sigma, rho = self._ask(observed, self)
+        mean, sigma, rho = self.ask(observed, self)
         covariance = sigma[..., :, None] * sigma[..., None, :]  # (B, V, F, 2, 2)
         covariance[..., 0, 1] *= rho
         covariance[..., 1, 0] *= rho
@@ -167,7 +167,7 @@ class SceneAttention(Network):
 
     def look(self, observed: ObservedScene[Any]) -> Attention:
         """Who attends to what, as NumPy arrays; ObservedScene of NumPy arrays."""
-        _, weights = self._ask(observed, lambda tensors: self._attend(tensors, self._describe(tensors)))
+        _, weights = self.ask(observed, lambda tensors: self._attend(tensors, self._describe(tensors)))
         absent = ~np.asarray(observed.vehicle_mask)[:, None, :, None]
         return Attention(*(np.where(absent, np.float32(0), to_numpy(part)) for part in weights))
 
@@ -184,16 +184,6 @@ class SceneAttention(Network):
         encoded = torch.cat([to_vehicles, to_lanes], dim=-1)
         decoded, decoder_weights = self.decoder(encoded, encoded, there)
         return decoded, (vehicle_weights, lane_weights, decoder_weights)
-
-    @torch.no_grad()
-    def _ask(self, observed: ObservedScene[Any], ask: Any) -> Any:  # noqa: ANN401  (a function of an ObservedScene of tensors, and what it returns)
-        """Let a function see tensors, in evaluation mode."""
-        trained = self.training
-        self.eval()
-        try:
-            return ask(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
-        finally:
-            self.train(trained)
 
 
 def mean_distance(predicted: Tensor, future: Tensor, known: Tensor) -> Tensor:

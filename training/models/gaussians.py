@@ -2,10 +2,10 @@
 
 A negative log likelihood here is the negative logarithm of the density in nats, with every constant, of positions in
 metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`. In training and in
-evaluation it is the same. The code published with convolutional social pooling departs from it in two places, neither
-repeated here: the branch of its test that mixes maneuvers halves the second axis's square and the term between the axes
-twice, and what it subtracts to turn a density per square foot into one per square metre is 0.516, the decimal logarithm
-of 3.2808, where it should be 2 ln 3.2808 = 2.376.
+evaluation (`training.densities`, which also mixes alternatives) it is the same. The code published with convolutional
+social pooling departs from it in two places, neither repeated here: the branch of its test that mixes maneuvers halves
+the second axis's square and the term between the axes twice, and what it subtracts to turn a density per square foot
+into one per square metre is 0.516, the decimal logarithm of 3.2808, where it should be 2 ln 3.2808 = 2.376.
 """
 
 import math
@@ -43,11 +43,6 @@ def to_gaussian(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return raw[..., :2], torch.exp(-log_precision), torch.tanh(keep_within(raw[..., 4], -bound, bound))
 
 
-def log_density(mean: Tensor, sigma: Tensor, rho: Tensor, place: Tensor) -> Tensor:
-    """Logarithm of the density, in nats per square metre: (..., 2), (..., 2), (...), (..., 2) -> (...)."""
-    return _log_density((place - mean) / sigma, sigma, rho)
-
-
 def gaussian_nll(mean: Tensor, sigma: Tensor, rho: Tensor, future: Tensor, mask: Tensor) -> Tensor:
     """Mean negative log density in nats over the known positions; 0 where none is known.
 
@@ -62,26 +57,8 @@ def gaussian_nll(mean: Tensor, sigma: Tensor, rho: Tensor, future: Tensor, mask:
         ().
     """
     away = torch.where(mask[..., None], future - mean, 0.0) / sigma
-    return _mean_of_known(-_log_density(away, sigma, rho), mask)
-
-
-def mixture_nll(log_weight: Tensor, mean: Tensor, sigma: Tensor, rho: Tensor, future: Tensor, mask: Tensor) -> Tensor:
-    """The same of a mixture, at every position by itself: -log sum_a weight_a density_a.
-
-    Args:
-        log_weight: (..., A) logarithms of the alternatives' weights, which sum to 1.
-        mean: (..., A, F, 2) in m.
-        sigma: (..., A, F, 2) in m, above 0.
-        rho: (..., A, F) within (-1, 1).
-        future: (..., F, 2) in m; what is masked is not looked at.
-        mask: (..., F) True where it is known.
-
-    Returns:
-        ().
-    """
-    away = torch.where(mask[..., None, :, None], future[..., None, :, :] - mean, 0.0) / sigma
-    mixed = torch.logsumexp(log_weight[..., None] + _log_density(away, sigma, rho), dim=-2)  # (..., F)
-    return _mean_of_known(-mixed, mask)
+    missed = torch.where(mask, -_log_density(away, sigma, rho), 0.0)
+    return missed.sum() / mask.sum().clamp(min=1)
 
 
 def keep_within(value: Tensor, low: float, high: float) -> Tensor:
@@ -96,10 +73,6 @@ def _log_density(away: Tensor, sigma: Tensor, rho: Tensor) -> Tensor:
     rest = (1 - rho) * (1 + rho)
     distance = (along**2 + across**2 - 2 * rho * along * across) / rest
     return -0.5 * (distance + torch.log(rest)) - torch.log(sigma).sum(dim=-1) - math.log(2 * math.pi)
-
-
-def _mean_of_known(values: Tensor, mask: Tensor) -> Tensor:
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 class _Within(Function):

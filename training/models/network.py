@@ -1,6 +1,7 @@
 """What the training loop asks of a torch network, and the way from its tensors to a prediction."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -8,6 +9,8 @@ from torch import Tensor, nn
 
 from training.observed import Truth
 from training.prediction import Prediction
+
+Answer = TypeVar("Answer")
 
 
 class Network(nn.Module):
@@ -35,13 +38,22 @@ class Network(nn.Module):
         """Predict; called without gradients, in evaluation mode, with tensors on the weights' device."""
         raise NotImplementedError
 
-    @torch.no_grad()
     def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays)
         """Predict B samples given as NumPy arrays."""
+        return self.ask(observed, self.say)
+
+    def ask(self, observed: Any, question: Callable[[Any], Answer]) -> Answer:  # noqa: ANN401  (as above)
+        """Let a function see tensors on the weights' device: without gradients, in evaluation mode.
+
+        Args:
+            observed: of NumPy arrays.
+            question: what to do with the same of tensors.
+        """
         trained = self.training
         self.eval()
         try:
-            return self.say(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
+            with torch.no_grad():
+                return question(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
         finally:
             self.train(trained)
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from training.models.gaussians import (
@@ -15,8 +14,6 @@ from training.models.gaussians import (
     SIGMA_LIMITS_M,
     gaussian_nll,
     keep_within,
-    log_density,
-    mixture_nll,
     to_gaussian,
 )
 
@@ -56,40 +53,6 @@ def test_mean_negative_log_density_is_scipys(seed, batch, ticks):
     ]
     expected = -sum(densities) / len(densities) if densities else 0.0
     assert gaussian_nll(mean, sigma, rho, future, mask).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
-    known = log_density(mean, sigma, rho, future)[mask]
-    np.testing.assert_allclose(known.numpy(), densities, rtol=1e-9, atol=1e-9)
-
-
-@settings(max_examples=40)
-@given(seed=st.integers(0, 10_000), alternatives=st.integers(1, 6))
-def test_a_mixture_is_mixed_at_every_position(seed, alternatives):
-    raw, _ = draw(seed, 2, alternatives, 3)
-    random = np.random.default_rng(seed)
-    future = torch.from_numpy(random.normal(0, 2, (2, 3, 2)))
-    mask = torch.from_numpy(random.random((2, 3)) < 0.7)
-    mask[0, 0] = True
-    future[~mask] = math.nan
-    weight = random.dirichlet(np.ones(alternatives), 2)
-    mean, sigma, rho = to_gaussian(raw)
-    densities = []
-    for b, t in zip(*np.nonzero(mask.numpy()), strict=True):
-        each = [
-            scipy_log_density(mean[b, a, t].numpy(), sigma[b, a, t].numpy(), rho[b, a, t].item(), future[b, t])
-            for a in range(alternatives)
-        ]
-        densities.append(logsumexp(each, b=weight[b]))
-    found = mixture_nll(torch.from_numpy(weight).log(), mean, sigma, rho, future, mask)
-    assert found.item() == pytest.approx(-np.mean(densities), rel=1e-8)
-
-
-def test_an_alternative_without_weight_counts_for_nothing():
-    raw, future = draw(3, 1, 1, 4)
-    mean, sigma, rho = to_gaussian(raw)
-    mask = torch.ones(1, 4, dtype=torch.bool)
-    alone = gaussian_nll(mean[:, 0], sigma[:, 0], rho[:, 0], future[:, 0], mask)
-    twice = [each.expand(1, 2, *each.shape[2:]) for each in (mean + torch.zeros(1, 1, 1, 1), sigma, rho)]
-    mixed = mixture_nll(torch.tensor([[0.0, -math.inf]]), *twice, future[:, 0], mask)
-    assert mixed.item() == pytest.approx(alone.item())
 
 
 def test_extreme_numbers_stay_finite_and_at_the_limits():
@@ -107,10 +70,14 @@ def test_extreme_numbers_stay_finite_and_at_the_limits():
 def test_single_precision_suffices_at_the_limits():
     place, sigma = np.array([0.013, -0.02]), np.array([SIGMA_LIMITS_M[0], 0.03])
     expected = scipy_log_density([0.0, 0.0], sigma, CORRELATION_LIMIT, place)
-    found = log_density(
-        torch.zeros(2), torch.tensor(sigma).float(), torch.tensor(CORRELATION_LIMIT), torch.tensor(place).float()
+    found = gaussian_nll(
+        torch.zeros(1, 2),
+        torch.tensor(sigma).float()[None],
+        torch.tensor([CORRELATION_LIMIT]),
+        torch.tensor(place).float()[None],
+        torch.ones(1, dtype=torch.bool),
     )
-    assert found.item() == pytest.approx(expected, rel=1e-3)
+    assert found.item() == pytest.approx(-expected, rel=1e-3)
 
 
 def test_gradients_pass_inside_and_back_inside_only():

@@ -106,6 +106,14 @@ def test_straight_is_constant_velocity_or_nothing(protocol):
     np.testing.assert_array_equal(nothing, np.zeros_like(plain))
 
 
+def test_straight_takes_two_ticks_at_ten_hertz():
+    """x = 0, 1, 3 in the last 0.2 s: 1.5 a tick."""
+    history = torch.full((1, TWO_SECONDS.history_ticks, 2), 1e6)
+    history[0, -3:] = torch.tensor([[-3.0, 0.5], [-2.0, 7.0], [0.0, 0.0]])
+    places = Straight(TWO_SECONDS, residual=True)(history)[0]
+    assert places[:2].tolist() == [[1.5, -0.25], [3.0, -0.5]]
+
+
 @pytest.mark.parametrize("name", RESIDUAL)
 def test_residual_shifts_the_places_and_nothing_else(name):
     history, _ = wander(np.random.default_rng(5), CSP, 4)
@@ -124,35 +132,88 @@ def test_the_lstm_is_at_first_constant_velocity():
     np.testing.assert_allclose(build("lstm").predict(observe(history)).position_m, plain, rtol=1e-5, atol=1e-5)
 
 
-def step_by_step(network, history):
-    """The vanilla LSTM written out for one sample, tick by tick, in NumPy: five raw numbers per step."""
-    weight = {name: tensor.numpy().astype(float) for name, tensor in network.state_dict().items()}
+class Written:
+    """A network's layers written out in NumPy, for one sample, one tick at a time."""
 
-    def sigmoid(values):
-        return 1 / (1 + np.exp(-values))
+    def __init__(self, network):
+        self.weight = {name: tensor.numpy().astype(float) for name, tensor in network.state_dict().items()}
 
-    def leaky(values):
-        return np.where(values < 0, 0.1 * values, values)
+    def dense(self, layer, values):
+        return self.weight[f"{layer}.weight"] @ values + self.weight[f"{layer}.bias"]
 
-    def dense(layer, values):
-        return weight[f"{layer}.weight"] @ values + weight[f"{layer}.bias"]
-
-    def cell(layer, fed, hidden, memory):
-        gates = weight[f"{layer}.weight_ih_l0"] @ fed + weight[f"{layer}.bias_ih_l0"]
-        gates = gates + weight[f"{layer}.weight_hh_l0"] @ hidden + weight[f"{layer}.bias_hh_l0"]
+    def cell(self, layer, fed, hidden, memory, number=0):
+        gates = self.weight[f"{layer}.weight_ih_l{number}"] @ fed + self.weight[f"{layer}.bias_ih_l{number}"]
+        gates = gates + self.weight[f"{layer}.weight_hh_l{number}"] @ hidden + self.weight[f"{layer}.bias_hh_l{number}"]
         enter, forget, new, leave = np.split(gates, 4)
         memory = sigmoid(forget) * memory + sigmoid(enter) * np.tanh(new)
         return sigmoid(leave) * np.tanh(memory), memory
 
+    def stack(self, layer, fed, states):
+        """Two layers, the second fed what the first puts out; their states (hidden, memory) are changed in place."""
+        for number in (0, 1):
+            states[number] = self.cell(layer, fed, *states[number], number=number)
+            fed = states[number][0]
+        return fed
+
+
+def sigmoid(values):
+    return 1 / (1 + np.exp(-values))
+
+
+def leaky(values):
+    return np.where(values < 0, 0.1 * values, values)
+
+
+def step_by_step(network, history):
+    """The vanilla LSTM: five raw numbers per step."""
+    written = Written(network)
     hidden, memory = np.zeros(64), np.zeros(64)
     for position in history.astype(float):
-        hidden, memory = cell("encoder", leaky(dense("embedding", position)), hidden, memory)
-    encoding = leaky(dense("dynamics", hidden))
+        hidden, memory = written.cell("encoder", leaky(written.dense("embedding", position)), hidden, memory)
+    encoding = leaky(written.dense("dynamics", hidden))
     hidden, memory, raw = np.zeros(128), np.zeros(128), []
     for _ in range(F):
-        hidden, memory = cell("decoder", encoding, hidden, memory)
-        raw.append(dense("out", hidden))
+        hidden, memory = written.cell("decoder", encoding, hidden, memory)
+        raw.append(written.dense("out", hidden))
     return np.array(raw)
+
+
+def step_through_stacked(network, history):
+    """The stacked LSTM: all places at once, from the second layer's last state."""
+    written, states = Written(network), [(np.zeros(128), np.zeros(128)) for _ in range(2)]
+    for position in history.astype(float):
+        last = written.stack("encoder", position, states)
+    return written.dense("out", last).reshape(F, 2)
+
+
+def step_through_encoder_decoder(network, history):
+    """The encoder-decoder: a place per step, the decoder always fed the encoder's last output."""
+    written, states = Written(network), [(np.zeros(256), np.zeros(256)) for _ in range(2)]
+    for position in history.astype(float):
+        last = written.stack("encoder", np.maximum(written.dense("embedding", position), 0), states)
+    places = []
+    for _ in range(F):
+        decoded = written.stack("decoder", last, states)
+        places.append(written.dense("place", np.maximum(written.dense("output", decoded), 0)))
+    return np.array(places)
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [("stacked-lstm", step_through_stacked), ("lstm-encoder-decoder", step_through_encoder_decoder)],
+)
+@pytest.mark.parametrize("residual", [False, True])
+def test_stacked_networks_are_their_description(name, written, residual):
+    history, _ = wander(np.random.default_rng(11), CSP, 2)
+    network = build(name, residual=residual)
+    with torch.no_grad():
+        for weights in network.parameters():
+            weights *= 2  # states far enough from 0 that nothing of it is nearly linear
+    said = network.predict(observe(history)).position_m
+    ahead = np.arange(1, F + 1)[:, None]
+    for sample in range(2):
+        straight = ahead * (history[sample, -1] - history[sample, -2]) if residual else 0  # 0.2 s are one tick at 5 Hz
+        np.testing.assert_allclose(said[sample], straight + written(network, history[sample]), atol=1e-4)
 
 
 def test_vanilla_lstm_is_its_description():

@@ -83,6 +83,16 @@ def test_what_keeps_its_velocity_goes_on(name, protocol, velocity):
     np.testing.assert_allclose(said[0], ahead[:, None] * np.array(velocity), rtol=1e-4, atol=1e-4)
 
 
+def test_at_ten_hertz_the_velocity_is_that_of_the_last_two_ticks():
+    """x = 0, 1, 3 in the last 0.2 s: (3 - 0) / 2 = 1.5 a tick, neither the last step of 2 nor a longer mean."""
+    history = np.zeros((1, TWO_SECONDS.history_ticks, 2))
+    history[0, -3:, 0] = (-3, -2, 0)
+    history[0, :-3, 0] = 1e6
+    said = find_model("constant-velocity").build(TWO_SECONDS).predict(observe(history)).position_m[0]
+    assert said[:3].tolist() == [[1.5, 0], [3.0, 0], [4.5, 0]]
+    assert said[-1].tolist() == [30.0, 0]
+
+
 # Constant turn rate
 
 

@@ -66,8 +66,15 @@ def restate(model, observed, sample):
     return published.encode(weights, observed.history[sample], neighbors), weights
 
 
-def test_same_weights_same_density():
-    model = build("cs-lstm", residual=False)
+def straight_on(observed, sample):
+    """(F, 2) constant velocity by hand: 0.2 s are less than a tick at 2 Hz, so over one tick."""
+    step = observed.history[sample, -1] - observed.history[sample, -2]
+    return np.array([step, 2 * step, 3 * step, 4 * step])
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_same_weights_same_density(residual):
+    model = build("cs-lstm", residual=residual)
     observed, _ = draw(1, [5, 0, 39])
     said = model.predict(observed)
     assert said.lateral is None
@@ -77,13 +84,15 @@ def test_same_weights_same_density():
     for sample in range(3):
         encoding, weights = restate(model, observed, sample)
         expected = published.decode(weights, encoding, F)
+        expected[:, :2] += straight_on(observed, sample) if residual else 0
         np.testing.assert_allclose(said.density.mean_m[sample, 0], expected[:, :2], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(said.density.sigma_m[sample, 0], expected[:, 2:4], rtol=1e-9)
         np.testing.assert_allclose(said.density.correlation[sample, 0], expected[:, 4], rtol=1e-9, atol=1e-9)
 
 
-def test_same_weights_same_densities_of_all_maneuvers():
-    model = build("cs-lstm-m", residual=False)
+@pytest.mark.parametrize("residual", [False, True])
+def test_same_weights_same_densities_of_all_maneuvers(residual):
+    model = build("cs-lstm-m", residual=residual)
     observed, _ = draw(2, [6, 0, 11])
     said = model.predict(observed)
     np.testing.assert_allclose(said.density.weight.sum(axis=1), 1)
@@ -98,6 +107,7 @@ def test_same_weights_same_densities_of_all_maneuvers():
             for along in range(2):
                 given = published.with_maneuver(encoding, across, along)
                 expected = published.decode(weights, given, F)
+                expected[:, :2] += straight_on(observed, sample) if residual else 0
                 found = said.density
                 which = sample, 2 * across + along
                 assert found.weight[which] == pytest.approx(lateral[across] * longitudinal[along], rel=1e-9)
@@ -109,10 +119,10 @@ def test_same_weights_same_densities_of_all_maneuvers():
         np.testing.assert_allclose(said.position_m[sample], place, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize(("fast", "residual"), [(False, False), (True, False), (True, True)])
 @pytest.mark.parametrize("name", ["cs-lstm", "cs-lstm-m"])
-def test_losses_are_those_of_the_true_maneuver(name, fast):
-    model = build(name, residual=False)
+def test_losses_are_those_of_the_true_maneuver(name, fast, residual):
+    model = build(name, residual=residual)
     model.fast = fast
     observed, truth = draw(3, [4, 7])
     squares, densities, missed = [], [], []
@@ -125,7 +135,9 @@ def test_losses_are_those_of_the_true_maneuver(name, fast):
                 - np.log(published.recognise(weights, given, "op_lon")[longitudinal])
             )
             given = published.with_maneuver(given, lateral, longitudinal)
-        for tick, (along, across, *sigma, rho) in enumerate(published.decode(weights, given, F)):
+        decoded = published.decode(weights, given, F)
+        decoded[:, :2] += straight_on(observed, sample) if residual else 0
+        for tick, (along, across, *sigma, rho) in enumerate(decoded):
             if truth.future_mask[sample, tick]:
                 place = truth.future[sample, tick]
                 squares.append((place[0] - along) ** 2 + (place[1] - across) ** 2)
@@ -146,11 +158,23 @@ def test_losses_are_those_of_the_true_maneuver(name, fast):
     phase=st.sampled_from(["mse", "nll"]),
 )
 def test_the_quicker_step_is_the_same_step(seed, neighbors, name, phase):
-    model = build(name, seed=seed)
+    compare_steps(build(name, seed=seed), seed, neighbors, phase, by_hand=True)
+
+
+@pytest.mark.parametrize("name", ["cs-lstm", "cs-lstm-m"])
+def test_on_two_threads_the_quicker_step_is_the_same_step(name):
+    """There empty cells are left out as on one, but the LSTMs are PyTorch's own."""
+    torch.set_num_threads(2)
+    compare_steps(build(name), 1, [3, 0, 8], "nll", by_hand=False)
+
+
+def compare_steps(model, seed, neighbors, phase, *, by_hand):
+    """Losses and gradients of the published step and of the quicker one, which is found to be of that kind."""
     observed, truth = (to_tensors(arrays) for arrays in draw(seed, neighbors))
     losses, gradients = [], []
     for fast in (False, True):
         model.fast = fast
+        assert (model.sparse, model.by_hand) == (fast, fast and by_hand)
         model.zero_grad()
         loss = model.loss(observed, truth, phase)
         loss.backward()

@@ -1,0 +1,62 @@
+"""What the report takes from the lake's runs: those that fit the live tensors; damaged ones are passed by and named."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+
+from pipeline.lake.files import MODELS, TENSORS
+from pipeline.stages.score import collect_scores
+from training.runs import RUN_VERSION
+
+ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
+INDEX = {"protocol": {"name": "tiny"}, "blocks": [{"part": "eval"}]}
+MANIFEST = SimpleNamespace(entries={TENSORS: SimpleNamespace(info={"path": "tensors"})})
+
+
+def write_run(root, name, **config):
+    folder = root / MODELS / name
+    folder.mkdir(parents=True)
+    whole = {"version": RUN_VERSION, "model": "lstm", "parameters": {}, "train_subsets": [], **INDEX, **config}
+    (folder / "config.json").write_text(json.dumps(whole))
+    metrics = {"evaluation": {"part": "eval", "horizons": [{**ROW, "mae_m": 2.0}]}}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+@pytest.fixture
+def root(tmp_path):
+    (tmp_path / "tensors").mkdir()
+    (tmp_path / "tensors" / "index.json").write_text(json.dumps(INDEX))
+    write_run(tmp_path, "whole")
+    return tmp_path
+
+
+def test_runs_of_other_tensors_are_none(root):
+    write_run(root, "other", protocol={"name": "other"})
+    passed_by = []
+    assert collect_scores(root, MANIFEST, passed_by.append) == [{"model": "whole", "part": "eval", "rows": [ROW]}]
+    assert passed_by == []
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "told"),
+    [
+        ("config.json", "{", "config.json: not readable as JSON"),
+        ("config.json", '{"version": 1}', f"config.json: expected version {RUN_VERSION}, got 1; train it again"),
+        ("config.json", None, "config.json"),
+        ("metrics.json", "", "metrics.json: expected what a training scored, got JSONDecodeError"),
+        ("metrics.json", "[]", "metrics.json: expected what a training scored, got TypeError"),
+        ("metrics.json", '{"evaluation": {"part": "eval"}}', "got KeyError('horizons'); train it again"),
+    ],
+)
+def test_a_damaged_run_is_passed_by_and_named(root, file, content, told):
+    damaged = write_run(root, "damaged") / file
+    damaged.unlink() if content is None else damaged.write_text(content)
+    passed_by = []
+    scores = collect_scores(root, MANIFEST, passed_by.append)
+    assert [own["model"] for own in scores] == ["whole"]
+    (note,) = passed_by
+    assert note.startswith("a run is passed by: ")
+    assert str(damaged) in note
+    assert told in note

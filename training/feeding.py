@@ -1,0 +1,63 @@
+"""Batches for the training loop: step after step, on the device that the network is on."""
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy.typing as npt
+
+from training.batches import Integers
+from training.config import Plan
+from training.observed import part_batch
+from training.reading import read_samples
+from training.tensors import TensorFolder
+
+if TYPE_CHECKING:
+    import torch
+
+Read = Callable[[Integers], tuple[Any, Any]]
+"""Numbers of samples (B,) -> what may be seen of them and what came (`training.observed`), tensors on the device."""
+Batches = Iterator[tuple[int, Any, Any]]
+"""How many samples, what may be seen of them, and what came."""
+
+
+def read_batches(plan: Plan, read: Read, step: int) -> Batches:
+    """How many samples a step takes, what may be seen of them and what came; from a step on, without end."""
+    size = plan.recipe.batch_size
+    epoch, place = divmod(step, plan.epoch_steps)
+    while True:
+        order = plan.draw_epoch(epoch)
+        for first in range(place * size, len(order), size):
+            samples = order[first : first + size]
+            yield len(samples), *read(samples)
+        epoch, place = epoch + 1, 0
+
+
+def make_reader(plan: Plan) -> Read:
+    """How batches come to the device."""
+    import torch
+
+    reads, folder, device = plan.entry.reads, plan.folder, plan.device
+    if device.type != "cpu" and reads == "grid":
+        return make_resident_reader(folder, device)
+
+    def read(samples: Integers) -> tuple[Any, Any]:
+        observed, truth = read_samples(folder, samples, reads)
+        if device.type == "cpu":
+            return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
+
+        def move(array: npt.NDArray[Any]) -> torch.Tensor:
+            return torch.from_numpy(array).to(device)
+
+        return observed.each(move), truth.each(move)
+
+    return read
+
+
+def make_resident_reader(folder: TensorFolder, device: "torch.device") -> Read:
+    """Batches of grids gathered on a device, from tensors that stand there as a whole."""
+    import torch
+
+    from training.torch_batches import ResidentTensors
+
+    resident = ResidentTensors(folder, device)
+    return lambda samples: part_batch(resident.gather(torch.from_numpy(samples).to(device)))
