@@ -17,7 +17,7 @@ LANES = ("left", "own", "right")
 EGO = "ego"
 LEAST_MARGIN_M, MARGIN_SHARE = 6.0, 0.05
 """Drawn before and behind the outermost vehicles: the share of what they span, for their labels."""
-VERGE_M = 1.0
+VERGE_M = 2.5
 """Drawn beside the carriageway."""
 
 

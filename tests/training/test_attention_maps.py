@@ -104,7 +104,7 @@ def test_what_is_drawn_of_a_head(shown):
     assert [(cell["by"], cell["to"], cell["weight"]) for cell in cells][2:4] == [("a", "z", 3), ("b", "x", 4)]
     (first, last), (top, bottom) = span_road(shown)
     assert (first, last) == pytest.approx((-4.1 - 6, 80 + 6))  # 5 % of 84.1 m are less than 6 m
-    assert (top, bottom) == pytest.approx((-6 - 1, 2 + 1))  # the markings at 0, 4 and 8 m, the ego at 6 m
+    assert (top, bottom) == pytest.approx((-6 - 2.5, 2 + 2.5))  # the markings at 0, 4 and 8 m, the ego at 6 m
 
 
 def test_drawings_name_every_head_and_fetch_nothing(shown, tmp_path):
