@@ -9,7 +9,7 @@ from typing import Any
 import polars as pl
 from study_claims import judge
 from study_forest import describe_forest
-from study_plan import PLAIN, Arm
+from study_plan import ARMS, PLAIN, Arm
 from study_tables import FEW, grid, order, pick, show
 
 from schemas.evaluations import EVERYTHING, FIGURES
@@ -20,6 +20,12 @@ EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv
 NEAREST = (2, 6, 10, 20)
 """Vehicles around the ego that scene models are shown in evaluation: scenes of 3, 7, 11 and 21."""
 DATASETS = {"ngsim": "NGSIM-like", "highd": "highD-like"}
+_TABLED_FIGURES = ("rmse_m", "rmse_longitudinal_m", "rmse_lateral_m", "mae_m", "nll_nats")
+TABLED = (
+    *("model", "dataset", "group", "average", "seconds", "n", "vehicles", "seeds"),
+    *(column for name in _TABLED_FIGURES for column in (name, f"{name}_sd")),
+)
+"""Columns of the table beside the page."""
 DRAWN = ("constant-velocity", "v-lstm", "cs-lstm", "cs-lstm-m")
 
 
@@ -49,7 +55,7 @@ def write_page(out: Path, study: Study) -> None:
     figure, curves = out.with_suffix(".svg"), read_curves(rows[study.arms[0].name])
     figure.write_bytes(draw_error_growth(curves).render(figure.suffix))
     curves.write_csv(named.with_name(f"{named.name}-curves.csv"), float_precision=4)
-    summaries = [summarise(own).select(pl.lit(arm).alias("arm"), pl.all()) for arm, own in scored.items()]
+    summaries = [summarise(own).select(pl.lit(arm).alias("arm"), *TABLED) for arm, own in scored.items()]
     pl.concat(summaries).write_csv(out.with_suffix(".csv"), float_precision=4)
     parts = [
         introduce(study, named.name),
@@ -111,6 +117,8 @@ def introduce(study: Study, name: str) -> str:
     commits = ", ".join(trained["commit"].unique(maintain_order=True))
     digests = ", ".join(dict.fromkeys(f"`{own.protocol}` {PROTOCOLS[own.protocol].digest}" for own in study.arms))
     options = study.plan
+    absent = [own.name for own in ARMS if own not in study.arms]
+    left_out = f" Not in it: {', '.join(absent)}." if absent else ""
     return f"""\
 # Results
 
@@ -125,7 +133,7 @@ them; how much each has seen stands below. The commands took {jobs["seconds"].su
 of them two at a time on two cores, a thread each. Figures are mean ± standard deviation over seeds; a dash stands for
 fewer than {FEW} samples. Networks count their places from constant velocity (`residual`), which the publications do
 not. Generated traffic is not the field's: published figures stand beside measured ones where `tracklake evaluate`
-prints them, not here."""
+prints them, not here.{left_out}"""
 
 
 def describe_arm(arm: Arm, rows: pl.DataFrame, lake: Path) -> str:
