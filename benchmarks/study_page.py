@@ -17,6 +17,8 @@ from schemas.protocols import PROTOCOLS
 from training.error_figure import draw_error_growth
 
 EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv", "jobs.csv"
+GROUPS = "groups.csv"
+"""Of the study's folder: means over seeds of every group of samples; too large to stand beside the page."""
 NEAREST = (2, 6, 10, 20)
 """Vehicles around the ego that scene models are shown in evaluation: scenes of 3, 7, 11 and 21."""
 DATASETS = {"ngsim": "NGSIM-like", "highd": "highD-like"}
@@ -56,7 +58,7 @@ def write_page(out: Path, study: Study) -> None:
     figure.write_bytes(draw_error_growth(curves).render(figure.suffix))
     curves.write_csv(named.with_name(f"{named.name}-curves.csv"), float_precision=4)
     summaries = [summarise(own).select(pl.lit(arm).alias("arm"), *TABLED) for arm, own in scored.items()]
-    pl.concat(summaries).write_csv(out.with_suffix(".csv"), float_precision=4)
+    pl.concat(summaries).write_csv(study.work / GROUPS, float_precision=4)
     parts = [
         introduce(study, named.name),
         judge(scored, study.plan["seeds"]),
@@ -125,7 +127,8 @@ def introduce(study: Study, name: str) -> str:
 Written by `make study` (`--minutes {options["minutes"]:g} --seeds {options["seeds"]} --samples-per-epoch
 {options["samples_per_epoch"]}`). Trained at commit {commits}; plan {study.digest}; protocols {digests}. Do not edit:
 what the figures say is discussed in [{name}-discussion.md]({name}-discussion.md). Means over seeds of every group:
-[{name}.csv]({name}.csv); every seed at every tick of the models drawn: [{name}-curves.csv]({name}-curves.csv).
+`{GROUPS}` in the study's folder; every seed at every tick of the models drawn:
+[{name}-curves.csv]({name}-curves.csv).
 
 {options["seeds"]} seeds a model, {options["minutes"]:g} minutes of generated traffic, congested (NGSIM-like) and free
 (highD-like), in one lake. An epoch takes {options["samples_per_epoch"]:,} samples at most, and slow models a share of

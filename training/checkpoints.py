@@ -242,7 +242,7 @@ def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> N
         )
 
 
-def _find_differences(then: Any, now: Any, name: str = "") -> list[str]:  # noqa: ANN401  (plain values of any depth)
+def _find_differences(then: object, now: object, name: str = "") -> list[str]:
     """What differs between two runs, by name."""
     if then == now:
         return []

@@ -2,19 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, runtime_checkable
+from typing import TYPE_CHECKING, Any, runtime_checkable
 from typing import Protocol as Interface
 
 import numpy as np
 import numpy.typing as npt
 
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from training.batches import Floats
 from training.forecasters import Forecaster
+from training.observed import ObservedScene
 from training.prediction import Density, Prediction
 from training.reading import NEAREST, read_samples
-from training.surroundings import find_around
+from training.surroundings import find_around, gather_surroundings
 from training.tensors import TensorFolder
 from training.windows import check_numbers, place
+
+if TYPE_CHECKING:
+    from training.models.attention import SceneForecast
 
 Doubles = npt.NDArray[np.float64]
 
@@ -133,7 +138,7 @@ def forecast_scene(
 class ScenePredictor(Interface):
     """A model that predicts every vehicle of a scene at once."""
 
-    def predict_scene(self, observed: Any) -> Any:  # noqa: ANN401  (ObservedScene in, SceneForecast out: naming them would import torch)
+    def predict_scene(self, observed: ObservedScene[Any]) -> "SceneForecast":
         """Means, covariances and mask of all vehicles, relative to the ego's last position."""
         ...
 
@@ -143,7 +148,7 @@ def _forecast_around(
 ) -> dict[int, Forecast]:
     """What a model of scenes says of every vehicle that it is shown, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = read_samples(folder, number, "scene", nearest=nearest)
+    observed, _ = gather_surroundings(folder, number, nearest=nearest)
     said, around = model.predict_scene(observed), find_around(folder, number, nearest)
     ids = folder.run_vehicle_id[folder.runs_of(around.row[0])]
     origin = find_origins(folder, number)[0]
@@ -201,7 +206,7 @@ def _place_density(density: Density, number: int, origin_m: Doubles) -> tuple[Al
     )
 
 
-def _name(names: tuple[str, ...], probabilities: Any, number: int) -> dict[str, float] | None:  # noqa: ANN401  (an array or None)
+def _name(names: tuple[str, ...], probabilities: Floats | None, number: int) -> dict[str, float] | None:
     if probabilities is None:
         return None
     return {name: round(float(share), 4) for name, share in zip(names, probabilities[number], strict=True)}

@@ -1,8 +1,8 @@
 """What a model may see of samples, and what it is to predict, kept apart: a prediction is never given the truth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, Self, TypeVar
+from dataclasses import Field, dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, Self, TypeVar
 
 from training.batches import Batch
 
@@ -18,11 +18,13 @@ class FutureInputError(AttributeError):
 
 
 class _Arrays:
-    """Arrays of one kind, by name."""
+    """Arrays of one kind, by name; every heir is a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def each(self, change: Callable[[Any], Any]) -> Self:
         """The same with every array changed, for instance to a tensor on a device."""
-        return type(self)(**{own.name: change(getattr(self, own.name)) for own in fields(self)})  # type: ignore[arg-type]  # every heir is a dataclass
+        return type(self)(**{own.name: change(getattr(self, own.name)) for own in fields(self)})
 
 
 class _Blind(_Arrays):
@@ -36,7 +38,7 @@ class _Blind(_Arrays):
         """
         if name.startswith("__"):
             raise AttributeError(name)
-        known = ", ".join(own.name for own in fields(self))  # type: ignore[arg-type]  # every heir is a dataclass
+        known = ", ".join(own.name for own in fields(self))
         raise FutureInputError(
             f"`{name}` is not known when a model predicts: it sees {known}. Futures and maneuvers are for `loss` alone"
         )

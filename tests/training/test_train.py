@@ -230,12 +230,12 @@ def test_the_seed_decides_the_weights_bit_for_bit_and_the_callers_random_numbers
     torch.manual_seed(11)
     drawn = []
     np.random.seed(5)  # noqa: NPY002  the legacy state is what might be disturbed
-    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    state = np.random.get_state()[1].copy()  # noqa: NPY002  the same
     for name, seed in (("one", 1), ("two", 1), ("three", 2)):
         train("forgetful", tensors, tmp_path / name, replace(FEW, seed=seed))
         drawn.append(torch.rand(1))
     assert torch.cat(drawn).tolist() == wanted[:3].tolist()
-    assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
+    assert (np.random.get_state()[1] == state).all()  # noqa: NPY002  the same
     one, two, three = (weights_of(tmp_path / name) for name in ("one", "two", "three"))
     assert all(torch.equal(one[name], two[name]) for name in one)
     assert not any(torch.equal(one[name], three[name]) for name in one)

@@ -1,7 +1,7 @@
 """Fitting a lane-change forest with scikit-learn: draw, augment, choose features, grow, keep the arrays."""
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,9 @@ from training.lane_changes.features import NUMBER
 from training.lane_changes.forest import LaneForest
 from training.lane_changes.settings import LaneForestSettings
 from training.tensors import TensorFolder
+
+if TYPE_CHECKING:
+    from sklearn.ensemble import RandomForestClassifier
 
 
 def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSettings | None = None) -> LaneForest:
@@ -111,7 +114,7 @@ def grow(
     return LaneForest(names, rate_hz, horizons_s, known, **arrays)
 
 
-def fit_trees(given: Floats, classes: Bytes, settings: LaneForestSettings, seed: int) -> Any:  # noqa: ANN401  (scikit-learn has no types)
+def fit_trees(given: Floats, classes: Bytes, settings: LaneForestSettings, seed: int) -> "RandomForestClassifier":
     """A `RandomForestClassifier` on (B, features) and (B, outputs) codes of LATERAL_MANEUVERS."""
     from sklearn.ensemble import RandomForestClassifier
 
@@ -121,7 +124,7 @@ def fit_trees(given: Floats, classes: Bytes, settings: LaneForestSettings, seed:
     return forest.fit(given, classes)
 
 
-def to_arrays(fitted: Any) -> dict[str, npt.NDArray[Any]]:  # noqa: ANN401  (scikit-learn has no types)
+def to_arrays(fitted: "RandomForestClassifier") -> dict[str, npt.NDArray[Any]]:
     """The trees of a fitted forest of several outputs as the arrays of `LaneForest`."""
     trees = [tree.tree_ for tree in fitted.estimators_]
     nodes = np.array([tree.node_count for tree in trees])

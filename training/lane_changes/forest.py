@@ -166,7 +166,7 @@ def decide(odds: Floats) -> Bytes:
     return decided
 
 
-def _read_numbers(values: Any) -> tuple[float, ...] | None:  # noqa: ANN401  (whatever a JSON file holds)
+def _read_numbers(values: object) -> tuple[float, ...] | None:
     """A list of numbers above 0; None where it is none."""
     numbers = values if isinstance(values, list) else [None]
     if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in numbers):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -68,7 +69,7 @@ def check_phase(phase: str, *known: str) -> None:
         raise ValueError(f"unknown phase `{phase}` of training: expected one of {', '.join(known)}")
 
 
-def to_numpy(tensor: Tensor) -> Any:  # noqa: ANN401  (an array of the tensor's dtype)
+def to_numpy(tensor: Tensor) -> npt.NDArray[Any]:
     """A tensor of any device as an array."""
     return tensor.detach().cpu().numpy()
 
