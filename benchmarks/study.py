@@ -139,7 +139,8 @@ def learn(arm: Arm, learner: Learner, seed: int, lake: Path, options: argparse.N
     settings = [part for setting in learner.settings for part in ("--set", setting)]
     samples = max(1, round(options.samples_per_epoch * learner.share))
     where = ("--lake", lake, "--protocol", arm.protocol, "--name", name)
-    how = ("--seed", seed, "--samples-per-epoch", samples, "--threads", 1, *settings)
+    epochs = ("--epochs", arm.epochs) if arm.epochs else ()
+    how = ("--seed", seed, "--samples-per-epoch", samples, *epochs, "--threads", 1, *settings)
     begun = (lake / "models" / f".{name}.unfinished" / "checkpoint.pt").exists()
     runner.run("train", learner.model, *where, *how, *(["--resume"] if begun else []), environment=arm.environment)
 
@@ -169,7 +170,7 @@ def read_options() -> argparse.Namespace:
     parser.add_argument("--minutes", type=float, default=4.0, help="of the generated recordings")
     parser.add_argument("--sample-seed", type=int, default=0, help="of the generated recordings")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each model")
-    parser.add_argument("--samples-per-epoch", type=int, default=30_000, help="at most; slow models take a share")
+    parser.add_argument("--samples-per-epoch", type=int, default=50_000, help="at most; slow models take a share")
     parser.add_argument("--at-once", type=int, default=2, help="trainings at a time, a thread each")
     parser.add_argument("--us101", type=Path, default=EXCERPT, help="the public excerpt of US-101 (290 vehicles)")
     parser.add_argument("--without-us101", action="store_true", help="leave its part out")
