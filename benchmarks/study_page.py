@@ -14,7 +14,7 @@ from study_tables import FEW, grid, order, pick, show
 
 from schemas.evaluations import EVERYTHING, FIGURES
 from schemas.protocols import PROTOCOLS
-from training.error_figure import draw_error_growth
+from training.pictures.error_figure import draw_error_growth
 
 EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv", "jobs.csv"
 GROUPS = "groups.csv"

@@ -101,8 +101,8 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
     """Train for so long."""
     import torch
 
-    from training.memory import keep_freed_memory
     from training.models import find_model
+    from training.running.memory import keep_freed_memory
 
     if step.endswith("kept"):
         keep_freed_memory()

@@ -72,8 +72,8 @@ def evaluate(
         from pipeline.stages.tensors import tensor_folder
         from schemas.columns import PARTS
         from schemas.evaluations import EVALUATIONS
-        from training.published import published_rows
         from training.reading import NEAREST
+        from training.scoring.published import published_rows
 
         if part not in PARTS:
             raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
@@ -123,7 +123,7 @@ def _evaluate_all(
     """Score one after the other; runs made for other tensors are passed by, unless they were asked for by name."""
     from training.evaluate import evaluate as evaluate_model
     from training.observed import FutureInputError
-    from training.runs import StaleRunError
+    from training.running.runs import StaleRunError
 
     found = []
     for name in names:

@@ -168,7 +168,7 @@ def _find_predictors(
     """
     from pipeline.stages.score import finished_runs
     from training.models import MODELS
-    from training.runs import load_run, refuse_leak
+    from training.running.runs import load_run, refuse_leak
 
     predictors: dict[str, Predictor] = {name: MODELS[name].build(folder.protocol) for name in MODELS_BESIDE}
     reads = {name: MODELS[name].reads for name in MODELS_BESIDE}
@@ -231,7 +231,7 @@ def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
 
 def _show_cells(terminal: "Terminal", cells: "list[CellScore]", protocol: str) -> None:
     from training.lane_changes.grid import ALL
-    from training.published import CELL_ACCURACY, CELL_ACCURACY_S
+    from training.scoring.published import CELL_ACCURACY, CELL_ACCURACY_S
 
     horizons = sorted({own.seconds for own in cells})
     strata = list(dict.fromkeys(own.stratum for own in cells))

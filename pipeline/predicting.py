@@ -15,7 +15,7 @@ from pipeline.session import command, read_settings
 if TYPE_CHECKING:
     from pipeline.terminal import Terminal
     from training.forecasters import Forecaster
-    from training.pictures import Picture
+    from training.pictures.picture import Picture
     from training.tensors import TensorFolder
 
 FOLDER = "predictions"
@@ -76,7 +76,7 @@ def predict(
         from pipeline.lake import load, write_aside
         from pipeline.lake.files import MODELS
         from pipeline.stages.tensors import tensor_folder
-        from training.prediction_drawing import draw_picture
+        from training.pictures.drawing import draw_picture
         from training.tensors import TensorFolder
 
         _check(models or [], sample, vehicle, time, pick, part, count, out)
@@ -140,7 +140,7 @@ def _check(
 
 def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
     """The sample that was named, if one was."""
-    from training.picking import find_sample
+    from training.pictures.picking import find_sample
 
     if sample is not None:
         last = len(folder.sample_row) - 1
@@ -172,7 +172,7 @@ def _open_all(
         alone: no constant velocity beside others.
     """
     from training.forecasters import open_forecaster
-    from training.runs import StaleRunError
+    from training.running.runs import StaleRunError
 
     found = [open_forecaster(name, folder, models, parts) for name in dict.fromkeys(names)]
     if not names:
@@ -204,7 +204,7 @@ def _pick(
     asked: list["Forecaster"],
 ) -> list[int]:
     """Samples of a kind."""
-    from training.picking import MOST_LOOKED_AT, pick_samples
+    from training.pictures.picking import MOST_LOOKED_AT, pick_samples
 
     found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=asked[-1])
     if pick is Pick.WORST:
@@ -218,9 +218,9 @@ def _pick(
 
 def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_vehicles: bool) -> "Picture":
     """Let models predict, then look up what came."""
-    from training.forecasts import forecast_samples, forecast_scene
     from training.observed import FutureInputError
-    from training.pictures import take_picture
+    from training.pictures.forecasts import forecast_samples, forecast_scene
+    from training.pictures.picture import take_picture
 
     try:
         if all_vehicles:
@@ -243,7 +243,7 @@ def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_v
 
 def _tell(terminal: "Terminal", picture: "Picture", file: Path) -> None:
     """Where the drawing is, and how far each model is from the truth at its end."""
-    from training.picture_rows import list_errors
+    from training.pictures.rows import list_errors
 
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
     off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
@@ -264,7 +264,7 @@ def _refuse_inattentive(asked: list["Forecaster"]) -> None:
 
 def _draw_attention(folder: "TensorFolder", asked: list["Forecaster"], samples: list[int], target: Path) -> list[Path]:
     """Attention maps of every model that has any, in a folder of its name."""
-    from training.attention_maps import export_attention
+    from training.pictures.attention_maps import export_attention
 
     found = []
     for own in asked:

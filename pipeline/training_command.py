@@ -13,8 +13,8 @@ from pipeline.options import JsonOption, LakeOption, ProtocolOption, QuietOption
 from pipeline.session import command, failure, read_settings
 
 if TYPE_CHECKING:
-    from training.config import TrainConfig
     from training.models import Model
+    from training.running.config import TrainConfig
 
 
 def train(
@@ -120,7 +120,7 @@ def _check_name(name: str) -> str:
 
 def _read_settings_of_model(entry: "Model", settings: list[str]) -> dict[str, Any]:
     """NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
-    from training.config import RECIPE_SETTINGS
+    from training.running.config import RECIPE_SETTINGS
 
     recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS}
     known = {**recipe, **entry.parameters}
@@ -132,7 +132,7 @@ def _read_settings_of_model(entry: "Model", settings: list[str]) -> dict[str, An
 
 def _make_config(given: dict[str, Any], *, resume: bool | None) -> "TrainConfig | None":
     """What was said about the training; None where nothing was and a training is gone on with as it was begun."""
-    from training.config import TrainConfig
+    from training.running.config import TrainConfig
 
     if resume and not given:
         return None

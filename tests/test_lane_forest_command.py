@@ -11,7 +11,7 @@ from schemas.protocols import CSP
 from training.lane_changes import LaneForest
 from training.lane_changes.examples import LEFT_OUT, STRATA
 from training.lane_changes.features import NAMES
-from training.runs import describe_run, save_run
+from training.running.runs import describe_run, save_run
 from training.tensors import TensorFolder
 
 

@@ -5,9 +5,11 @@
 - `training.augmentation`: the road mirrored, positions shifted.
 - `training.models`: the registry of models, one file each.
 - `training.train`: train a model into a run's folder.
-- `training.evaluate`: the errors of a model or run at each horizon, in many groups; `training.guard` comes before it.
-- `training.prediction_drawing`: samples drawn with what models say; `training.error_figure`: errors over the horizon.
-- `training.published`: what others published, to stand beside.
+- `training.evaluate`: the errors of a model or run at each horizon, in many groups.
+- `training.lane_changes`: a random forest that foretells lane changes, and the cells of a grid around a vehicle.
+
+Behind these: `mapped` (tensor folders from within), `running` (what a training stands on), `scoring` (errors,
+densities, and the guard that comes before them), `pictures` (samples, attention and errors drawn).
 
 Nothing imports torch before `training.torch_batches` or a model that needs it is asked for.
 """

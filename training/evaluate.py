@@ -11,11 +11,11 @@ import polars as pl
 from schemas.evaluations import EVALUATIONS, EVERYTHING
 from schemas.protocols import Protocol
 from training.forecasters import open_forecaster
-from training.guard import refuse_future
-from training.latency import Latency, measure_latency
 from training.models import Predictor, Reads
 from training.reading import NEAREST, read_samples, truth_of_ego
-from training.scores import Score, Tally, find_strata
+from training.scoring.guard import refuse_future
+from training.scoring.latency import Latency, measure_latency
+from training.scoring.scores import Score, Tally, find_strata
 from training.tensors import TensorFolder
 
 BATCH_SIZE = 2048
@@ -145,7 +145,7 @@ def measure_errors(
     nearest: int = NEAREST,
     seconds: Sequence[float] | None = None,
 ) -> Evaluation:
-    """Predict every sample of a part and sum up the errors, after `training.guard.refuse_future`.
+    """Predict every sample of a part and sum up the errors, after `training.scoring.guard.refuse_future`.
 
     Args:
         predictor: given what may be seen of the samples, and nothing else.

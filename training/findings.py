@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from schemas.columns import SEVERITIES
 from training.batches import Flags
-from training.windows import check_numbers
+from training.mapped.windows import check_numbers
 
 if TYPE_CHECKING:
     from training.tensors import TensorFolder

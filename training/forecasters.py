@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from training.models import MODELS, Predictor, Reads, find_model
-from training.runs import load_run, refuse_leak, refuse_unfinished
+from training.running.runs import load_run, refuse_leak, refuse_unfinished
 from training.tensors import TensorFolder
 
 

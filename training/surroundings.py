@@ -8,8 +8,8 @@ import numpy.typing as npt
 
 from schemas.tensors import NOMINAL_LANE_M
 from training.batches import Flags, Floats, Integers
+from training.mapped.windows import Rows, check_numbers, place, subtract
 from training.observed import ObservedScene, Truth
-from training.windows import Rows, check_numbers, place, subtract
 
 if TYPE_CHECKING:
     from training.tensors import TensorFolder

@@ -13,11 +13,11 @@ from schemas.columns import PARTS
 from schemas.protocols import Protocol
 from schemas.tensors import STEPS_M
 from training.batches import Batch, Bytes, Floats, Integers, SceneBatch
-from training.checks import TensorError
-from training.drawing import draw_numbers
-from training.opening import map_arrays, read_index, read_protocol
-from training.scenes import Lanes, find_lanes, find_scenes_of_samples, gather_scenes
-from training.windows import Masks, Windows, check_numbers, place, spread, subtract
+from training.mapped.checks import TensorError
+from training.mapped.draws import draw_numbers
+from training.mapped.opening import map_arrays, read_index, read_protocol
+from training.mapped.scenes import Lanes, find_lanes, find_scenes_of_samples, gather_scenes
+from training.mapped.windows import Masks, Windows, check_numbers, place, spread, subtract
 
 __all__ = ["Batch", "SceneBatch", "TensorError", "TensorFolder"]
 
@@ -162,7 +162,7 @@ class TensorFolder:
             part: train, val or eval.
             batch_size: B.
             shuffle_seed: draws the order; None = the samples' own.
-            shuffle_block: shuffle within blocks of so many samples, see `training.drawing.draw_numbers`.
+            shuffle_block: shuffle within blocks of so many samples, see `training.mapped.draws.draw_numbers`.
             absolute: see `Batch`.
         """
         order = {"shuffle_seed": shuffle_seed, "shuffle_block": shuffle_block}

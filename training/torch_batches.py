@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from training.batches import Batch, Integers
-from training.drawing import draw_numbers
+from training.mapped.draws import draw_numbers
 from training.tensors import TensorFolder, find_part
 
 Change = Callable[[Batch], Batch]
@@ -78,7 +78,7 @@ class BatchStream(IterableDataset[TorchBatch]):
         batch_size: B; the last batch may be smaller.
         shuffle_seed: of the first pass; the next one takes the next seed (with workers: another). None = the samples'
             own order.
-        shuffle_block: see `training.drawing.draw_numbers`.
+        shuffle_block: see `training.mapped.draws.draw_numbers`.
         absolute: see `Batch`.
         pin_memory: whether batches stand in page-locked memory; needs an accelerator.
         change: made to each batch before it becomes torch, such as `training.augmentation.mirror`. Each worker has a

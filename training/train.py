@@ -8,7 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from training.checkpoints import (
+from training.evaluate import measure_errors
+from training.models import Model, Predictor, find_model, require_torch
+from training.observed import FutureInputError
+from training.running.checkpoints import (
     CHECKPOINT_FILE,
     TrainingState,
     claim_folder,
@@ -20,15 +23,12 @@ from training.checkpoints import (
     restore,
     save_checkpoint,
 )
-from training.config import Plan, TrainConfig, make_plan
-from training.evaluate import measure_errors
-from training.feeding import Batches, Read, make_reader, read_batches
-from training.guard import refuse_future
-from training.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
-from training.memory import keep_freed_memory
-from training.models import Model, Predictor, find_model, require_torch
-from training.observed import FutureInputError
-from training.runs import describe_run, save_run
+from training.running.config import Plan, TrainConfig, make_plan
+from training.running.feeding import Batches, Read, make_reader, read_batches
+from training.running.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
+from training.running.memory import keep_freed_memory
+from training.running.runs import describe_run, save_run
+from training.scoring.guard import refuse_future
 from training.tensors import TensorFolder
 
 if TYPE_CHECKING:
@@ -90,8 +90,8 @@ def train(
         FutureInputError: the model sees what comes after the moment at which it predicts; told before the first step
             where it does so untrained, else after the last. No checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
-        ValueError: unknown model or parameter; not enough to train with, see `training.config.make_plan`; or no time
-            for one step.
+        ValueError: unknown model or parameter; not enough to train with, see `training.running.config.make_plan`; or no
+            time for one step.
         ImportError: torch is needed and missing.
     """
     entry = find_model(model)

@@ -17,8 +17,8 @@ from pipeline.stages.tensors import tensor_folder
 from schemas import SUBSETS
 from schemas.columns import PARTS
 from training.batches import Batch
+from training.mapped.windows import spread
 from training.tensors import TensorFolder
-from training.windows import spread
 
 Format = Literal["parquet", "npz"]
 CARD = "README.md"

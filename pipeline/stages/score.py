@@ -56,7 +56,7 @@ def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None
     Returns:
         {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
     """
-    from training.runs import StaleRunError, read_config
+    from training.running.runs import StaleRunError, read_config
 
     if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
         return []
@@ -79,7 +79,7 @@ def _read_score(path: Path) -> dict[str, Any] | None:
     Raises:
         StaleRunError: the file is damaged.
     """
-    from training.runs import AGAIN, StaleRunError
+    from training.running.runs import AGAIN, StaleRunError
 
     try:
         evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]

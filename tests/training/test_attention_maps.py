@@ -9,10 +9,10 @@ import pytest
 from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, open_moment
 from tensor_tables import TINY
 
-from training.attention_drawing import compose_attention, draw_attention
-from training.attention_maps import export_attention, map_attention
-from training.attention_rows import list_bands, list_boxes, list_cells, span_road, tell_head
 from training.models import find_model
+from training.pictures.attention_drawing import compose_attention, draw_attention
+from training.pictures.attention_maps import export_attention, map_attention
+from training.pictures.attention_rows import list_bands, list_boxes, list_cells, span_road, tell_head
 
 HEADS = 2
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from training.densities import find_nll
 from training.prediction import Density
+from training.scoring.densities import find_nll
 
 
 def random_density(draw, *, samples, alternatives, ticks):

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 import polars as pl
 import pytest
 
-from training.error_figure import COLUMNS, MOST_MODELS, draw_error_growth, summarise_seeds
+from training.pictures.error_figure import COLUMNS, MOST_MODELS, draw_error_growth, summarise_seeds
 
 
 def table(*rows):

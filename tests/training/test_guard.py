@@ -8,13 +8,13 @@ import pytest
 from tensor_tables import TINY, drive, random_clock, sample_everything, split_row, write
 
 from schemas.tensors import ARRAYS, MOST_TICKS
-from training import guard
 from training.evaluate import measure_errors
-from training.guard import OF_ROWS, OF_SAMPLES, choose_moments, refuse_future, samples_of_scene
 from training.models.constant_velocity import ConstantVelocity
 from training.observed import FutureInputError
 from training.prediction import Density, Prediction
 from training.reading import read_samples
+from training.scoring import guard
+from training.scoring.guard import OF_ROWS, OF_SAMPLES, choose_moments, refuse_future, samples_of_scene
 from training.tensors import TensorFolder
 
 BOTH = pl.concat([split_row("a", "train"), split_row("b", "eval")])

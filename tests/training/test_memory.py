@@ -8,7 +8,7 @@ import pytest
 
 REPEATED = """
 import resource
-from training.memory import keep_freed_memory
+from training.running.memory import keep_freed_memory
 
 done = keep_freed_memory()
 

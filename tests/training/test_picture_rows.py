@@ -9,9 +9,10 @@ from drawn_moment import FAR, NEAR, OWN, OWN_SAMPLE, open_moment, sure
 from hypothesis import given
 from hypothesis import strategies as st
 
-from training.drawing_labels import list_odds, spread_labels
-from training.forecasts import forecast_scene
-from training.picture_rows import (
+from training.pictures.forecasts import forecast_scene
+from training.pictures.labels import list_odds, spread_labels
+from training.pictures.picture import take_picture
+from training.pictures.rows import (
     choose_view,
     list_alternatives,
     list_boxes,
@@ -24,7 +25,6 @@ from training.picture_rows import (
     list_truths,
     trace_ellipses,
 )
-from training.pictures import take_picture
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M
 from lane_tracks import open_tracks, track
 
 from training.forecasters import Forecaster, open_forecaster
-from training.forecasts import forecast_samples, forecast_scene
 from training.observed import FutureInputError, ObservedScene
-from training.pictures import take_picture
+from training.pictures.forecasts import forecast_samples, forecast_scene
+from training.pictures.picture import take_picture
 from training.prediction import Prediction
 
 

@@ -8,7 +8,7 @@ from drawn_moment import FAR, OWN, make_moment
 from typer.testing import CliRunner
 
 from pipeline import cli
-from training.runs import describe_run, save_run
+from training.running.runs import describe_run, save_run
 from training.tensors import TensorFolder
 
 
@@ -130,8 +130,8 @@ def test_without_a_lake_there_is_nothing_to_draw(tmp_path, monkeypatch):
 
 def test_kinds_to_pick_are_those_that_samples_are_picked_by():
     from pipeline.predicting import MOST_MODELS, SUFFIXES, Pick
-    from training import charts, prediction_drawing
-    from training.picking import PICKS
+    from training.pictures import charts, drawing
+    from training.pictures.picking import PICKS
 
     assert {pick.value for pick in Pick} == set(PICKS)
-    assert (MOST_MODELS, SUFFIXES) == (prediction_drawing.MOST_MODELS, charts.SUFFIXES)
+    assert (MOST_MODELS, SUFFIXES) == (drawing.MOST_MODELS, charts.SUFFIXES)

@@ -8,13 +8,13 @@ from itertools import pairwise
 import pytest
 from drawn_moment import OWN, OWN_SAMPLE, open_moment, sure
 
-from training.charts import Tables
-from training.drawing_key import MODEL_COLOURS, draw_key, list_entries
 from training.forecasters import open_forecaster
-from training.forecasts import forecast_samples, forecast_scene
-from training.picture_rows import choose_view
-from training.pictures import take_picture
-from training.prediction_drawing import draw_picture
+from training.pictures.charts import Tables
+from training.pictures.drawing import draw_picture
+from training.pictures.forecasts import forecast_samples, forecast_scene
+from training.pictures.key import MODEL_COLOURS, draw_key, list_entries
+from training.pictures.picture import take_picture
+from training.pictures.rows import choose_view
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -5,7 +5,7 @@ import pytest
 from schemas.evaluations import EVALUATIONS, FIGURES
 from schemas.protocols import PROTOCOLS
 from training.models import MODELS
-from training.published import CELL_ACCURACY, CELL_ACCURACY_S, CHOI_2021, KIM_2020, PUBLISHED, published_rows
+from training.scoring.published import CELL_ACCURACY, CELL_ACCURACY_S, CHOI_2021, KIM_2020, PUBLISHED, published_rows
 
 ELSEWHERE = {"MHA-LSTM", "STDAN"}
 """Published models that we have none of."""

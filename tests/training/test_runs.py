@@ -16,9 +16,9 @@ from tiny_network import PARTS, Forgetful, register, write_tiny
 
 from schemas.tensors import ARRAYS
 from training.evaluate import evaluate
-from training.runs import RUN_VERSION, StaleRunError, digest_tensors, find_versions, load_run
+from training.running.runs import RUN_VERSION, StaleRunError, digest_tensors, find_versions, load_run
+from training.running.torch_files import write_torch_file
 from training.tensors import TensorFolder
-from training.torch_files import write_torch_file
 from training.train import TrainConfig, train
 
 CONFIG = TrainConfig(epochs=1)
@@ -120,7 +120,7 @@ def test_a_run_says_what_trained_it_and_is_not_judged_by_it(finished, trained):
 
 
 def test_versions_of_what_is_not_installed_are_none(monkeypatch):
-    monkeypatch.setattr("training.runs.TRAINED_BY", ("tracklake", "no-such-distribution"))
+    monkeypatch.setattr("training.running.runs.TRAINED_BY", ("tracklake", "no-such-distribution"))
     assert find_versions() == {"tracklake": version("tracklake"), "no-such-distribution": None}
 
 
@@ -133,7 +133,7 @@ def test_the_digest_is_of_the_index_and_of_every_array(trained, monkeypatch):
     content += b"".join(getattr(folder, array.name).tobytes() for array in ARRAYS)
     wanted = hashlib.sha256(content).hexdigest()[:12]
     assert digest_tensors(folder) == wanted
-    monkeypatch.setattr("training.runs.HASHED_BYTES", 1000)
+    monkeypatch.setattr("training.running.runs.HASHED_BYTES", 1000)
     assert digest_tensors(folder) == wanted, "in pieces as in one"
 
 

@@ -13,7 +13,7 @@ from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from schemas.evaluations import AVERAGES, EVALUATIONS, FIGURES
 from training.observed import Truth
 from training.prediction import Density, Prediction
-from training.scores import Score, Strata, Tally
+from training.scoring.scores import Score, Strata, Tally
 
 TICKS, RATE_HZ = 4, 2
 SECONDS = (0.5, 1.0, 2.0)

@@ -11,7 +11,7 @@ from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, F, H, block_of, loop_ove
 from tensor_tables import CLOCK, TINY, sample_everything, sizes_of, split_row, write
 
 from schemas.protocols import Protocol
-from training.checks import TensorError
+from training.mapped.checks import TensorError
 from training.observed import FutureInputError
 from training.surroundings import gather_surroundings
 from training.tensors import TensorFolder

@@ -12,7 +12,7 @@ from tensor_tables import CLOCK, drive, sample_everything, split_row, write
 
 from schemas.columns import PARTS
 from schemas.samples import NEIGHBORS, SAMPLES
-from training.drawing import draw_numbers
+from training.mapped.draws import draw_numbers
 from training.tensors import TensorFolder
 
 

@@ -10,7 +10,7 @@ from tensor_tables import TINY, drive, sample_everything, split_row, write
 
 from schemas.columns import PARTS
 from schemas.tensors import ARRAYS, ARRAYS_FILE, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
-from training.checks import KINDS
+from training.mapped.checks import KINDS
 from training.tensors import TensorError, TensorFolder
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from tiny_network import register, write_tiny
 
-import training.feeding
+import training.running.feeding
 import training.train
-from training.feeding import make_resident_reader
+from training.running.feeding import make_resident_reader
 from training.tensors import TensorFolder
 from training.train import TrainConfig, train
 
@@ -54,13 +54,13 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
 
 def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
-    real = training.feeding.read_samples
+    real = training.running.feeding.read_samples
 
     def read_slowly(*given):
         time.sleep(0.02)
         return real(*given)
 
-    monkeypatch.setattr(training.feeding, "read_samples", read_slowly)
+    monkeypatch.setattr(training.running.feeding, "read_samples", read_slowly)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
     assert 0 < metrics["samples_per_s"] < 32 / 0.02

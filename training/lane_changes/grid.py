@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from schemas.columns import LATERAL_MANEUVERS
 from training.batches import Flags, Floats, Integers
-from training.guard import refuse_future
 from training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from training.lane_changes.examples import READ_AT_ONCE, STRATA, Judged, judge_samples
 from training.lane_changes.features import NUMBER, describe_targets
@@ -26,7 +25,8 @@ from training.models.constant_velocity import ConstantVelocity
 from training.observed import FutureInputError, Observed, ObservedScene, part_batch
 from training.prediction import Prediction
 from training.reading import NEAREST
-from training.runs import refuse_leak
+from training.running.runs import refuse_leak
+from training.scoring.guard import refuse_future
 from training.surroundings import gather_surroundings
 from training.tensors import TensorFolder
 

@@ -12,8 +12,8 @@ from schemas.columns import LATERAL_MANEUVERS
 from schemas.protocols import Protocol
 from schemas.tensors import NOMINAL_LANE_M
 from training.batches import Bytes, Flags, Integers
+from training.mapped.windows import place
 from training.tensors import TensorFolder
-from training.windows import place
 
 KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))
 

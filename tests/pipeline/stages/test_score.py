@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.lake.files import MODELS, TENSORS
 from pipeline.stages.score import collect_scores
-from training.runs import RUN_VERSION
+from training.running.runs import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
 INDEX = {"protocol": {"name": "tiny"}, "blocks": [{"part": "eval"}]}

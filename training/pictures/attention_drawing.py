@@ -4,7 +4,7 @@ from pathlib import Path
 
 import altair as alt
 
-from training.attention_rows import (
+from training.pictures.attention_rows import (
     LANES,
     AttentionMap,
     list_bands,
@@ -14,7 +14,7 @@ from training.attention_rows import (
     span_road,
     tell_head,
 )
-from training.charts import INK, MUTED, Drawing, Tables, check_suffix
+from training.pictures.charts import INK, MUTED, Drawing, Tables, check_suffix
 
 ROAD_WIDTH, MATRIX_SIZE, LANES_WIDTH = 590, 165, 48
 """Pixels."""

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from schemas.tensors import NOMINAL_LANE_M
 from training.batches import SceneBatch
-from training.forecasts import Forecast
+from training.mapped.windows import spread
+from training.pictures.forecasts import Forecast
 from training.tensors import TensorFolder
-from training.windows import spread
 
 Doubles = npt.NDArray[np.float64]
 Role = Literal["own", "neighbor", "other"]

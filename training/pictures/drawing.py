@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import altair as alt
 
-from training.charts import INK, MUTED, Drawing, Layers, Row, Tables
-from training.drawing_key import BOX_COLOURS, DASHES, MODEL_COLOURS, draw_key, mark_models
-from training.drawing_labels import list_odds
-from training.picture_rows import (
+from training.pictures.charts import INK, MUTED, Drawing, Layers, Row, Tables
+from training.pictures.key import BOX_COLOURS, DASHES, MODEL_COLOURS, draw_key, mark_models
+from training.pictures.labels import list_odds
+from training.pictures.picture import Picture
+from training.pictures.rows import (
     View,
     choose_view,
     list_alternatives,
@@ -20,7 +21,6 @@ from training.picture_rows import (
     list_predictions,
     list_truths,
 )
-from training.pictures import Picture
 
 MOST_MODELS = len(MODEL_COLOURS)
 

@@ -1,7 +1,7 @@
 """Where the probabilities of alternatives are written on a drawing, so that they hide neither each other nor lines."""
 
-from training.picture_rows import Row, View, likely_alternatives
-from training.pictures import Picture
+from training.pictures.picture import Picture
+from training.pictures.rows import Row, View, likely_alternatives
 
 
 def list_odds(picture: Picture, view: View, *, step_x_m: float, step_y_m: float) -> list[Row]:

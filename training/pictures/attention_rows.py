@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from training.picture_rows import UNKNOWN_SIZE_M
-from training.pictures import Picture
+from training.pictures.picture import Picture
+from training.pictures.rows import UNKNOWN_SIZE_M
 
 Row = dict[str, Any]
 Doubles = npt.NDArray[np.float64]

@@ -11,12 +11,12 @@ import numpy.typing as npt
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from training.batches import Floats
 from training.forecasters import Forecaster
+from training.mapped.windows import check_numbers, place
 from training.observed import ObservedScene
 from training.prediction import Density, Prediction
 from training.reading import NEAREST, read_samples
 from training.surroundings import find_around, gather_surroundings
 from training.tensors import TensorFolder
-from training.windows import check_numbers, place
 
 if TYPE_CHECKING:
     from training.models.attention import SceneForecast

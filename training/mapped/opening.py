@@ -19,7 +19,7 @@ from schemas.tensors import (
     STEPS_M,
     TENSORS_VERSION,
 )
-from training.checks import AGAIN, TensorError, check_arrays, check_index, is_pair, is_whole
+from training.mapped.checks import AGAIN, TensorError, check_arrays, check_index, is_pair, is_whole
 
 
 def read_index(path: Path) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
 
     Raises:
         TensorError: the file is absent, cut short or too long, no safetensors file, or lacks an array or holds it with
-            another dtype or shape; or see `training.checks.check_arrays`.
+            another dtype or shape; or see `training.mapped.checks.check_arrays`.
     """
     file = path / ARRAYS_FILE
     header, start = _read_header(file)

@@ -10,7 +10,7 @@ import numpy as np
 from training.batches import Integers
 from training.models import Model
 from training.recipes import Recipe
-from training.runs import describe_run
+from training.running.runs import describe_run
 from training.tensors import TensorFolder
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from training.attention_drawing import draw_attention
-from training.attention_rows import AttentionMap
 from training.observed import ObservedScene
-from training.pictures import take_picture
+from training.pictures.attention_drawing import draw_attention
+from training.pictures.attention_rows import AttentionMap
+from training.pictures.picture import take_picture
 from training.reading import NEAREST
 from training.surroundings import find_around, gather_surroundings
 from training.tensors import TensorFolder

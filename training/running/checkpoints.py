@@ -13,9 +13,9 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from training.config import TrainConfig
-from training.logs import Row
-from training.torch_files import PARTIAL, DamagedFileError, load_weights, read_torch_file, write_torch_file
+from training.running.config import TrainConfig
+from training.running.logs import Row
+from training.running.torch_files import PARTIAL, DamagedFileError, load_weights, read_torch_file, write_torch_file
 
 if TYPE_CHECKING:
     import torch
@@ -159,7 +159,7 @@ def save_checkpoint(
 
     Args:
         path: of the file; replaced at once where it exists.
-        run: what is being trained on what, see `training.runs.describe_run`.
+        run: what is being trained on what, see `training.running.runs.describe_run`.
         network: with its weights.
         optimizer: with its moments.
         state: the rest.
@@ -184,7 +184,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """What a checkpoint holds, by name; whether it is this run's is for `restore` to say.
 
     Raises:
-        DamagedFileError: it cannot be read, see `training.torch_files.read_torch_file`, or is of another version.
+        DamagedFileError: it cannot be read, see `training.running.torch_files.read_torch_file`, or is of another
+            version.
     """
     content = read_torch_file(path, ANEW)
     if content.get("version") != CHECKPOINT_VERSION:

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from training.batches import Floats, Integers, SceneBatch
-from training.checks import AGAIN, TensorError
-from training.windows import place, spread, subtract
+from training.mapped.checks import AGAIN, TensorError
+from training.mapped.windows import place, spread, subtract
 
 if TYPE_CHECKING:
     from training.tensors import TensorFolder

@@ -7,7 +7,7 @@ none of them by the same amount as a later one; other maneuvers; and no track th
 
 What is not found out:
 
-- a model that learnt the answers by heart before; `training.runs.refuse_leak` keeps those away;
+- a model that learnt the answers by heart before; `training.running.runs.refuse_leak` keeps those away;
 - one that reads the files anew (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
 - one that looks up, in the folder that it holds, who else is a sample, a neighbor (in which cell) or in a scene later;
 - one that uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;

@@ -125,7 +125,7 @@ def save_run(
     aside.mkdir()
     try:
         if network is not None:
-            from training.torch_files import write_torch_file
+            from training.running.torch_files import write_torch_file
 
             write_torch_file(aside / "weights.pt", network.state_dict())
         for log in logs:
@@ -162,7 +162,7 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     predictor = model.build(protocol, **config["parameters"])
     if model.learns:
         require_torch(model.name)
-        from training.torch_files import DamagedFileError, load_weights, read_torch_file
+        from training.running.torch_files import DamagedFileError, load_weights, read_torch_file
 
         weights = path / "weights.pt"
         try:
@@ -202,7 +202,7 @@ def refuse_unfinished(path: Path) -> None:
     Raises:
         StaleRunError: saying how to go on.
     """
-    from training.checkpoints import is_unfinished
+    from training.running.checkpoints import is_unfinished
 
     if not (path / "config.json").is_file() and is_unfinished(path):
         raise StaleRunError(

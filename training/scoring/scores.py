@@ -14,10 +14,10 @@ import numpy.typing as npt
 from schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
 from training.batches import Flags, Integers
-from training.densities import find_nll
 from training.findings import touched
 from training.observed import Truth
 from training.prediction import Prediction
+from training.scoring.densities import find_nll
 from training.tensors import TensorFolder
 
 Sums = npt.NDArray[np.float64]

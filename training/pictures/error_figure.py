@@ -3,7 +3,7 @@
 import altair as alt
 import polars as pl
 
-from training.charts import AMBER, BLUE, GREEN, INK, ORANGE, PURPLE, SKY, Drawing, Layers, Tables
+from training.pictures.charts import AMBER, BLUE, GREEN, INK, ORANGE, PURPLE, SKY, Drawing, Layers, Tables
 
 KEY = ("model", "dataset", "seed", "seconds")
 COLUMNS = {

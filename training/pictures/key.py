@@ -2,9 +2,9 @@
 
 import altair as alt
 
-from training.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, Layers, Row, Tables
-from training.picture_rows import View, list_alternatives, list_boxes
-from training.pictures import Picture
+from training.pictures.charts import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, Layers, Row, Tables
+from training.pictures.picture import Picture
+from training.pictures.rows import View, list_alternatives, list_boxes
 
 MODEL_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 MODEL_SHAPES = ("circle", "square", "diamond", "triangle-up")

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from training.batches import Integers
-from training.config import Plan
 from training.observed import part_batch
 from training.reading import read_samples
+from training.running.config import Plan
 from training.tensors import TensorFolder
 
 if TYPE_CHECKING:

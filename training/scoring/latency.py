@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from training.guard import choose_moments, samples_of_scene
 from training.models import Predictor, Reads
 from training.reading import NEAREST, read_samples
+from training.scoring.guard import choose_moments, samples_of_scene
 from training.tensors import TensorFolder
 
 MOMENTS = 20

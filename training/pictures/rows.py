@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from training.forecasts import Alternative, Forecast
-from training.pictures import Picture, Vehicle
+from training.pictures.forecasts import Alternative, Forecast
+from training.pictures.picture import Picture, Vehicle
 
 Row = dict[str, Any]
 Doubles = npt.NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Drawings: samples with what came and what models say, attention, errors over the horizon."""

@@ -1,0 +1,1 @@
+"""How good predictions are: errors and densities summed up, the guard before them, and what others published."""
