@@ -11,23 +11,15 @@ from typing import TYPE_CHECKING, Any
 from training.evaluate import measure_errors
 from training.models import Model, Predictor, find_model, require_torch
 from training.observed import FutureInputError
-from training.running.checkpoints import (
-    CHECKPOINT_FILE,
-    TrainingState,
-    claim_folder,
-    find_config,
-    holding_interrupts,
-    read_checkpoint,
-    refuse_other_run,
-    refuse_wrong_start,
-    restore,
-    save_checkpoint,
-)
+from training.running.checkpoints import find_config, read_checkpoint, refuse_other_run, restore, save_checkpoint
 from training.running.config import Plan, TrainConfig, make_plan
 from training.running.feeding import Batches, Read, make_reader, read_batches
+from training.running.interrupts import holding_interrupts
 from training.running.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
 from training.running.memory import keep_freed_memory
 from training.running.runs import describe_run, save_run
+from training.running.state import TrainingState
+from training.running.unfinished import CHECKPOINT_FILE, claim_folder, refuse_wrong_start
 from training.scoring.guard import refuse_future
 from training.tensors import TensorFolder
 

@@ -12,15 +12,15 @@ from tensor_tables import TINY
 from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
 
 from training.evaluate import evaluate
-from training.running.checkpoints import (
+from training.running.runs import StaleRunError
+from training.running.torch_files import DamagedFileError, write_torch_file
+from training.running.unfinished import (
     CHECKPOINT_FILE,
     UnfinishedError,
     claim_folder,
     is_unfinished,
     unfinished_folder,
 )
-from training.running.runs import StaleRunError
-from training.running.torch_files import DamagedFileError, write_torch_file
 from training.train import TrainConfig, TrainingInterruptedError, train
 
 # 4 steps an epoch; `mse` for 2 of 3 epochs. Other than one step after the other: dropout, Adam's moments, a cosine,

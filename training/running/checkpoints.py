@@ -1,21 +1,13 @@
 """Checkpoints: everything that decides how a training goes on, so that one that is resumed ends as if never stopped."""
 
-import fcntl
-import math
-import os
-import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from training.running.config import TrainConfig
-from training.running.logs import Row
-from training.running.torch_files import PARTIAL, DamagedFileError, load_weights, read_torch_file, write_torch_file
+from training.running.state import TrainingState
+from training.running.torch_files import DamagedFileError, load_weights, read_torch_file, write_torch_file
+from training.running.unfinished import ANEW, UnfinishedError
 
 if TYPE_CHECKING:
     import torch
@@ -23,128 +15,9 @@ if TYPE_CHECKING:
 
 CHECKPOINT_VERSION = 2
 """Counts changes of the file, and of how a training goes on, that older checkpoints do not fit."""
-CHECKPOINT_FILE = "checkpoint.pt"
-LOCK_FILE = "lock"
-ANEW = "begin anew (`--anew`)"
-
-
-class UnfinishedError(ValueError):
-    """A training cannot begin, or go on, as it stands on disk."""
-
-
-@dataclass
-class TrainingState:
-    """Where a training stands, weights and optimiser apart.
-
-    Args:
-        step: optimiser steps done; says the epoch and the place in it, too.
-        samples: in these steps.
-        elapsed_s: since it began, interruptions left out.
-        stepping_s: of these, in steps, batches read included.
-        reading_s: of these, for batches.
-        smooth_loss: running mean of the loss.
-        losses: of every step.
-        phases: loss of each phase so far, and its first step.
-        course: rows of course.csv.
-        epochs: rows of epochs.csv.
-        marked: step, samples, stepping_s and reading_s at the last row of course.csv.
-        best_loss: least validation loss of the present phase.
-        best_epoch: where it was.
-        best_weights: and with which weights.
-        stale_epochs: of the last phase, since then.
-    """
-
-    step: int = 0
-    samples: int = 0
-    elapsed_s: float = 0.0
-    stepping_s: float = 0.0
-    reading_s: float = 0.0
-    smooth_loss: float = math.nan
-    losses: list[float] = field(default_factory=list)
-    phases: list[tuple[str, int]] = field(default_factory=list)
-    course: list[Row] = field(default_factory=list)
-    epochs: list[Row] = field(default_factory=list)
-    marked: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
-    best_loss: float | None = None
-    best_epoch: int | None = None
-    best_weights: dict[str, Any] | None = None
-    stale_epochs: int = 0
-
-    def begin_phase(self, loss: str) -> None:
-        """Another loss from here on; losses of two kinds are not compared."""
-        self.phases.append((loss, self.step))
-        self.smooth_loss = math.nan
-        self.best_loss = self.best_epoch = self.best_weights = None
-
-    def take_step(self, loss: float, samples: int) -> None:
-        """One more step is done."""
-        self.step += 1
-        self.samples += samples
-        self.losses.append(loss)
-        self.smooth_loss = loss if math.isnan(self.smooth_loss) else 0.98 * self.smooth_loss + 0.02 * loss
-
 
 _FIELDS = {own.name for own in fields(TrainingState)}
 _KEYS = {"version", "run", "network", "optimizer", "random", "device_random", "state"}
-
-
-def unfinished_folder(run: Path) -> Path:
-    """Where a run's training keeps checkpoint and logs until it is done: hidden, so that no one takes it for a run."""
-    return run.parent / f".{run.name}.unfinished"
-
-
-def is_unfinished(run: Path) -> bool:
-    """Whether there is a checkpoint to go on from."""
-    return (unfinished_folder(run) / CHECKPOINT_FILE).is_file()
-
-
-def refuse_wrong_start(run: Path, *, resume: bool | None) -> None:
-    """Refuse to lose a checkpoint unasked, or to go on from one that is not there.
-
-    Args:
-        run: the run's folder.
-        resume: True: to go on; False: to begin anew; None: the caller did not say.
-
-    Raises:
-        UnfinishedError: saying what to do.
-    """
-    folder = unfinished_folder(run)
-    if resume is None and is_unfinished(run):
-        raise UnfinishedError(
-            f"{folder}: a training of the run `{run.name}` was interrupted; go on with it (`--resume`), or lose it and "
-            f"{ANEW}"
-        )
-    if resume and not is_unfinished(run):
-        raise UnfinishedError(f"{folder}: no interrupted training of the run `{run.name}` to resume; train it anew")
-
-
-@contextmanager
-def claim_folder(run: Path) -> Iterator[Path]:
-    """The folder for a run's checkpoint and logs, to oneself; where no checkpoint came of it, it is removed.
-
-    Raises:
-        UnfinishedError: another process is training this run.
-    """
-    folder = unfinished_folder(run)
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UnfinishedError(
-                f"{folder}: another process is training the run `{run.name}`; wait for it to end, or name this run "
-                "otherwise (`--name`)"
-            ) from None
-        try:
-            for left in folder.glob(f"*{PARTIAL}"):
-                left.unlink()  # by a process that was killed while it wrote
-            yield folder
-        finally:
-            if not (folder / CHECKPOINT_FILE).is_file():
-                shutil.rmtree(folder)
-    finally:
-        os.close(descriptor)
 
 
 def save_checkpoint(
@@ -290,33 +163,3 @@ def restore(
         return TrainingState(**(plain | {"losses": plain["losses"].tolist()}))
     except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as wrong:
         raise DamagedFileError(f"{path}: not a checkpoint of this training ({wrong}); {ANEW}") from None
-
-
-@contextmanager
-def holding_interrupts() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C wait until a step is done; half a step could not be saved. A second Ctrl-C does not wait.
-
-    Where somebody else listens for it (or this is not the main thread, to which signals come), it is left to them.
-
-    Returns:
-        Says whether it was pressed.
-    """
-    pressed = False
-
-    def note(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
-
-    mine = threading.current_thread() is threading.main_thread()
-    if not mine or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield lambda: False
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if pressed:  # after the last step
-        raise KeyboardInterrupt

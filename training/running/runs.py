@@ -15,6 +15,7 @@ import numpy as np
 from schemas.protocols import Protocol
 from schemas.tensors import ARRAYS
 from training.models import Predictor, find_model, require_torch
+from training.running.unfinished import is_unfinished
 from training.tensors import TensorFolder
 
 if TYPE_CHECKING:
@@ -202,8 +203,6 @@ def refuse_unfinished(path: Path) -> None:
     Raises:
         StaleRunError: saying how to go on.
     """
-    from training.running.checkpoints import is_unfinished
-
     if not (path / "config.json").is_file() and is_unfinished(path):
         raise StaleRunError(
             f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "
