@@ -1,7 +1,8 @@
 """Models, training and evaluation on the tensors of a lake. Of our own packages only `schemas` is imported.
 
 - `training.tensors`: open a tensor folder, gather batches of samples or of whole scenes by vectorised indexing.
-- `training.torch_batches`: the same as torch tensors: streamed, by a sampler, or gathered on a device.
+- `training.torch_batches`: the same as torch tensors: streamed, by a sampler, or gathered on a device; and
+  `training.torch_surroundings`: samples with those around them, gathered on a device.
 - `training.augmentation`: the road mirrored, positions shifted.
 - `training.models`: the registry of models, one file each.
 - `training.train`: train a model into a run's folder.

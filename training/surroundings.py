@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.tensors import NOMINAL_LANE_M
 from training.batches import Flags, Floats, Integers
 from training.mapped.windows import Rows, check_numbers, place, subtract
 from training.observed import ObservedScene, Truth
@@ -133,20 +132,10 @@ def _smallest(keys: Integers, count: int) -> Integers:
 
 
 def _describe_lanes(folder: "TensorFolder", sample: Integers) -> Floats:
-    """(B, 3, 3) of the lanes left of, under and right of each ego: centre's offset, width, 1 where it exists.
-
-    Where a subset has no markings, lanes of NOMINAL_LANE_M from the carriageway's left edge on are taken.
-    """
-    row, subset = folder.sample_row[sample], folder.subset_of(sample)
-    own, lanes = folder.lane[row].astype(np.intp), folder.lanes
-    lane = own[:, None] + np.arange(-1, 2)
-    exists = (own[:, None] > 0) & (lane > 0) & (lane <= lanes.last[subset, None])
-    known = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
-    centre, width = lanes.centre_m[subset[:, None], known], lanes.lane_width_m[subset[:, None], known]
-    unmarked = np.isnan(centre)
-    centre = np.where(unmarked, (lane - 0.5) * NOMINAL_LANE_M, centre)
-    width = np.where(unmarked, NOMINAL_LANE_M, width)
+    """(B, 3, 3) of the lanes left of, under and right of each ego, see `ObservedScene`."""
+    row, subset, around = folder.sample_row[sample], folder.subset_of(sample), folder.lanes.around
+    described = around[subset, np.clip(folder.lane[row], 0, around.shape[1] - 1)]
     y_m = place(folder.position_m[row][:, None, :], folder.centre_m[subset], folder.step_m)[:, 0, 1]
-    described: Floats = np.stack([centre - y_m[:, None], width, exists], axis=-1).astype(np.float32)
-    described[~exists] = 0
-    return described
+    described[..., 0] -= y_m[:, None] * described[..., 2]
+    lanes: Floats = described.astype(np.float32)
+    return lanes

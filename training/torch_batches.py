@@ -6,6 +6,7 @@ from itertools import islice
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
@@ -186,8 +187,7 @@ class ResidentTensors:
         self.folder, self.device = folder, torch.device(device)
 
         def load(array: np.ndarray) -> Tensor:
-            # A copy first: torch does not know read-only memory.
-            return torch.from_numpy(array.copy()).to(self.device)
+            return load_array(array, self.device)
 
         self.position_m = load(folder.position_m)
         self.sample_row, self.sample_future = load(folder.sample_row), load(folder.sample_future)
@@ -257,8 +257,18 @@ class ResidentTensors:
     def _read(self, rows: Tensor, origin: Tensor, centre: Tensor, absolute: bool) -> Tensor:
         """(M, T, 2) float32 positions in m of rows (M, T), relative to stored origins (M, 2) or absolute."""
         positions = self.position_m[rows]
-        if self.step_m is None:
-            return positions if absolute else positions - origin[:, None]
         if absolute:
-            return (centre[:, None] + positions * self.step_m).float()
-        return (positions.float() - origin[:, None].float()) * self.step_m.float()
+            return positions if self.step_m is None else (centre[:, None] + positions * self.step_m).float()
+        return subtract_origin(positions, origin, self.step_m)
+
+
+def load_array(array: npt.NDArray[Any], device: torch.device) -> Tensor:
+    """A mapped array as a tensor on a device; always a copy, for torch does not know read-only memory."""
+    return torch.from_numpy(array.copy()).to(device)
+
+
+def subtract_origin(positions: Tensor, origin: Tensor, step_m: Tensor | None) -> Tensor:
+    """Stored positions (M, T, 2) relative to stored origins (M, 2), in m, float32."""
+    if step_m is None:
+        return positions - origin[:, None]
+    return (positions.float() - origin[:, None].float()) * step_m.float()

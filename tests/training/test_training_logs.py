@@ -11,6 +11,7 @@ from tiny_network import register, write_tiny
 import training.running.feeding
 import training.train
 from training.running.feeding import make_resident_reader
+from training.surroundings import gather_surroundings
 from training.tensors import TensorFolder
 from training.train import TrainConfig, train
 
@@ -72,9 +73,19 @@ def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
 def test_a_resident_reader_reads_the_same(tensors):
     folder = TensorFolder.open(tensors)
     samples = folder.samples_of("train")[[5, 0, 7]]
-    observed, truth = make_resident_reader(folder, torch.device("cpu"))(samples)
+    observed, truth = make_resident_reader(folder, "grid", torch.device("cpu"))(samples)
     batch = folder.gather(samples)
     np.testing.assert_allclose(observed.neighbor_history.numpy(), batch.neighbor_history, atol=1e-4)
     assert observed.neighbor_cell.tolist() == batch.neighbor_cell.tolist()
     assert truth.future_mask.tolist() == batch.future_mask.tolist()
     assert truth.lateral.tolist() == batch.lateral.tolist()
+
+
+def test_a_resident_reader_of_scenes_reads_the_same(tensors):
+    folder = TensorFolder.open(tensors)
+    samples = folder.samples_of("train")[[5, 0, 7]]
+    observed, truth = make_resident_reader(folder, "scene", torch.device("cpu"))(samples)
+    wanted, came = gather_surroundings(folder, samples, nearest=10)
+    np.testing.assert_array_equal(observed.history.numpy(), wanted.history)
+    np.testing.assert_array_equal(observed.lanes.numpy(), wanted.lanes)
+    assert truth.future_mask.tolist() == came.future_mask.tolist()

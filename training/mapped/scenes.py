@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from schemas.tensors import NOMINAL_LANE_M
 from training.batches import Floats, Integers, SceneBatch
 from training.mapped.checks import AGAIN, TensorError
 from training.mapped.windows import place, spread, subtract
@@ -30,6 +32,23 @@ class Lanes:
     width_m: npt.NDArray[np.float64]
     centre_m: npt.NDArray[np.float64]
     lane_width_m: npt.NDArray[np.float64]
+
+    @cached_property
+    def around(self) -> npt.NDArray[np.float64]:
+        """(subsets, O, 3, 3) lanes left of, under and right of lanes 0 to O - 1: y of the centre, width, 1; or zeros.
+
+        Zeros stand for lanes that do not exist, and for all three of lane 0, which is none; of lanes above O - 1, none
+        has a neighbor. Where a subset has no markings, lanes of NOMINAL_LANE_M from the left edge on are taken.
+        """
+        own = np.arange(int(self.last.max(initial=0)) + 3)[:, None]
+        lane = own + np.arange(-1, 2)
+        exists = (own > 0) & (lane > 0) & (lane <= self.last[:, None, None])
+        known = np.clip(lane, 0, self.centre_m.shape[1] - 1)
+        centre, width = self.centre_m[:, known], self.lane_width_m[:, known]
+        unmarked = np.isnan(centre)
+        centre = np.where(unmarked, (lane - 0.5) * NOMINAL_LANE_M, centre)
+        width = np.where(unmarked, NOMINAL_LANE_M, width)
+        return np.stack([centre, width, exists], axis=-1) * exists[..., None]
 
 
 def find_lanes(subsets: Sequence[Mapping[str, Any]]) -> Lanes:

@@ -3,11 +3,10 @@
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-import numpy.typing as npt
-
 from training.batches import Integers
+from training.models import Reads
 from training.observed import part_batch
-from training.reading import read_samples
+from training.reading import NEAREST, read_samples
 from training.running.config import Plan
 from training.tensors import TensorFolder
 
@@ -37,27 +36,26 @@ def make_reader(plan: Plan) -> Read:
     import torch
 
     reads, folder, device = plan.entry.reads, plan.folder, plan.device
-    if device.type != "cpu" and reads == "grid":
-        return make_resident_reader(folder, device)
+    if device.type != "cpu":
+        return make_resident_reader(folder, reads, device)
 
     def read(samples: Integers) -> tuple[Any, Any]:
         observed, truth = read_samples(folder, samples, reads)
-        if device.type == "cpu":
-            return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
-
-        def move(array: npt.NDArray[Any]) -> torch.Tensor:
-            return torch.from_numpy(array).to(device)
-
-        return observed.each(move), truth.each(move)
+        return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
 
     return read
 
 
-def make_resident_reader(folder: TensorFolder, device: "torch.device") -> Read:
-    """Batches of grids gathered on a device, from tensors that stand there as a whole."""
+def make_resident_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
+    """Batches gathered on a device, from tensors that stand there as a whole."""
     import torch
 
-    from training.torch_batches import ResidentTensors
+    if reads == "grid":
+        from training.torch_batches import ResidentTensors
 
-    resident = ResidentTensors(folder, device)
-    return lambda samples: part_batch(resident.gather(torch.from_numpy(samples).to(device)))
+        grids = ResidentTensors(folder, device)
+        return lambda samples: part_batch(grids.gather(torch.from_numpy(samples).to(device)))
+    from training.torch_surroundings import ResidentSurroundings
+
+    scenes = ResidentSurroundings(folder, device, nearest=NEAREST)
+    return lambda samples: scenes.gather(torch.from_numpy(samples).to(device))
