@@ -50,10 +50,9 @@ class TrainConfig:
         seed: of the weights, of the order of samples, and of what the network drops.
         threads: of torch; None = its own choice. One by default: for networks this small a second one gains little on
             an idle machine, and on a busy one it waits for its turn at every tick: a step takes ten times as long.
-        device: `cpu`; or `cuda`, where batches of grids are gathered from tensors that stand there as a whole, while
-            those of scenes are gathered on the CPU and moved there. On `cuda` the seed does not decide the
-            weights bit for bit, interrupted or not: some sums (of pooled neighbors, for one) are added up in whatever
-            order the threads come.
+        device: `cpu`; or `cuda`, where batches are gathered from tensors that stand there as a whole. There the seed
+            does not decide the weights bit for bit, interrupted or not: some sums (of pooled neighbors, for one) are
+            added up in whatever order the threads come.
         log_steps: a row of course.csv every so many steps.
         checkpoint_s: a checkpoint at least so often, besides those at the ends of epochs.
     """
