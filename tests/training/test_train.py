@@ -1,6 +1,5 @@
 """The training loop: what it is shown, what it learns, what it writes, what it refuses."""
 
-import csv
 import json
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +10,7 @@ import pytest
 import torch
 from tensor_tables import TINY, sample_everything, split_row, write
 from tensor_tables import drive as drive_vehicles
-from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
+from tiny_network import PARTS, RECIPE, Forgetful, read_log, register, write_tiny
 
 import training.train
 from schemas.protocols import CSP
@@ -27,11 +26,6 @@ FEW = TrainConfig(steps=9, log_steps=2)
 @pytest.fixture(scope="module")
 def tensors(tmp_path_factory):
     return write_tiny(tmp_path_factory.mktemp("tensors"))
-
-
-def read_csv(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 # What it learns
@@ -167,7 +161,7 @@ def test_the_learning_rate_follows_the_schedule(tensors, tmp_path, monkeypatch):
     train("forgetful", tensors, tmp_path / "constant", each)
     train("forgetful", tensors, tmp_path / "cosine", replace(each, schedule="cosine"))
     constant, cosine = (
-        [float(row["learning_rate"]) for row in read_csv(tmp_path / name / "course.csv")]
+        [float(row["learning_rate"]) for row in read_log(tmp_path / name / "course.csv")]
         for name in ("constant", "cosine")
     )
     assert constant == [0.5] * 10
@@ -293,7 +287,7 @@ def test_patience_ends_the_last_phase_and_keeps_the_best_weights(tensors, tmp_pa
     recipe = replace(RECIPE, phases=(Phase("mse", 2), Phase("distance", 10)))
     register(monkeypatch, Scripted, recipe)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(patience=2))
-    rows = read_csv(tmp_path / "run" / "epochs.csv")
+    rows = read_log(tmp_path / "run" / "epochs.csv")
     assert [(row["phase"], float(row["validation_loss"]), row["best"]) for row in rows] == [
         ("mse", 1.0, "1"), ("mse", 9.0, "0"),
         ("distance", 5.0, "1"), ("distance", 4.0, "1"), ("distance", 3.0, "1"), ("distance", 3.0, "0"),

@@ -1,12 +1,11 @@
 """The logs of a training, and how fast it went."""
 
-import csv
 import time
 
 import numpy as np
 import pytest
 import torch
-from tiny_network import register, write_tiny
+from tiny_network import read_log, register, write_tiny
 
 import training.running.feeding
 import training.train
@@ -21,11 +20,6 @@ def tensors(tmp_path_factory):
     return write_tiny(tmp_path_factory.mktemp("tensors"))
 
 
-def read_csv(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
 def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
     losses = []
@@ -36,7 +30,7 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
         lambda self, loss, samples: (losses.append((loss, samples)), real(self, loss, samples)),
     )
     train("forgetful", tensors, tmp_path / "run", TrainConfig(log_steps=3))
-    course, epochs = (read_csv(tmp_path / "run" / name) for name in ("course.csv", "epochs.csv"))
+    course, epochs = (read_log(tmp_path / "run" / name) for name in ("course.csv", "epochs.csv"))
     # 12 steps in three epochs of 4; `mse` ends after 8, and no row is of two phases.
     assert [(int(row["step"]), int(row["epoch"]), row["phase"]) for row in course] == [
         (3, 0, "mse"), (6, 1, "mse"), (8, 1, "mse"), (9, 2, "distance"), (12, 2, "distance")
@@ -65,7 +59,7 @@ def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
     assert 0 < metrics["samples_per_s"] < 32 / 0.02
-    for row in read_csv(tmp_path / "run" / "course.csv"):
+    for row in read_log(tmp_path / "run" / "course.csv"):
         assert 0.5 < float(row["data_share"]) < 1.0
         assert 0 < float(row["samples_per_s"]) < 32 / 0.02
 

@@ -1,5 +1,6 @@
 """A small network with dropout and two phases, entered into the registry for a test; and tensors to train it on."""
 
+import csv
 import sys
 from types import SimpleNamespace
 
@@ -73,3 +74,9 @@ def make_tables(seed=0, subsets="abc", *, protocol=TINY, vehicles=12, ticks=16):
 
 def write_tiny(folder, splits=PARTS, *, seed=0, subsets="abc", protocol=TINY):
     return write(folder, make_tables(seed, subsets, protocol=protocol), splits, protocol=protocol)
+
+
+def read_log(path):
+    """A training's log, row by row, as text."""
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))

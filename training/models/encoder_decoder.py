@@ -4,16 +4,14 @@ import torch
 from torch import Tensor, nn
 
 from schemas.protocols import Protocol
-from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from training.models.network import PlaceNetwork
 from training.models.straight import Straight
-from training.observed import Observed, Truth
-from training.prediction import Prediction
 
 WIDTH = 256
 """Of the embedding, of every LSTM layer and of the output layer (Choi et al. 2021)."""
 
 
-class EncoderDecoder(Network):
+class EncoderDecoder(PlaceNetwork):
     """Embeds H positions in m (256, ReLU), encodes them (2 x 256), decodes F steps (2 x 256), puts out places.
 
     The output layer has 256 units (ReLU) and is followed by the linear one to 2 numbers. The decoder starts from the
@@ -45,12 +43,3 @@ class EncoderDecoder(Network):
         decoded, _ = self.decoder(fed, states)  # (B, F, 256)
         places: Tensor = self.straight(history) + self.place(torch.relu(self.output(decoded)))
         return places
-
-    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """() mean squared distance in m2; the only phase is `mse`."""
-        check_phase(phase, "mse")
-        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
-
-    def say(self, observed: Observed[Tensor]) -> Prediction:
-        """Places only."""
-        return Prediction(position_m=to_numpy(self(observed.history)))

@@ -5,20 +5,18 @@ from torch import Tensor, nn
 
 from schemas.protocols import Protocol
 from training.models.constant_velocity import velocity_ticks
-from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
-from training.observed import Observed, Truth
-from training.prediction import Prediction
+from training.models.network import PlaceNetwork
 
 SPEED_SCALE_MPS = 15.0
 """Speeds are divided by this: motorway traffic then lies between 0 and about 3."""
 
 
-class DeviationLstm(Network):
+class DeviationLstm(PlaceNetwork):
     """Encodes H positions, unrolls F steps, and predicts the deviation from constant velocity.
 
-    Constant velocity (as in the model of this name) explains nearly all of where a vehicle will
-    be; the network is left with braking, accelerating and changing lanes. Its last layer starts at zero, so an
-    untrained network predicts constant velocity exactly and training starts from there.
+    Constant velocity (as in the model of this name) explains nearly all of where a vehicle will be; the network is left
+    with braking, accelerating and changing lanes. Its last layer starts at zero, so an untrained network predicts
+    constant velocity exactly and training starts from there.
 
     Inputs per tick of history, 6: the deviation from where constant velocity would have been (along, across) in m, its
     change since the tick before in m/s (along, across), and the constant velocity itself (along, across), scaled.
@@ -56,12 +54,3 @@ class DeviationLstm(Network):
         decoded, _ = self.decoder(fed, (state, cell))  # (B, F, hidden)
         ahead = torch.arange(1, self.steps + 1, device=history.device, dtype=history.dtype)
         return velocity * ahead[:, None] + torch.cumsum(self.out(decoded), dim=1)
-
-    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """() mean squared distance in m2; the only phase is `mse`."""
-        check_phase(phase, "mse")
-        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
-
-    def say(self, observed: Observed[Tensor]) -> Prediction:
-        """Places only."""
-        return Prediction(position_m=to_numpy(self(observed.history)))

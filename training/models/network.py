@@ -8,7 +8,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from training.observed import Truth
+from training.observed import Observed, Truth
 from training.prediction import Prediction
 
 Answer = TypeVar("Answer")
@@ -57,6 +57,19 @@ class Network(nn.Module):
                 return question(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
         finally:
             self.train(trained)
+
+
+class PlaceNetwork(Network):
+    """A network that puts out places alone, of a sample's own history. Heirs give `forward` (B, H, 2) -> (B, F, 2)."""
+
+    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
+        """() mean squared distance in m2; the only phase is `mse`."""
+        check_phase(phase, "mse")
+        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
+
+    def say(self, observed: Observed[Tensor]) -> Prediction:
+        """Places only."""
+        return Prediction(position_m=to_numpy(self(observed.history)))
 
 
 def check_phase(phase: str, *known: str) -> None:

@@ -3,13 +3,11 @@
 from torch import Tensor, nn
 
 from schemas.protocols import Protocol
-from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from training.models.network import PlaceNetwork
 from training.models.straight import Straight
-from training.observed import Observed, Truth
-from training.prediction import Prediction
 
 
-class StackedLstm(Network):
+class StackedLstm(PlaceNetwork):
     """Reads H positions in m, and puts out F places from its last state.
 
     The plainest recurrent network that Choi et al. 2021 compare with; the width of 128 is ours.
@@ -33,12 +31,3 @@ class StackedLstm(Network):
         _, (state, _) = self.encoder(history)
         places: Tensor = self.straight(history) + self.out(state[-1]).unflatten(-1, (-1, 2))  # (B, F, 2)
         return places
-
-    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """() mean squared distance in m2; the only phase is `mse`."""
-        check_phase(phase, "mse")
-        return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
-
-    def say(self, observed: Observed[Tensor]) -> Prediction:
-        """Places only."""
-        return Prediction(position_m=to_numpy(self(observed.history)))

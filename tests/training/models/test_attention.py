@@ -25,14 +25,6 @@ PARTS = ("vehicles", "lanes", "decoder")
 seeds = st.integers(0, 2**31)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def build(heads=4, protocol=CSP, *, seed=0, wild=True, **parameters):
     """A network; `wild`: its last layer, which begins at zero, drawn as well, so that every part of it shows."""
     with torch.random.fork_rng(devices=[]):

@@ -21,14 +21,6 @@ PROTOCOLS = (CSP, TWO_SECONDS)
 H, F = CSP.history_ticks, CSP.horizon_ticks
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def build(name, protocol=CSP, seed=0, **parameters):
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

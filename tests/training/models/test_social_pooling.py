@@ -18,14 +18,6 @@ SHORT = Protocol(name="short", rate_hz=2, history_s=1.5, horizon_s=2.0)
 H = F = 4
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def build(name, *, seed=0, **parameters):
     torch.manual_seed(seed)
     return MODELS[name].build(SHORT, **parameters).double()
