@@ -59,8 +59,8 @@ def evaluate(
 ) -> None:
     """Errors at each horizon of runs and models, with what is behind them, and published figures beside.
 
-    The whole table goes to LAKE/evaluations/<protocol>.csv, or, where RUNS are named, another part or another number
-    of vehicles around, to --out only.
+    The whole table goes to LAKE/evaluations/<protocol>.csv; where RUNS are named, or another part, another number of
+    vehicles around, --every-tick or --no-published is asked for, to --out only.
     """
     with command(quiet=quiet, json=json) as terminal:
         import polars as pl
@@ -83,9 +83,8 @@ def evaluate(
         root = settings.lake
         tensors = tensor_folder(root, load(root), settings)
         around = NEAREST if nearest is None else nearest
-        target = out
-        if out is None and not runs and part == "eval" and around == NEAREST:
-            target = root / FOLDER / f"{settings.get_protocol().name}.csv"
+        plain = part == "eval" and around == NEAREST and published and not every_tick
+        target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
         if target is not None:
             target.parent.mkdir(parents=True, exist_ok=True)  # now: what takes long would be lost afterwards
         names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
@@ -103,8 +102,8 @@ def evaluate(
         if target is not None:
             _write(target, table)
             terminal.say(f"table {target}: {table.height:,} rows", style="dim")
-        elif around != NEAREST:
-            terminal.say(f"note: the lake keeps scores of {NEAREST} vehicles around; --out writes these", style="dim")
+        elif not runs:
+            terminal.say("note: the lake keeps the table of the options' defaults; --out writes this one", style="dim")
         rows = table.to_dicts()
         terminal.give({"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target})
 
@@ -120,9 +119,10 @@ def _evaluate_all(
     every_tick: bool,
     strict: bool,
 ) -> list["Evaluation"]:
-    """Score one after the other; runs made for other tensors are passed by, unless they were asked for by name."""
+    """Score one after the other; runs that do not fit, or not any more, are passed by, unless asked for by name."""
     from training.evaluate import evaluate as evaluate_model
     from training.observed import FutureInputError
+    from training.prediction import NotFiniteError
     from training.running.runs import StaleRunError
 
     found = []
@@ -131,10 +131,10 @@ def _evaluate_all(
             found.append(
                 evaluate_model(name, tensors, models, part, nearest=nearest, with_latency=True, every_tick=every_tick)
             )
-        except StaleRunError as stale:
+        except (StaleRunError, NotFiniteError, ImportError) as unfit:
             if strict:
                 raise
-            terminal.complain(str(stale), label="passed by")
+            terminal.complain(str(unfit), label="passed by")
         except FutureInputError as leak:
             raise ValueError(str(leak)) from leak
     return found

@@ -53,7 +53,11 @@ def predict(
         float | None, typer.Option("--time", metavar="S", help="With --vehicle: seconds since the recording began.")
     ] = None,
     pick: Annotated[
-        Pick | None, typer.Option("--pick", help="Draw samples of a kind; worst: of the last model (default: random).")
+        Pick | None,
+        typer.Option(
+            "--pick",
+            help="Draw samples of a kind; worst: of the last model, or newest run (default: random).",
+        ),
     ] = None,
     part: Annotated[str, typer.Option("--part", help="With --pick: train, val or eval.")] = "eval",
     seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: of the draw.")] = 0,
@@ -89,7 +93,8 @@ def predict(
         if attention:
             _refuse_inattentive(asked)
         if not samples:
-            samples = _pick(terminal, folder, pick or Pick.RANDOM, part, count, seed, asked)
+            judge = asked[-1] if models else next((own for own in asked if own.name != BASELINE), asked[0])
+            samples = _pick(terminal, folder, pick or Pick.RANDOM, part, count, seed, judge)
         drawn: list[dict[str, Any]] = []
         for number in samples:
             picture = _ask(folder, number, asked, all_vehicles=all_vehicles)
@@ -186,8 +191,8 @@ def _open_all(
                 break
             try:
                 found.append(open_forecaster(name, folder, models, parts))
-            except StaleRunError as stale:
-                terminal.complain(str(stale), label="passed by")
+            except (StaleRunError, ImportError) as unfit:
+                terminal.complain(str(unfit), label="passed by")
     named = {own.name for own in found}
     if BASELINE not in named and len(found) < MOST_MODELS and not (alone and found):
         found.insert(0, open_forecaster(BASELINE, folder, models, parts))
@@ -201,16 +206,16 @@ def _pick(
     part: str,
     count: int,
     seed: int,
-    asked: list["Forecaster"],
+    judge: "Forecaster",
 ) -> list[int]:
     """Samples of a kind."""
     from training.pictures.picking import MOST_LOOKED_AT, pick_samples
 
-    found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=asked[-1])
+    found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
         many = len(folder.samples_of(part))
         among = f"{MOST_LOOKED_AT:,} drawn of {many:,}" if many > MOST_LOOKED_AT else f"{many:,}"
-        terminal.say(f"the worst of {asked[-1].name} among {among} samples of {part}", style="dim")
+        terminal.say(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
     if len(found) < count:
         terminal.say(f"note: there are only {len(found)} such samples", style="dim")
     return [int(number) for number in found]

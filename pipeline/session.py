@@ -55,7 +55,7 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
     except (ValueError, OSError, ImportError) as error:
         raise failure(terminal, str(error)) from None
     except KeyboardInterrupt:
-        told = "interrupted; what was committed stays, and the same command goes on from there"
+        told = "interrupted; what was committed stays; run the same command again"
         raise failure(terminal, told) from None
 
 

@@ -99,6 +99,8 @@ def train(
             raise failure(terminal, f"{stopped}\nTo go on: {shlex.join(again)}") from None
         if metrics["evaluation"] is not None:
             show_scores(terminal, [metrics["evaluation"]])
+        else:
+            terminal.say("note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim")
         terminal.say(
             f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
             f"reading them took {metrics['data_share']:.1%} of it"
@@ -109,10 +111,13 @@ def train(
 
 def _check_name(name: str) -> str:
     """A run's name, which is a folder's."""
+    from pipeline.lane_forest import FOLDER as FOREST
     from training.models import MODELS
 
     if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
         raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {name!r}")
+    if name == FOREST:
+        raise typer.BadParameter(f"`{name}` is where `tracklake lane-forest` keeps its forest; name the run otherwise")
     if name in MODELS and not MODELS[name].learns:
         raise typer.BadParameter(f"{name} does not learn; `tracklake evaluate {name}` scores it")
     return name

@@ -66,7 +66,7 @@ def test_what_a_person_reads(done):
     assert re.search(r"[0-9,]+ samples are not scored: .*[0-9,]+ not recorded for 5 s", done.out)
 
 
-def test_evaluate_and_report_take_no_notice_of_it(done, copied):
+def test_a_forest_is_no_run(done, copied):
     from pipeline.stages.score import finished_runs
 
     assert done.code == 0

@@ -92,7 +92,7 @@ def test_evaluate_passes_by_a_run_that_was_made_for_other_tensors(command, lake,
     assert command.here("evaluate", "old", "--lake", copy, **full).code == 1
 
 
-@pytest.mark.parametrize("name", ["../tracks", "/etc", ".hidden", "constant-velocity"])
+@pytest.mark.parametrize("name", ["../tracks", "/etc", ".hidden", "constant-velocity", "lane-forest"])
 def test_a_runs_name_cannot_reach_other_folders(command, lake, name):
     done = command.here("train", "lstm", "--lake", lake.root, "--seconds", "0.5", f"--name={name}")
     assert done.code == 2

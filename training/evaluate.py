@@ -12,6 +12,7 @@ from schemas.evaluations import EVALUATIONS, EVERYTHING
 from schemas.protocols import Protocol
 from training.forecasters import open_forecaster
 from training.models import Predictor, Reads
+from training.prediction import NotFiniteError
 from training.reading import NEAREST, read_samples, truth_of_ego
 from training.scoring.guard import refuse_future
 from training.scoring.latency import Latency, measure_latency
@@ -159,7 +160,8 @@ def measure_errors(
     Raises:
         EmptyPartError: the part has no samples.
         FutureInputError: the model sees what comes after the moment at which it predicts.
-        ValueError: a prediction is not a finite number, or not of the horizon's shape.
+        NotFiniteError: a prediction is not a finite number.
+        ValueError: it is not of the horizon's shape.
     """
     samples = folder.samples_of(part)
     if len(samples) == 0:
@@ -178,9 +180,7 @@ def measure_errors(
     for what, sums in tally.sums.items():
         if not np.isfinite(sums).all():
             said = "densities" if what == "nll" else "positions"
-            raise ValueError(
-                f"`{name}` predicts {said} that are not finite numbers; train it again with a lower learning rate"
-            )
+            raise NotFiniteError(name, said)
     at = seconds if seconds is not None else [tick / protocol.rate_hz for tick in protocol.scored_ticks]
     return Evaluation(
         model=name,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from training.models import MODELS, Predictor, Reads, find_model
-from training.running.runs import load_run, refuse_leak, refuse_unfinished
+from training.running.runs import StaleRunError, load_run, refuse_leak, refuse_unfinished
 from training.tensors import TensorFolder
 
 
@@ -48,6 +48,8 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
             refuse_leak(run.config, folder, part)
         return Forecaster(name, run.predictor, model.reads)
     refuse_unfinished(models / name)
+    if Path(name).name == name and (models / name / "metrics.json").is_file():
+        raise StaleRunError(f"{models / name}: a run without its config.json; train it again")
     if name in MODELS:
         raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
     runs = sorted(path.parent.name for path in models.glob("[!.]*/config.json"))

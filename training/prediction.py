@@ -5,6 +5,20 @@ from dataclasses import dataclass
 from training.batches import Floats
 
 
+class NotFiniteError(ValueError):
+    """A model predicts what is no number.
+
+    Args:
+        model: its name, or the run's.
+        what: positions or densities.
+    """
+
+    def __init__(self, model: str, what: str) -> None:
+        super().__init__(
+            f"`{model}` predicts {what} that are not finite numbers; train it again with a lower learning rate"
+        )
+
+
 @dataclass(frozen=True)
 class Density:
     """A mixture of bivariate normal densities over places, at every tick.

@@ -42,7 +42,7 @@ class Recipe:
         """Of all phases together."""
         return sum(phase.epochs for phase in self.phases)
 
-    def phase_at(self, spent: float, budget: float = 1.0) -> Phase:
+    def phase_at(self, spent: float, budget: float) -> Phase:
         """The phase after so much of a budget: in whole steps, or in seconds."""
         ended = 0
         for phase in self.phases:

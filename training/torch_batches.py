@@ -174,8 +174,8 @@ class SampleDataset(Dataset[TorchBatch]):
 class ResidentTensors:
     """A whole folder on a device, and batches gathered there: nothing crosses the bus but the samples' numbers.
 
-    Takes what the arrays take: for each sample some 20 bytes, 6 for each of its neighbors, 14 for each entry on the
-    clock (with float32 positions). Its batches are never NumPy's, so nothing of `training.augmentation` can change
+    Takes what the arrays take: 16 bytes for each sample, 6 for each of its neighbors, 8 for each entry on the clock (4
+    with int16 positions). Its batches are never NumPy's, so nothing of `training.augmentation` can change
     them: that needs `BatchStream` or `SampleDataset`.
 
     Args:

@@ -13,8 +13,8 @@ from training.torch_batches import load_array, subtract_origin
 class ResidentSurroundings:
     """A whole folder on a device, and samples with those around them gathered there.
 
-    As `training.torch_batches.ResidentTensors`, but of whole scenes: of each entry on the clock some 14 bytes, of each
-    vehicle of each scene 4, of each sample 10.
+    As `training.torch_batches.ResidentTensors`, but of whole scenes: of each entry on the clock 10 bytes (6 with int16
+    positions), of each vehicle of each scene 4, of each sample 10.
 
     Args:
         folder: what to load.

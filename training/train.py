@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from training.evaluate import measure_errors
 from training.models import Model, Predictor, find_model, require_torch
 from training.observed import FutureInputError
+from training.prediction import NotFiniteError
 from training.running.checkpoints import find_config, read_checkpoint, refuse_other_run, restore, save_checkpoint
 from training.running.config import Plan, TrainConfig, make_plan
 from training.running.feeding import Batches, Read, make_reader, read_batches
@@ -79,6 +80,7 @@ def train(
             training with other settings or data; or another process is at it.
         DamagedFileError: the checkpoint is not what was written.
         DivergedError: the loss is not finite.
+        NotFiniteError: what the network predicts in the end is not.
         FutureInputError: the model sees what comes after the moment at which it predicts; told before the first step
             where it does so untrained, else after the last. No checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
@@ -112,7 +114,7 @@ def train(
             metrics["evaluation"] = _evaluate(network, entry, folder, out.name)
             save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
             checkpoint.unlink()
-        except (DivergedError, FutureInputError):
+        except (DivergedError, NotFiniteError, FutureInputError):
             checkpoint.unlink(missing_ok=True)  # it leads to the same, or was learnt from what came after
             raise
         except KeyboardInterrupt:
@@ -164,18 +166,19 @@ def _fit(
                     _log_steps(plan, state, optimizer, log_steps)  # a row is of one phase
                     state.begin_phase(phase.loss)
                 _take_step(plan, state, network, optimizer, batches, spent)
+                state.elapsed_s = time.monotonic() - began
                 if state.step % config.log_steps == 0:
                     _log_steps(plan, state, optimizer, log_steps)
                 ends = state.step % plan.epoch_steps == 0
                 if ends:
                     log_epoch(_end_epoch(plan, state, network, read))
-                state.elapsed_s = time.monotonic() - began
                 since_saved = time.monotonic() - saved
                 if since_saved > config.checkpoint_s or (ends and since_saved > BRIEF_S):
                     save()
                     saved = time.monotonic()
                 try:
                     if progress is not None:
+                        spent = state.elapsed_s if config.seconds else state.step
                         progress(min(1.0, spent / plan.budget), state.smooth_loss)
                     if interrupted():
                         raise KeyboardInterrupt
@@ -278,7 +281,7 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
 def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read) -> Row:
     """A row of epochs.csv; where there is patience, after validating, which keeps the weights where they are better."""
     epoch, phase = (state.step - 1) // plan.epoch_steps, state.phases[-1][0]
-    losses = state.losses[epoch * plan.epoch_steps :]
+    losses = state.losses[max(epoch * plan.epoch_steps, state.phases[-1][1]) :]  # of one phase: others are no number
     row: Row = {"epoch": epoch, "step": state.step, "phase": phase, "seconds": round(state.elapsed_s, 3)}
     row |= {"loss": sum(losses) / len(losses), "validation_loss": None, "best": None}
     if plan.config.patience is None:

@@ -75,6 +75,10 @@ def test_another_models_weights_are_refused_by_name_and_shape(finished):
         ({"version": None}, "expected version 2, got None; train it again"),
         (None, "not readable as JSON"),
         ([], "expected version 2, got a list"),
+        ({"protocol": {}}, "expected the name and digest of a protocol in it; train it again"),
+        ({"protocol": 3}, "expected protocol in it"),
+        ({"parameters": None}, "expected parameters in it"),
+        ({"train_subsets": 3, "blocks": {}}, "expected blocks, train_subsets in it"),
     ],
 )
 def test_runs_of_other_versions_and_broken_ones_are_refused(change, told, finished):
@@ -99,6 +103,40 @@ def test_a_run_is_not_evaluated_on_what_it_was_trained_on(finished, tmp_path):
     shutil.rmtree(finished)
     train("constant-velocity", write_tiny(tmp_path / "tensors"), tmp_path / "cv")
     assert evaluate("cv", tmp_path / "swapped", tmp_path).samples > 0, "what never learned cannot have seen anything"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"model": "crystal-ball"}, "unknown model `crystal-ball`"),
+        ({"parameters": {"hidden": "wide"}}, "run: .*train it again"),
+        ({"parameters": {"depth": 3}}, "model `forgetful` has no parameter depth"),
+    ],
+)
+def test_runs_that_cannot_be_built_are_refused(change, told, finished):
+    file = finished / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(StaleRunError, match=told):
+        load_run(finished, TINY)
+
+
+def test_a_run_without_its_config_is_refused(finished, trained):
+    (finished / "config.json").unlink()
+    with pytest.raises(StaleRunError, match=r"a run without its config.json; train it again"):
+        evaluate("run", trained / "tensors", finished.parent)
+
+
+def test_a_run_is_not_evaluated_on_what_chose_its_weights(tmp_path, monkeypatch):
+    """Trained on a, stopped by b, which is later what is evaluated on; without patience, b was never looked at."""
+    register(monkeypatch)
+    splits = pl.concat([split_row("a", "train"), split_row("b", "val"), split_row("c", "eval")])
+    other = pl.concat([split_row("a", "val"), split_row("b", "eval"), split_row("c", "train")])
+    tensors, later = write_tiny(tmp_path / "tensors", splits), write_tiny(tmp_path / "later", other)
+    train("forgetful", tensors, tmp_path / "patient", TrainConfig(epochs=2, patience=2))
+    with pytest.raises(StaleRunError, match=r"1 subset\(s\) of `eval` \(highd/b\) were .* or chose its weights"):
+        evaluate("patient", later, tmp_path)
+    train("forgetful", tensors, tmp_path / "plain", CONFIG)
+    assert evaluate("plain", later, tmp_path).samples > 0
 
 
 def test_a_run_meets_new_recordings(finished, tmp_path):

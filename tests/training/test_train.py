@@ -16,6 +16,7 @@ import training.train
 from schemas.protocols import CSP
 from training.evaluate import evaluate
 from training.models import MODELS
+from training.prediction import NotFiniteError
 from training.recipes import Phase, Recipe
 from training.tensors import TensorFolder
 from training.train import DivergedError, TrainConfig, train
@@ -242,10 +243,10 @@ def test_threads_are_as_before(tensors, tmp_path, monkeypatch):
         "forgetful",
         tensors,
         tmp_path / "run",
-        replace(FEW, threads=2),
+        replace(FEW, threads=before + 1),
         lambda *_: inside.append(torch.get_num_threads()),
     )
-    assert inside[0] == 2
+    assert inside[0] == before + 1
     assert torch.get_num_threads() == before
     assert len(built) == 1
 
@@ -357,6 +358,14 @@ def test_a_loss_that_explodes_is_told_and_nothing_is_left_to_go_on_from(tensors,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_last_step_that_explodes_leaves_nothing_to_go_on_from(tensors, tmp_path, monkeypatch):
+    """Its own loss was a number: it is what the weights predict then that is none."""
+    register(monkeypatch)
+    with pytest.raises(NotFiniteError, match="`run` predicts positions that are not finite numbers"):
+        train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=1, learning_rate=1e30))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
@@ -365,7 +374,9 @@ def test_a_loss_that_explodes_is_told_and_nothing_is_left_to_go_on_from(tensors,
         ({"steps": -1}, "expected `steps` above 0"),
         ({"learning_rate": float("nan")}, "expected `learning_rate` above 0"),
         ({"seed": -1}, "expected `seed` 0 or above, got -1"),
-        ({"steps": "x"}, "expected a number for `steps`, got 'x'"),
+        ({"steps": "x"}, "expected a whole number for `steps`, got 'x'"),
+        ({"batch_size": 2.5}, "expected a whole number for `batch_size`, got 2.5"),
+        ({"seconds": "x"}, "expected a number for `seconds`, got 'x'"),
         ({"parameters": 3}, "expected `parameters` by name, got 3"),
         ({"steps": 5, "seconds": 2.0}, "expected one of seconds, steps, epochs at most, got seconds 2.0 and steps 5"),
         ({"optimizer": "sgd"}, "expected `optimizer` adam or adamw, got 'sgd'"),

@@ -30,7 +30,7 @@ ARRAYS = {
     "threshold": np.dtype(np.float64),
     "leaf_odds": np.dtype(np.float64),
 }
-NEEDED_FACTS = ("settings", "protocol", "blocks", "train_subsets")
+NEEDED_FACTS = {"settings": object, "protocol": dict, "blocks": list, "train_subsets": list}
 """Without these nobody can say what a forest may be scored on."""
 WALKED_AT_ONCE = 4096
 
@@ -147,7 +147,7 @@ class LaneForest:
                 f"{file}: expected horizons in s, a rate in Hz and facts, got {header.get('horizons_s')!r}, "
                 f"{header.get('rate_hz')!r} and {type(facts).__name__}{AGAIN}"
             )
-        if not set(NEEDED_FACTS) <= facts.keys():
+        if not all(name in facts and isinstance(facts[name], kind) for name, kind in NEEDED_FACTS.items()):
             raise ForestError(f"{file}: expected facts of {', '.join(NEEDED_FACTS)}, got {', '.join(facts)}{AGAIN}")
         try:
             LaneForestSettings.read(facts["settings"])

@@ -23,7 +23,7 @@ from training.lane_changes.settings import LaneForestSettings
 from training.models import MODELS, Predictor, Reads
 from training.models.constant_velocity import ConstantVelocity
 from training.observed import FutureInputError, Observed, ObservedScene, part_batch
-from training.prediction import Prediction
+from training.prediction import NotFiniteError, Prediction
 from training.reading import NEAREST
 from training.running.runs import refuse_leak
 from training.scoring.guard import refuse_future
@@ -249,15 +249,14 @@ def _ask(name: str, predictor: Predictor, seen: _Seen, reads: Reads) -> Floats:
     """(B, F, 2) the places that a model says.
 
     Raises:
-        ValueError: they are not finite numbers, or not of the horizon's shape.
+        NotFiniteError: they are not finite numbers.
+        ValueError: they are not of the horizon's shape.
     """
     place_m = predictor.predict(seen.scene if reads == "scene" else seen.grid).position_m
     if place_m.shape != seen.future.shape:
         raise ValueError(f"`{name}`: expected places of shape {seen.future.shape}, got {place_m.shape}")
     if not np.isfinite(place_m).all():
-        raise ValueError(
-            f"`{name}` predicts positions that are not finite numbers; train it again with a lower learning rate"
-        )
+        raise NotFiniteError(name, "positions")
     return place_m
 
 

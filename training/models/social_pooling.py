@@ -40,7 +40,7 @@ class SocialPooling(Network):
 
     What differs from the published code: metres, with the axis along the road first; a neighbor with a short history
     is encoded with its earliest known position repeated, where the published reader takes its cell for empty; the
-    cross-entropies are those of one class out of several, where it adds up one of every class by itself; means are
+    cross-entropies are those of one class out of several, where it averages one of every class by itself; means are
     counted from constant velocity, unless `residual` is False.
     """
 

@@ -13,7 +13,7 @@ from training.batches import Floats
 from training.forecasters import Forecaster
 from training.mapped.windows import check_numbers, place
 from training.observed import ObservedScene
-from training.prediction import Density, Prediction
+from training.prediction import Density, NotFiniteError, Prediction
 from training.reading import NEAREST, read_samples
 from training.surroundings import find_around, gather_surroundings
 from training.tensors import TensorFolder
@@ -183,7 +183,7 @@ def place_forecast(model: str, said: Prediction, number: int, origin_m: Doubles)
     """
     position = said.position_m[number].astype(np.float64) + origin_m
     if not np.isfinite(position).all():
-        raise ValueError(f"`{model}` predicts positions that are not finite numbers; train it again")
+        raise NotFiniteError(model, "positions")
     return Forecast(
         model=model,
         position_m=position,

@@ -21,10 +21,8 @@ ScheduleName = Literal["constant", "cosine"]
 RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm")
 """What may be set of a model's recipe."""
 BUDGETS = ("seconds", "steps", "epochs")
-NUMBERS = (
-    *BUDGETS, "samples_per_epoch", "patience", "batch_size", "learning_rate", "max_gradient_norm", "seed", "threads",
-    "log_steps", "checkpoint_s",
-)  # fmt: skip
+WHOLE_NUMBERS = ("steps", "epochs", "samples_per_epoch", "patience", "batch_size", "seed", "threads", "log_steps")
+NUMBERS = ("seconds", "learning_rate", "max_gradient_norm", "checkpoint_s")
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class TrainConfig:
             does not decide the weights bit for bit, interrupted or not: some sums (of pooled neighbors, for one) are
             added up in whatever order the threads come.
         log_steps: a row of course.csv every so many steps.
-        checkpoint_s: a checkpoint at least so often, besides those at the ends of epochs.
+        checkpoint_s: a checkpoint at least so often, besides those at the ends of epochs that took a while.
     """
 
     seconds: float | None = None
@@ -82,6 +80,8 @@ class TrainConfig:
         """
         for own in fields(self):
             value = getattr(self, own.name)
+            if own.name in WHOLE_NUMBERS and not isinstance(value, int | None):
+                raise ValueError(f"training: expected a whole number for `{own.name}`, got {value!r}")
             if own.name in NUMBERS and not isinstance(value, int | float | None):
                 raise ValueError(f"training: expected a number for `{own.name}`, got {value!r}")
             if own.name != "seed" and isinstance(value, int | float) and not value > 0:
@@ -178,7 +178,7 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
             f"{folder.path}: patience {config.patience} needs samples in `val` to judge by, and the split "
             f"`{folder.split}` has none: set `validation_part = true` and run `tracklake run`, or train without it"
         )
-    if config.device != "cpu" and not (config.device.startswith("cuda") and torch.cuda.is_available()):
+    if config.device != "cpu" and not (config.device == "cuda" and torch.cuda.is_available()):
         raise ValueError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
     device = (
         torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device(config.device)

@@ -25,8 +25,8 @@ EPOCHS = {
     "epoch": "from 0; the last one may be shorter than the others",
     "step": "optimiser steps done by its end",
     "phase": "the recipe's loss, of its last step",
-    "seconds": "as in course.csv",
-    "loss": "mean over its steps",
+    "seconds": "as in course.csv, before validating",
+    "loss": "mean over its steps of that phase",
     "validation_loss": "of the same phase over the part `val`; empty where it is not measured",
     "best": "1 where that is the least of its phase so far, else 0; empty where it is not measured",
 }

@@ -27,6 +27,8 @@ RUN_VERSION = 2
 AGAIN = "train it again"
 TRAINED_BY = ("tracklake", "torch")
 """Distributions whose versions a run names."""
+KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "blocks": list}
+"""Of what a run's config must hold."""
 HASHED_BYTES = 1 << 22
 """At a time: Ctrl-C does not wait for a whole array."""
 
@@ -73,6 +75,7 @@ def describe_run(
         "protocol": folder.index["protocol"],
         "split": folder.split,
         "train_subsets": sorted(folder.subsets_of("train")),
+        "val_subsets": sorted(folder.subsets_of("val")) if config.get("patience") else [],
         "blocks": folder.index["blocks"],
         "tensors": digest_tensors(folder),
     }
@@ -150,7 +153,8 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     """Load a run for tensors of a protocol.
 
     Raises:
-        StaleRunError: the run is of another version, was trained for another protocol, or is damaged.
+        StaleRunError: the run is of another version, was trained for another protocol, is of a model or has parameters
+            that this version does not know, or is damaged.
         ImportError: torch is needed and missing.
     """
     config = read_config(path)
@@ -159,8 +163,11 @@ def load_run(path: Path, protocol: Protocol) -> Run:
             f"{path}: trained for the protocol {config['protocol']['name']} ({config['protocol']['digest']}), the "
             f"tensors are of {protocol.name} ({protocol.digest}); train it again on these tensors"
         )
-    model = find_model(config["model"])
-    predictor = model.build(protocol, **config["parameters"])
+    try:
+        model = find_model(config["model"])
+        predictor = model.build(protocol, **config["parameters"])
+    except (ValueError, TypeError) as wrong:
+        raise StaleRunError(f"{path}: {wrong}; {AGAIN}") from None
     if model.learns:
         require_torch(model.name)
         from training.running.torch_files import DamagedFileError, load_weights, read_torch_file
@@ -188,7 +195,9 @@ def read_config(path: Path) -> dict[str, Any]:
     version = config.get("version") if isinstance(config, dict) else f"a {type(config).__name__}"
     if version != RUN_VERSION:
         raise StaleRunError(f"{file}: expected version {RUN_VERSION}, got {version}; {AGAIN}")
-    lacking = sorted({"model", "parameters", "protocol", "train_subsets", "blocks"} - config.keys())
+    lacking = sorted(name for name, kind in KINDS.items() if not isinstance(config.get(name), kind))
+    if not lacking and not {"name", "digest"} <= config["protocol"].keys():
+        lacking = ["the name and digest of a protocol"]
     if lacking:
         raise StaleRunError(f"{file}: expected {', '.join(lacking)} in it; {AGAIN}")
     return dict(config)
@@ -214,7 +223,8 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     """Refuse to evaluate a run on what it was trained on.
 
     The split may have been drawn anew since the run was trained. Where it has, no subset of the part may be one that
-    the run has seen; where it has not, the split itself keeps the parts apart.
+    the run was trained on, or that its weights were chosen by (`patience`); where it has not, the split itself keeps
+    the parts apart.
 
     Args:
         config: the run's.
@@ -226,9 +236,10 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     """
     if config["blocks"] == folder.index["blocks"]:
         return
-    seen = sorted(set(config["train_subsets"]) & folder.subsets_of(part))
+    seen = sorted({*config["train_subsets"], *config.get("val_subsets", ())} & folder.subsets_of(part))
     if seen:
         raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "
-            f"`{part}` ({', '.join(seen[:5])}) were in its training part; train it again on these tensors"
+            f"`{part}` ({', '.join(seen[:5])}) were in its training part, or chose its weights; train it again "
+            "on these tensors"
         )

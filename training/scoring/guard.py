@@ -7,13 +7,15 @@ none of them by the same amount as a later one; other maneuvers; and no track th
 
 What is not found out:
 
-- a model that learnt the answers by heart before; `training.running.runs.refuse_leak` keeps those away;
+- a model that learnt the answers by heart before (`training.running.runs.refuse_leak` keeps those away), or keeps
+  arrays of the folder from before;
 - one that reads the files anew (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
 - one that looks up, in the folder that it holds, who else is a sample, a neighbor (in which cell) or in a scene later;
 - one that uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;
 - one that sees the future at other moments only than the few that are looked at.
 """
 
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
@@ -34,7 +36,8 @@ from training.tensors import TensorFolder
 MOMENTS = 3
 """Predicted twice."""
 TOLERANCE = 1e-3
-"""Differences that are no leak, in the predictions' own units, and relative to them: arithmetic of another order."""
+"""Differences that are no leak, in the predictions' own units: arithmetic of another order."""
+RELATIVE_TOLERANCE = 1e-5
 
 Change = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 
@@ -91,7 +94,7 @@ def refuse_future(
     """Refuse a model whose predictions of some moments change with what comes after them.
 
     The folder itself is another one meanwhile, so that a model which holds it is found out too; it is not to be read
-    from another thread at the same time.
+    from another thread at the same time. The model is asked in copies.
 
     Args:
         predictor: the model.
@@ -114,7 +117,9 @@ def refuse_future(
         def predict(samples: Integers = samples) -> tuple[dict[str, Any], dict[str, Any]]:
             observed, _ = read_samples(folder, samples, reads, nearest=nearest)
             given = {own.name: np.array(getattr(observed, own.name)) for own in fields(observed)}  # before it is used
-            return given, _arrays_of(predictor.predict(observed))
+            # A copy each time: nothing that is remembered of one prediction goes into the next one.
+            asked = copy.deepcopy(predictor, {id(folder): folder})
+            return given, _arrays_of(asked.predict(observed))
 
         given, said = predict()
         for array, change in OF_ROWS.items():
@@ -239,8 +244,8 @@ def _find_difference(
             shapes = (own[name].shape if name in own else "nothing" for own in (one, other))
             return name, 0, "shape {} or {}".format(*shapes)
         was, now = one[name].astype(np.float64), other[name].astype(np.float64)
-        tolerance = 0.0 if exactly else TOLERANCE
-        near = np.isclose(was, now, rtol=tolerance, atol=tolerance, equal_nan=True)
+        relative, absolute = (0.0, 0.0) if exactly else (RELATIVE_TOLERANCE, TOLERANCE)
+        near = np.isclose(was, now, rtol=relative, atol=absolute, equal_nan=True)
         if not near.all():
             apart = np.where(near, 0.0, np.nan_to_num(np.abs(was - now), nan=np.inf))
             return name, int(np.unravel_index(apart.argmax(), apart.shape)[0]), f"{apart.max():.3g} apart"
