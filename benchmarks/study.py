@@ -91,8 +91,8 @@ def work_on(arm: Arm, lake: Path, source: Path, options: argparse.Namespace, run
     common = ("--lake", lake, "--protocol", arm.protocol)
     if left:
         runner.run("run", source, *common, environment=arm.environment)
-    # The longest first: the last of two at a time then waits least.
-    left.sort(key=lambda job: -job[0].share)
+    # The slowest networks, which are those that take a share, first: the last of two at a time then waits least.
+    left.sort(key=lambda job: job[0].share)
     with ThreadPoolExecutor(options.at_once) as pool:
         list(pool.map(lambda job: learn(arm, *job, lake, options, runner), left))
     if arm.forest:
