@@ -145,7 +145,8 @@ def describe_arm(arm: Arm, rows: pl.DataFrame, lake: Path) -> str:
     everything = pick(means)
     seconds = sorted(everything["seconds"].unique())
     parts = [f"## {arm.name}: protocol `{arm.protocol}`", describe_source(arm)]
-    parts.append(f"What was trained:\n\n{lay_out_training(arm, lake)}")
+    longer = f", {arm.epochs} epochs instead of the recipes'" if arm.epochs else ""
+    parts.append(f"What was trained{longer}:\n\n{lay_out_training(arm, lake)}")
     headline = PROTOCOLS[arm.protocol].headline
     titles = {"RMSE, m": "rmse_m"}
     if headline == "rmse-by-axis":
