@@ -124,11 +124,12 @@ def test_names_and_figures_are_never_cut_off(width):
     assert shown == "".join(names)
 
 
-def test_another_number_of_vehicles_around_is_not_written_into_the_lake(command, lake):
+@pytest.mark.parametrize("option", ["--nearest=2", "--no-published", "--every-tick", "--part=train"])
+def test_what_the_options_change_is_not_written_into_the_lake(command, lake, option):
     before = list_files(lake)
-    done = command.here("evaluate", "--nearest", "2", "--no-published", "--lake", lake.root)
+    done = command.here("evaluate", option, "--lake", lake.root)
     assert done.code == 0, done.err
-    assert "note: the lake keeps scores of 10 vehicles around; --out writes these" in done.out
+    assert "note: the lake keeps the table of the options' defaults; --out writes this one" in done.out
     assert list_files(lake) == before
 
 

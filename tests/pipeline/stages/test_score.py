@@ -10,7 +10,7 @@ from pipeline.stages.score import collect_scores
 from training.running.runs import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
-INDEX = {"protocol": {"name": "tiny"}, "blocks": [{"part": "eval"}]}
+INDEX = {"protocol": {"name": "tiny", "digest": "0"}, "blocks": [{"part": "eval"}]}
 MANIFEST = SimpleNamespace(entries={TENSORS: SimpleNamespace(info={"path": "tensors"})})
 
 
@@ -33,7 +33,7 @@ def root(tmp_path):
 
 
 def test_runs_of_other_tensors_are_none(root):
-    write_run(root, "other", protocol={"name": "other"})
+    write_run(root, "other", protocol={"name": "other", "digest": "1"})
     passed_by = []
     assert collect_scores(root, MANIFEST, passed_by.append) == [{"model": "whole", "part": "eval", "rows": [ROW]}]
     assert passed_by == []
