@@ -152,7 +152,8 @@ def learn_forest(arm: Arm, seed: int, lake: Path, runner: Runner) -> None:
         return
     curve = ["--learning-curve"] if seed == 0 else []
     where = ("--lake", lake, "--protocol", arm.protocol)
-    runner.run("lane-forest", "--seed", seed, *curve, *where, environment=arm.environment)
+    runs = [name_run(learner, seed) for learner in arm.learners]  # whose columns are also that forest's
+    runner.run("lane-forest", *runs, "--seed", seed, *curve, *where, environment=arm.environment)
     scores = lake / "models" / "lane-forest" / "lane_forest.json"
     kept.write_text(scores.read_text(encoding="utf-8"), encoding="utf-8")
 

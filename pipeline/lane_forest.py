@@ -32,6 +32,9 @@ OPTIONS_OF_THEIR_OWN = ("examples", "augmentation")
 
 
 def lane_forest(
+    runs: Annotated[
+        list[str] | None, typer.Argument(help="Runs whose cells are scored, too; none: all runs in the lake.")
+    ] = None,
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
     seed: Annotated[
@@ -89,7 +92,7 @@ def lane_forest(
             passed_by[name] = why
             terminal.complain(f"{name}: {why}", label="passed by")
 
-        predictors, reads = _find_predictors(settings.lake / MODELS, folder, pass_by)
+        predictors, reads = _find_predictors(settings.lake / MODELS, folder, runs or [], pass_by)
         try:
             scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
         except FutureInputError as leak:
@@ -160,29 +163,30 @@ def _write(file: Path, record: dict[str, Any]) -> None:
 
 
 def _find_predictors(
-    models: Path, folder: "TensorFolder", pass_by: "Callable[[str, str], None]"
+    models: Path, folder: "TensorFolder", runs: list[str], pass_by: "Callable[[str, str], None]"
 ) -> tuple[dict[str, "Predictor"], dict[str, "Reads"]]:
     """Models that need no training, and the lake's runs that were trained on these tensors, with what each reads.
 
-    What cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is passed by.
+    What cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is passed by, unless it
+    was asked for by name.
     """
     from pipeline.stages.score import finished_runs
+    from training.forecasters import open_forecaster
     from training.models import MODELS
-    from training.running.runs import load_run, refuse_leak
 
     predictors: dict[str, Predictor] = {name: MODELS[name].build(folder.protocol) for name in MODELS_BESIDE}
     reads = {name: MODELS[name].reads for name in MODELS_BESIDE}
-    for path in (file.parent for file in finished_runs(models.parent)):
-        if path.name in predictors:
+    for name in runs or [file.parent.name for file in finished_runs(models.parent)]:
+        if name in predictors:
             continue
         try:
-            run = load_run(path, folder.protocol)
-            refuse_leak(run.config, folder, "eval")
+            own = open_forecaster(name, folder, models, frozenset({"eval"}))
         except (ValueError, OSError, ImportError) as refused:
-            pass_by(path.name, str(refused))
+            if runs:
+                raise
+            pass_by(name, str(refused))
             continue
-        predictors[path.name] = run.predictor
-        reads[path.name] = MODELS[run.config["model"]].reads
+        predictors[name], reads[name] = own.predictor, own.reads
     return predictors, reads
 
 

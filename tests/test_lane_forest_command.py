@@ -11,6 +11,7 @@ from schemas.protocols import CSP
 from training.lane_changes import LaneForest
 from training.lane_changes.examples import LEFT_OUT, STRATA
 from training.lane_changes.features import NAMES
+from training.models import MODELS
 from training.running.runs import describe_run, save_run
 from training.tensors import TensorFolder
 
@@ -94,12 +95,16 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
         "of-another-protocol": {"protocol": config["protocol"] | {"digest": "another"}},
         "good": {},
         "of-an-unknown-model": {"model": "crystal-ball"},
-        "on-these-recordings": {"blocks": [], "train_subsets": sorted(folder.subsets_of("eval"))},
     }.items():
         save_run(models / name, config | changes, {}, None)
+    learned = describe_run("lstm", {}, {}, folder) | {"blocks": [], "train_subsets": sorted(folder.subsets_of("eval"))}
+    save_run(models / "on-these-recordings", learned, {}, MODELS["lstm"].build(folder.protocol))
     (models / "damaged").mkdir()
     (models / "damaged" / "metrics.json").write_text("{}")
     finished = command.here("lane-forest", "--lake", copied, "--use", "--json")
+    written = json.loads((kept / "lane_forest.json").read_text())
+    alone = command.here("lane-forest", "good", "--lake", copied, "--use", "--json")
+    refused = command.here("lane-forest", "good", "on-these-recordings", "--lake", copied, "--use")
     for run in models.iterdir():
         if run != kept:
             shutil.rmtree(run)
@@ -110,6 +115,10 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     straight = [own for own in scored["cells"] if own["model"] == "constant-velocity"]
     assert [own for own in told["cells"] if own["model"] == "good"] == [own | {"model": "good"} for own in straight]
     assert [own for own in told["cells"] if own["model"] != "good"] == scored["cells"]
+    assert json.loads(alone.out)["cells"] == told["cells"]
+    assert json.loads(alone.out)["passed_by"] == {}, "it was not asked for"
+    assert refused.code == 1
+    assert "were in its training part" in refused.err
     reasons = {
         "damaged": "config.json",
         "of-another-protocol": "trained for the protocol csp",
@@ -120,7 +129,7 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     for name, reason in reasons.items():
         assert reason in told["passed_by"][name]
         assert f"passed by: {name}: " in finished.err
-    assert json.loads((kept / "lane_forest.json").read_text())["passed_by"] == told["passed_by"]
+    assert written["passed_by"] == told["passed_by"]
 
 
 def test_settings_are_the_forests(command, copied, kept):

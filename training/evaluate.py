@@ -20,8 +20,8 @@ from training.scoring.scores import Score, Tally, find_strata
 from training.tensors import TensorFolder
 
 BATCH_SIZE = 256
-"""Samples predicted at once; the errors do not depend on it. Of 2,048, an LSTM's layers leave a processor's cache: twice
-as long for the largest network."""
+"""Samples predicted at once; the errors do not depend on it. With 2,048, the largest network's layers leave a processor's
+cache, and it takes nearly twice as long."""
 
 
 @dataclass(frozen=True)

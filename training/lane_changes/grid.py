@@ -14,8 +14,9 @@ import numpy.typing as npt
 
 from schemas.columns import LATERAL_MANEUVERS
 from training.batches import Flags, Floats, Integers
+from training.evaluate import BATCH_SIZE
 from training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
-from training.lane_changes.examples import READ_AT_ONCE, STRATA, Judged, judge_samples
+from training.lane_changes.examples import STRATA, Judged, judge_samples
 from training.lane_changes.features import NUMBER, describe_targets
 from training.lane_changes.forest import LaneForest, decide
 from training.lane_changes.labels import KEEP, LEFT
@@ -340,8 +341,8 @@ def _find_strata(judged: Judged) -> dict[str, Flags]:
 
 
 def _cut(numbers: Integers) -> Iterator[Integers]:
-    for start in range(0, len(numbers), READ_AT_ONCE):
-        yield numbers[start : start + READ_AT_ONCE]
+    for start in range(0, len(numbers), BATCH_SIZE):
+        yield numbers[start : start + BATCH_SIZE]
 
 
 def _find_ticks(folder: TensorFolder, forest: LaneForest) -> npt.NDArray[np.intp]:
