@@ -20,8 +20,8 @@ from training.scoring.scores import Score, Tally, find_strata
 from training.tensors import TensorFolder
 
 BATCH_SIZE = 256
-"""Samples predicted at once; the errors do not depend on it. With 2,048, the largest network's layers leave the cache of a
-processor, and it takes nearly twice as long."""
+"""Samples predicted at once; the errors do not depend on it. With 2,048, what the largest network computes leaves the
+cache, and it takes nearly twice as long."""
 
 
 @dataclass(frozen=True)
