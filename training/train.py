@@ -158,7 +158,7 @@ def _fit(
             saved = time.monotonic()
             while True:
                 state.elapsed_s = time.monotonic() - began
-                spent = state.elapsed_s if config.seconds else state.step
+                spent = plan.measure_spent(state.step, state.elapsed_s)
                 if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
                 phase = plan.recipe.phase_at(spent, plan.budget)
@@ -178,7 +178,7 @@ def _fit(
                     saved = time.monotonic()
                 try:
                     if progress is not None:
-                        spent = state.elapsed_s if config.seconds else state.step
+                        spent = plan.measure_spent(state.step, state.elapsed_s)
                         progress(min(1.0, spent / plan.budget), state.smooth_loss)
                     if interrupted():
                         raise KeyboardInterrupt

@@ -30,7 +30,7 @@ ARRAYS = {
     "threshold": np.dtype(np.float64),
     "leaf_odds": np.dtype(np.float64),
 }
-NEEDED_FACTS = {"settings": object, "protocol": dict, "blocks": list, "train_subsets": list}
+NEEDED_FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
 """Without these nobody can say what a forest may be scored on."""
 WALKED_AT_ONCE = 4096
 
@@ -147,8 +147,11 @@ class LaneForest:
                 f"{file}: expected horizons in s, a rate in Hz and facts, got {header.get('horizons_s')!r}, "
                 f"{header.get('rate_hz')!r} and {type(facts).__name__}{AGAIN}"
             )
-        if not all(name in facts and isinstance(facts[name], kind) for name, kind in NEEDED_FACTS.items()):
-            raise ForestError(f"{file}: expected facts of {', '.join(NEEDED_FACTS)}, got {', '.join(facts)}{AGAIN}")
+        lacking = [name for name, kind in NEEDED_FACTS.items() if not isinstance(facts.get(name), kind)]
+        if lacking:
+            raise ForestError(
+                f"{file}: expected facts of {', '.join(NEEDED_FACTS)}, got no {', '.join(lacking)}{AGAIN}"
+            )
         try:
             LaneForestSettings.read(facts["settings"])
         except ValueError as wrong:

@@ -138,6 +138,10 @@ class Plan:
         epochs = self.config.epochs or self.recipe.epochs
         return self.config.seconds or self.config.steps or epochs * self.epoch_steps
 
+    def measure_spent(self, step: int, elapsed_s: float) -> float:
+        """How much of the budget is spent, in its own unit."""
+        return elapsed_s if self.config.seconds else step
+
     def draw_epoch(self, epoch: int) -> Integers:
         """(epoch_samples,) numbers of an epoch's samples in its order, every one once at most."""
         random = np.random.default_rng((self.config.seed, epoch))
