@@ -15,8 +15,8 @@ from unittest import mock
 
 import pytest
 from hypothesis import HealthCheck, settings
+from lake_sources import EXCERPTS, SAMPLE
 
-SAMPLE_MINUTES = 0.3
 SERVER_START_S = 120.0
 
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
@@ -160,7 +160,7 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
 def sample(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default sample, shortened, with its truth.parquet."""
     folder = tmp_path_factory.mktemp("generated") / "sample"
-    done = command("sample", "--out", folder, "--minutes", str(SAMPLE_MINUTES), "--seed", "7", "--quiet")
+    done = command("sample", "--out", folder, *SAMPLE, "--quiet")
     assert done.code == 0, done.err
     return folder
 
@@ -181,9 +181,20 @@ def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactor
     return Lake(root, json.loads(done.out))
 
 
+@pytest.fixture(scope="session")
+def excerpts_lake(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Lake:
+    """Likewise of the real NGSIM excerpts, where they are at hand."""
+    if not EXCERPTS.is_dir():
+        pytest.skip(f"the NGSIM excerpts are not at {EXCERPTS}")
+    root = tmp_path_factory.mktemp("lakes") / "lake"
+    done = command("run", EXCERPTS, "--lake", root, "--json")
+    assert done.code == 0, done.err
+    return Lake(root, json.loads(done.out))
+
+
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what uses the generated sample on one worker, so that it is generated once."""
+    """Keep what uses the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"sample", "lake"} & set(getattr(item, "fixturenames", ())):
+        if {"sample", "lake", "excerpts_lake"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.xdist_group("lake"))

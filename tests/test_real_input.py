@@ -1,11 +1,10 @@
 """The real excerpts through the command, where they are at hand (they are not part of the repository)."""
 
 import json
-from pathlib import Path
 
 import pytest
+from lake_sources import EXCERPTS
 
-EXCERPTS = Path(__file__).parents[2] / "shared" / "data" / "ngsim"
 pytestmark = [
     pytest.mark.xdist_group("lake"),
     pytest.mark.skipif(not EXCERPTS.is_dir(), reason=f"the NGSIM excerpts are not at {EXCERPTS}"),
@@ -29,10 +28,8 @@ def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
     assert "peachtree-1600-south" in (tmp_path / "lake" / "reports" / "index.html").read_text()
 
 
-def test_all_excerpts_at_once(command, tmp_path):
-    done = command("run", EXCERPTS, "--lake", tmp_path / "lake", "--json")
-    assert done.code == 0, done.err
-    said = json.loads(done.out)
+def test_all_excerpts_at_once(command, excerpts_lake):
+    said = excerpts_lake.said
     # 1,005 + 1,999 + 10,000 + 38 + 155,604 rows, and 5,000 of the portal's once more in another dialect, which are
     # recognised as repetitions.
     assert said["headline"]["rows_read"] == 173_646
@@ -41,7 +38,7 @@ def test_all_excerpts_at_once(command, tmp_path):
     assert said["headline"]["recordings"] == 7
     query = """SELECT recording, measure, expected, found FROM completeness WHERE authority = 'published'
                AND recording IN ('us-101-0750', 'i-80-1600') ORDER BY ALL"""
-    rows = json.loads(command.here("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)
+    rows = json.loads(command.here("sql", query, "--lake", excerpts_lake.root, "--format", "json").out)
     # Counted over the files with the csv module alone; seven rows of two other vehicles of US-101 07:50 are the API's.
     assert [tuple(row.values()) for row in rows] == [
         ("i-80-1600", "entries", 1_262_678, 1_005),
