@@ -25,9 +25,9 @@ import numpy as np
 import polars as pl
 from csp_lake import measure_export
 
-from pipeline.transforms.samples import TRACK_COLUMNS, draw_samples
-from schemas import FINDINGS, MISSING_STARTS
-from schemas.protocols import CSP
+from tracklake.pipeline.transforms.samples.selection import TRACK_COLUMNS, draw_samples
+from tracklake.schemas import FINDINGS, MISSING_STARTS
+from tracklake.schemas.protocols import CSP
 
 ENTRIES = 10_000_000
 REPEATS = 3

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.lake import Entry, load, open_for_writing, write_table
-from pipeline.settings import Settings
-from pipeline.sources.assemble import assemble_subset
-from pipeline.sources.base import RawFile, Subset
-from pipeline.stages.registry import STAGE_BY_NAME
-from schemas import SUBSETS, TRACKS, VEHICLES
-from schemas.columns import FOOT_M
+from tracklake.pipeline.lake import Entry, load, open_for_writing, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources.assemble import assemble_subset
+from tracklake.pipeline.sources.source import RawFile, Subset
+from tracklake.pipeline.stages.registry import STAGE_BY_NAME
+from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.columns import FOOT_M
 
 RECORDINGS = {
     "us-101-0750": 1_180_598,
@@ -64,8 +64,8 @@ def export(lake: Path, out: Path, options: tuple[str, ...]) -> tuple[float, floa
     shutil.rmtree(out, ignore_errors=True)
     # The high-water mark of the program itself: what getrusage tells includes this process, from which it was started.
     code = (
-        "import pathlib, pipeline.cli\n"
-        "try:\n    pipeline.cli.main()\n"
+        "import pathlib, tracklake.pipeline.cli.app\n"
+        "try:\n    tracklake.pipeline.cli.app.main()\n"
         "finally:\n    print(pathlib.Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])"
     )
     command = [sys.executable, "-c", code, "export", "csp", "--lake", str(lake), "--out", str(out), *options, "--quiet"]

@@ -23,9 +23,9 @@ from pathlib import Path
 import polars as pl
 from raw_files import ngsim_rows, write_export, write_highd, write_text
 
-from pipeline.lake.files import ZSTD_LEVEL
-from pipeline.sources.ngsim_dialects import EXPORT_FIELDS
-from schemas.raw_highd import RAW_TRACKS_FIELDS
+from tracklake.pipeline.lake.files import ZSTD_LEVEL
+from tracklake.pipeline.sources.ngsim_dialects import EXPORT_FIELDS
+from tracklake.schemas.raw_highd import RAW_TRACKS_FIELDS
 
 REPEATS = 3
 FLOOR_LEVEL = 3
@@ -175,8 +175,8 @@ def ingest(source: Path, work: Path, environment: dict[str, str]) -> tuple[float
     shutil.rmtree(lake, ignore_errors=True)
     # The high-water mark of the program itself: what getrusage tells includes this process, from which it was started.
     code = (
-        "import pathlib, pipeline.cli\n"
-        "try:\n    pipeline.cli.main()\n"
+        "import pathlib, tracklake.pipeline.cli.app\n"
+        "try:\n    tracklake.pipeline.cli.app.main()\n"
         "finally:\n    print(pathlib.Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])"
     )
     command = [sys.executable, "-c", code, "ingest", str(source), "--lake", str(lake), "--workers", "2", "--quiet"]

@@ -7,7 +7,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import polars as pl
 
-from schemas.raw_highd import RAW_RECORDING_FIELDS, RAW_TRACKS_FIELDS, RAW_VEHICLES_FIELDS
+from tracklake.schemas.raw_highd import RAW_RECORDING_FIELDS, RAW_TRACKS_FIELDS, RAW_VEHICLES_FIELDS
 
 HIGHD_FRAMES_PER_VEHICLE = 360
 NGSIM_FRAMES_PER_VEHICLE = 600

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from schemas.columns import PARTS
-from training.tensors import TensorFolder
+from tracklake.schemas.columns import PARTS
+from tracklake.training.data.tensor_folder import TensorFolder
 
 CELLS = 39
 

@@ -13,8 +13,8 @@ from itertools import combinations
 
 import polars as pl
 
-from pipeline.transforms.split_tables import COLUMNS, Allocation
-from pipeline.transforms.splits import allocate_flow_balanced
+from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
+from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation
 
 SUBSETS = 117
 SITES = {"1": 60, "2": 10, "3": 10, "4": 8, "5": 7, "6": 5}

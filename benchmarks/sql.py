@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.lake import Entry, connect, open_for_writing, write_table
-from schemas import (
+from tracklake.pipeline.lake import Entry, connect, open_for_writing, write_table
+from tracklake.schemas import (
     FINDINGS,
     MISSING_STARTS,
     NEIGHBORS,

@@ -6,7 +6,7 @@ import polars as pl
 from study_plan import CLAIMS, Claim
 from study_tables import FEW, grid, pick
 
-from schemas.evaluations import EVERYTHING
+from tracklake.schemas.evaluations import EVERYTHING
 
 WHERE = {EVERYTHING: "all", "ngsim": "NGSIM-like", "highd": "highD-like"}
 HOW = """\

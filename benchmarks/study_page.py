@@ -12,9 +12,9 @@ from study_forest import describe_forest
 from study_plan import ARMS, PLAIN, Arm
 from study_tables import FEW, grid, order, pick, show
 
-from schemas.evaluations import EVERYTHING, FIGURES
-from schemas.protocols import PROTOCOLS
-from training.pictures.error_figure import draw_error_growth
+from tracklake.schemas.evaluations import EVERYTHING, FIGURES
+from tracklake.schemas.protocols import PROTOCOLS
+from tracklake.training.plots.error_figure import draw_error_growth
 
 EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv", "jobs.csv"
 GROUPS = "groups.csv"

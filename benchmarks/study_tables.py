@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 
 import polars as pl
 
-from schemas.evaluations import EVERYTHING
-from training.models import MODELS
+from tracklake.schemas.evaluations import EVERYTHING
+from tracklake.training.models import MODELS
 
 FEW = 30
 """Figures over fewer samples are not shown."""

@@ -34,15 +34,15 @@ import numpy as np
 import polars as pl
 from reference_loader import Reference
 
-from pipeline.tensor_files import write_tensors
-from pipeline.transforms.resample import put_on_clock
-from pipeline.transforms.tensors import SubsetTensors, build_subset_tensors
-from schemas.columns import Table
-from schemas.findings import FINDINGS
-from schemas.protocols import CSP
-from schemas.samples import NEIGHBORS, SAMPLES
-from schemas.splits import SPLITS
-from schemas.vehicles import VEHICLES
+from tracklake.pipeline.lake.tensor_files import write_tensors
+from tracklake.pipeline.transforms.resample import put_on_clock
+from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
+from tracklake.schemas.columns import Table
+from tracklake.schemas.findings import FINDINGS
+from tracklake.schemas.protocols import CSP
+from tracklake.schemas.samples import NEIGHBORS, SAMPLES
+from tracklake.schemas.splits import SPLITS
+from tracklake.schemas.vehicles import VEHICLES
 
 REPEATS = 3
 CASES = {
@@ -250,7 +250,7 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
 
 def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, Any]:
     """Read batches of the training part for so long, beginning anew where it ends."""
-    from training.tensors import TensorFolder
+    from tracklake.training.data.tensor_folder import TensorFolder
 
     opened = TensorFolder.open(Path(folder))
     if order == "one at a time":

@@ -31,9 +31,9 @@ import numpy as np
 from reference_loader import Reference
 from tensors import CASES, build, save
 
-from training.observed import Observed, Truth
-from training.reading import read_samples
-from training.tensors import TensorFolder
+from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models.inputs import read_samples
 
 Read = tuple[Observed[Any], Truth[Any]]
 
@@ -101,8 +101,8 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
     """Train for so long."""
     import torch
 
-    from training.models import find_model
-    from training.running.memory import keep_freed_memory
+    from tracklake.training.models import find_model
+    from tracklake.training.runs.memory import keep_freed_memory
 
     if step.endswith("kept"):
         keep_freed_memory()
@@ -180,7 +180,7 @@ def collate_batches(folder: TensorFolder) -> Iterator[Read]:
 
 def measure_predictions(folder: str) -> dict[str, tuple[float, float]]:
     """Every model of the registry, untrained: (wall, processor) ms, medians of 20."""
-    from training.models import MODELS
+    from tracklake.training.models import MODELS
 
     opened = TensorFolder.open(Path(folder))
     numbers = opened.samples_of("eval")[:VEHICLES]

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from quality_reports.findings import judge_subset
-from quality_reports.judging import judge, tracks_needed
-from quality_reports.scene import Scene
-from schemas import TRACKS
+from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
+from tracklake.quality_reports.rules.findings import judge_subset
+from tracklake.quality_reports.rules.scene import Scene
+from tracklake.schemas import TRACKS
 
 REPEATS = 3
 CASES = {

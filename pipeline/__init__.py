@@ -1,5 +1,1 @@
-"""Raw recordings to lake: sources, transforms, the lake, stages, flows and the command line."""
-
-from importlib.metadata import version
-
-__version__ = version("tracklake")
+"""Raw recordings to a lake: sources, transforms, stages, flows and the command line."""

@@ -8,8 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
-from schemas.protocols import CSP, PROTOCOLS, Protocol
-from schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
+from tracklake.schemas.protocols import CSP, PROTOCOLS, Protocol
+from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
 
 PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split")
 """Settings that take the place of a protocol's own values."""

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from schemas.completeness import PUBLISHED_TOTALS
+from tracklake.schemas.completeness import PUBLISHED_TOTALS
 
 SOURCE = (
     "the appendices of the study that validates NGSIM and highD (speeds averaged per vehicle and second, errors by the "

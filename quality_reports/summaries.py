@@ -9,11 +9,11 @@ from typing import Any, Protocol, SupportsFloat, TypeAlias
 
 import polars as pl
 
-from quality_reports.published import SOURCE, list_published
-from quality_reports.rules import RULES, Rule, describe
-from schemas.columns import PARTS
-from schemas.split_leakage import QUANTITIES
-from schemas.start_assessments import ESTIMATORS
+from tracklake.quality_reports.published import SOURCE, list_published
+from tracklake.quality_reports.rules.registry import RULES, Rule, describe
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.split_leakage import QUANTITIES
+from tracklake.schemas.start_assessments import ESTIMATORS
 
 QUALITY_SCHEMA = "tracklake/quality/1"
 SIGNIFICANT_DIGITS = 10
@@ -55,7 +55,7 @@ Parameters = Mapping[str, Any]
 
 def statement(name: str) -> str:
     """The text of `sql/<name>.sql`."""
-    return (files("quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
+    return (files("tracklake.quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
 
 
 def query(connection: Connection, name: str, parameters: Parameters | None = None) -> list[Row]:

@@ -1,18 +1,18 @@
 """What every table of the lake is. Nothing but polars and pandera is imported here."""
 
-from schemas.columns import StructureError, Table, column
-from schemas.completeness import COMPLETENESS
-from schemas.findings import FINDINGS
-from schemas.ingestion import INGEST_LOG, REJECTS
-from schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
-from schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
-from schemas.scores import SUBSET_SCORES, VEHICLE_SCORES
-from schemas.split_leakage import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS
-from schemas.splits import SPLIT_BALANCE, SPLIT_LEFT_OUT, SPLIT_RECIPES, SPLITS
-from schemas.start_assessments import START_ASSESSMENTS
-from schemas.subsets import SUBSET_STATUS, SUBSETS
-from schemas.tracks import TRACKS
-from schemas.vehicles import VEHICLE_STARTS, VEHICLES
+from tracklake.schemas.columns import StructureError, Table, column
+from tracklake.schemas.completeness import COMPLETENESS
+from tracklake.schemas.findings import FINDINGS
+from tracklake.schemas.ingestion import INGEST_LOG, REJECTS
+from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
+from tracklake.schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
+from tracklake.schemas.scores import SUBSET_SCORES, VEHICLE_SCORES
+from tracklake.schemas.split_leakage import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS
+from tracklake.schemas.splits import SPLIT_BALANCE, SPLIT_LEFT_OUT, SPLIT_RECIPES, SPLITS
+from tracklake.schemas.start_assessments import START_ASSESSMENTS
+from tracklake.schemas.subsets import SUBSET_STATUS, SUBSETS
+from tracklake.schemas.tracks import TRACKS
+from tracklake.schemas.vehicles import VEHICLE_STARTS, VEHICLES
 
 SCHEMA_VERSION = 1
 """Counts changes of the tables below that an older lake cannot be read with."""

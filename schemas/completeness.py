@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, Table, column
+from tracklake.schemas.columns import DATASET, Table, column
 
 RECORDING_META, TRACKS_META, PUBLISHED, TOTAL_FRAMES = "recordingMeta", "tracksMeta", "published", "Total_Frames"
 AUTHORITIES = (RECORDING_META, TRACKS_META, PUBLISHED, TOTAL_FRAMES)

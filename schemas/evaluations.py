@@ -17,7 +17,7 @@ Roots are taken last: rmse_m of `vehicles` is the root of the mean over vehicles
 import pandera.polars as pa
 import polars as pl
 
-from schemas.columns import PARTS, Table, column
+from tracklake.schemas.columns import PARTS, Table, column
 
 ORIGINS = ("measured", "published")
 AVERAGES = ("samples", "vehicles")

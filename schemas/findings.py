@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, SEVERITIES, SUBSET, Table, column
+from tracklake.schemas.columns import DATASET, SEVERITIES, SUBSET, Table, column
 
 FINDINGS = Table(
     "findings",

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, Table, column
+from tracklake.schemas.columns import DATASET, Table, column
 
 REASON_COUNT = pl.Struct({"reason": pl.String(), "rows": pl.Int64()})
 

@@ -1,11 +1,11 @@
-"""The tables as Markdown, derived from their declarations: `python -m schemas.markdown > docs/tables.md`."""
+"""The tables as Markdown, derived from their declarations: `python -m tracklake.schemas.markdown > docs/tables.md`."""
 
 import sys
 from collections.abc import Iterator
 
-from schemas import SCHEMA_VERSION, TABLES, Table
-from schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
-from schemas.raw_ngsim import RAW_NGSIM
+from tracklake.schemas import SCHEMA_VERSION, TABLES, Table
+from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
+from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 RAW_TABLES = (RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS)
 

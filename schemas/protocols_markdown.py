@@ -1,9 +1,9 @@
-"""The protocols as Markdown, from their declaration: `python -m schemas.protocols_markdown > docs/protocols.md`."""
+"""The protocols as Markdown, from their declaration: see `make docs`."""
 
 import sys
 from collections.abc import Sequence
 
-from schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
+from tracklake.schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
 
 HEAD = """# Protocols
 

@@ -7,7 +7,7 @@ stand in the file.
 
 import polars as pl
 
-from schemas.columns import Table, column
+from tracklake.schemas.columns import Table, column
 
 RAW_TRACKS_FIELDS = (
     *("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity", "xAcceleration", "yAcceleration"),

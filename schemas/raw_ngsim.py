@@ -7,7 +7,7 @@ exceed; a line beyond them is rejected.
 
 import polars as pl
 
-from schemas.columns import Table, column
+from tracklake.schemas.columns import Table, column
 
 RAW_NGSIM = Table(
     "raw_ngsim",

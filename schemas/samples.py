@@ -2,7 +2,15 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PROTOCOL, SUBSET, Table, column
+from tracklake.schemas.columns import (
+    DATASET,
+    LATERAL_MANEUVERS,
+    LONGITUDINAL_MANEUVERS,
+    PROTOCOL,
+    SUBSET,
+    Table,
+    column,
+)
 
 CELLS = 39
 """Cells of the neighbor grid: 13 rows x 3 columns (left, own, right)."""

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import DATASET, SUBSET, Table, column
 
 WITHOUT_ERROR = "of the entries, those that break no rule of severity error"
 WITHOUT_WARNING = "of the entries, those that break no rule of severity error or warning"

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, PARTS, Table, column
+from tracklake.schemas.columns import DATASET, PARTS, Table, column
 
 QUANTITIES = ("flow", "speed", "left", "right", "brake")
 """Whose distributions are compared: veh/lane/s, m/s, and 0 or 1 for each sample's maneuver."""

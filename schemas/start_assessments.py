@@ -2,10 +2,10 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import DATASET, SUBSET, Table, column
 
 ESTIMATORS = ("regression", "mean_speed", "no_margin", "local_regression")
-"""The contract's (DESIGN section 6), two simpler ones and a better one; see `pipeline.transforms.assess_starts`."""
+"""The contract's (DESIGN section 6), two simpler ones and a better one; see `pipeline.transforms.starts.assessment`."""
 
 START_ASSESSMENTS = Table(
     "start_assessments",

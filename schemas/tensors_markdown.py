@@ -1,10 +1,10 @@
-"""The tensor folder as Markdown, from its declaration: `python -m schemas.tensors_markdown > docs/tensors.md`."""
+"""The tensor folder as Markdown, from its declaration: see `make docs`."""
 
 import sys
 
-from schemas import tensors
-from schemas.protocols import CSP
-from schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
+from tracklake.schemas import tensors
+from tracklake.schemas.protocols import CSP
+from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
 
 LETTERS = {
     "N": "rows: entries on the protocol's clock that stand in a part of the split, of subsets with samples",
@@ -19,11 +19,12 @@ HEAD = f"""# Tensors
 
 Derived from `schemas/tensors.py`; do not edit (`make docs` writes it). Version {TENSORS_VERSION}.
 
-`tracklake tensors` writes a folder of two files, which `training.tensors.TensorFolder.open` maps into memory and
+`tracklake tensors` writes a folder of two files, which `training.data.tensor_folder.TensorFolder.open` maps into
+memory and
 checks: `{tensors.ARRAYS_FILE}`, every array in the safetensors layout, and `{tensors.INDEX_FILE}`, what they are.
 
 Shapes, order and units of the batches gathered from them (numpy, torch, or on a device) are those of
-`training.batches.Batch` and `SceneBatch`. Under the protocol `{CSP.name}` a history has H = \
+`training.data.batches.Batch` and `SceneBatch`. Under the protocol `{CSP.name}` a history has H = \
 {CSP.history_ticks} positions, a future F = {CSP.horizon_ticks}; of others see [protocols](protocols.md).
 
 ## Sizes

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import DATASET, SUBSET, Table, column
 
 TRACKS = Table(
     "tracks",

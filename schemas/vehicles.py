@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from schemas.columns import DATASET, SUBSET, VEHICLE_CLASSES, Table, column
+from tracklake.schemas.columns import DATASET, SUBSET, VEHICLE_CLASSES, Table, column
 
 VEHICLES = Table(
     "vehicles",

@@ -49,7 +49,7 @@ class Command:
         """The same in this process, which spares imports: where neither the process nor Prefect is what is tested."""
         from typer.testing import CliRunner
 
-        from pipeline.cli import app
+        from tracklake.pipeline.cli.app import app
 
         with chdir(self.folder), mock.patch.dict(os.environ, {**self.environment, **extra}, clear=True):
             done = CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False)
@@ -61,7 +61,7 @@ class Command:
 
     def __call__(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
         done = subprocess.run(
-            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)],
             cwd=self.folder,
             env={**self.environment, **extra},
             input=stdin,
@@ -75,7 +75,7 @@ class Command:
     def start(self, *arguments: str | Path, **extra: str) -> "subprocess.Popen[str]":
         """Start it and do not wait."""
         return subprocess.Popen(
-            [sys.executable, "-m", "pipeline.cli", *map(str, arguments)],
+            [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)],
             cwd=self.folder,
             env={**self.environment, **extra},
             stdout=subprocess.PIPE,

@@ -43,12 +43,12 @@ import polars as pl
 from lake_sources import EXCERPTS, SAMPLE
 from scipy.io import loadmat
 
-from pipeline.lake import load, scan
-from schemas import TABLES
-from schemas.columns import PARTS
-from training.models import MODELS
-from training.tensors import TensorFolder
-from training.train import TrainConfig, train
+from tracklake.pipeline.lake import load, scan
+from tracklake.schemas import TABLES
+from tracklake.schemas.columns import PARTS
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models import MODELS
+from tracklake.training.train import TrainConfig, train
 
 Digests = dict[str, str | list[str]]
 """By name; of losses the numbers, ten steps a line."""
@@ -254,7 +254,7 @@ def measure_all(folder: Path) -> dict[str, Digests]:
     environment = {**kept, "PREFECT_HOME": str(folder / "prefect")}
 
     def run(*arguments: str | Path) -> None:
-        command = [sys.executable, "-m", "pipeline.cli", *map(str, arguments)]
+        command = [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)]
         subprocess.run(command, env=environment, cwd=folder, stdout=subprocess.DEVNULL, check=True)
 
     sample, lake = folder / "sample", folder / "lake"

@@ -9,8 +9,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.lake import connect, query
-from pipeline.lake.macros import MACROS
+from tracklake.pipeline.lake import connect, query
+from tracklake.pipeline.lake.macros import MACROS
 
 PAGE = (Path(__file__).parents[1] / "docs" / "cookbook.md").read_text()
 QUESTIONS = re.findall(r"^### ([^\n]+\?)\n\n```sql\n(.*?)```\n\n(.+?)\n\n", PAGE, flags=re.DOTALL | re.MULTILINE)
@@ -63,7 +63,7 @@ def test_the_python_of_the_page_runs(lake, tmp_path, monkeypatch):
 
 
 def test_the_page_and_the_listing_name_every_macro_and_table(command):
-    from schemas import TABLES
+    from tracklake.schemas import TABLES
 
     listed = command.here("sql", "--list").out
     for macro in MACROS:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from quality_reports.markdown import write_rules
-from quality_reports.rules import RULES
-from schemas import TABLES
-from schemas.markdown import write_tables
-from training.models_markdown import write_models
+from tracklake.quality_reports.rules.markdown import write_rules
+from tracklake.quality_reports.rules.registry import RULES
+from tracklake.schemas import TABLES
+from tracklake.schemas.markdown import write_tables
+from tracklake.training.models.markdown import write_models
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -39,7 +39,7 @@ def test_the_commands_of_the_readme_run_as_printed(newcomer):
 
 
 def test_the_readme_names_every_command():
-    from pipeline.cli import app
+    from tracklake.pipeline.cli.app import app
 
     names = {command.name or command.callback.__name__ for command in app.registered_commands}
     assert [name for name in sorted(names) if f"tracklake {name}" not in README] == []

@@ -8,26 +8,26 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from training.evaluate import measure_errors
-from training.models import Model, Predictor, find_model, require_torch
-from training.observed import FutureInputError
-from training.prediction import NotFiniteError
-from training.running.checkpoints import find_config, read_checkpoint, refuse_other_run, restore, save_checkpoint
-from training.running.config import Plan, TrainConfig, make_plan
-from training.running.feeding import Batches, Read, make_reader, read_batches
-from training.running.interrupts import holding_interrupts
-from training.running.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
-from training.running.memory import keep_freed_memory
-from training.running.runs import describe_run, save_run
-from training.running.state import TrainingState
-from training.running.unfinished import CHECKPOINT_FILE, claim_folder, refuse_wrong_start
-from training.scoring.guard import refuse_future
-from training.tensors import TensorFolder
+from tracklake.training.data.observed import FutureInputError
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.evaluation.evaluate import measure_errors
+from tracklake.training.evaluation.guard import refuse_future
+from tracklake.training.models import Model, Predictor, find_model, require_torch
+from tracklake.training.models.prediction import NotFiniteError
+from tracklake.training.runs.checkpoints import find_config, read_checkpoint, refuse_other_run, restore, save_checkpoint
+from tracklake.training.runs.config import Plan, TrainConfig, make_plan
+from tracklake.training.runs.feeding import Batches, Read, make_reader, read_batches
+from tracklake.training.runs.interrupts import holding_interrupts
+from tracklake.training.runs.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
+from tracklake.training.runs.memory import keep_freed_memory
+from tracklake.training.runs.run_folder import describe_run, save_run
+from tracklake.training.runs.state import TrainingState
+from tracklake.training.runs.unfinished import CHECKPOINT_FILE, claim_folder, refuse_wrong_start
 
 if TYPE_CHECKING:
     import torch
 
-    from training.models.network import Network
+    from tracklake.training.models.network import Network
 
 __all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]
 
@@ -71,8 +71,8 @@ def train(
             checkpoint, which would be lost.
 
     Returns:
-        What `metrics.json` holds: see `_describe_training`, and `evaluation` (see `training.evaluate`; null where the
-        split has no evaluation part).
+        What `metrics.json` holds: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
+        where the split has no evaluation part).
 
     Raises:
         TensorError: the tensors are absent or broken.
@@ -84,7 +84,7 @@ def train(
         FutureInputError: the model sees what comes after the moment at which it predicts; told before the first step
             where it does so untrained, else after the last. No checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
-        ValueError: unknown model or parameter; not enough to train with, see `training.running.config.make_plan`; or no
+        ValueError: unknown model or parameter; not enough to train with, see `training.runs.config.make_plan`; or no
             time for one step.
         ImportError: torch is needed and missing.
     """

@@ -1,1 +1,1 @@
-"""Other projects' formats."""
+"""The lake in the formats of other projects."""

@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pipeline.lake.manifest import sync
+from tracklake.pipeline.lake.manifest import sync
 
 
 class ExportError(ValueError):

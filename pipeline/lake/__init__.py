@@ -1,11 +1,11 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
-from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
-from pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
-from pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
-from pipeline.lake.rebuild import list_ingested
-from pipeline.lake.sandbox import LakeResult, connect, query, query_errors
-from pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
+from tracklake.pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
+from tracklake.pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
+from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
+from tracklake.pipeline.lake.rebuild import list_ingested
+from tracklake.pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
 
 __all__ = [
     "Entry",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import polars as pl
 from polars.datatypes import DataTypeClass
 
-from pipeline.lake.errors import LakeError
-from pipeline.lake.files import partition_values
-from pipeline.lake.macros import MACROS
-from pipeline.lake.manifest import Manifest, write_aside
-from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
+from tracklake.pipeline.lake.errors import LakeError
+from tracklake.pipeline.lake.files import partition_values
+from tracklake.pipeline.lake.macros import MACROS
+from tracklake.pipeline.lake.manifest import Manifest, write_aside
+from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 
 if TYPE_CHECKING:
     import duckdb

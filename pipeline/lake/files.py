@@ -11,9 +11,9 @@ from urllib.parse import quote, unquote
 
 import polars as pl
 
-from pipeline.lake.errors import LakeMissingError
-from pipeline.lake.manifest import LakeFile, Manifest, load, sync
-from schemas import TABLES, Table
+from tracklake.pipeline.lake.errors import LakeMissingError
+from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load, sync
+from tracklake.schemas import TABLES, Table
 
 STAGING = ".staging"
 TENSORS = "tensors"

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
-from schemas import SCHEMA_VERSION
+from tracklake.pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
+from tracklake.schemas import SCHEMA_VERSION
 
 MANIFEST = "manifest.json"
 _ASIDE = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")

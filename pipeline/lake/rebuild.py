@@ -4,10 +4,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake.catalog import CATALOG
-from pipeline.lake.files import STAGING, TABLE_BY_NAME, TENSORS
-from pipeline.lake.manifest import MANIFEST, Manifest, Retired, load, not_ours, read_document, remembered_sources
-from schemas import SCHEMA_VERSION
+from tracklake.pipeline.lake.catalog import CATALOG
+from tracklake.pipeline.lake.files import STAGING, TABLE_BY_NAME, TENSORS
+from tracklake.pipeline.lake.manifest import (
+    MANIFEST,
+    Manifest,
+    Retired,
+    load,
+    not_ours,
+    read_document,
+    remembered_sources,
+)
+from tracklake.schemas import SCHEMA_VERSION
 
 
 def begin_anew(root: Path) -> Manifest:

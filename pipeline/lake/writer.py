@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake import catalog, files
-from pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, remove_leftovers, store
-from pipeline.lake.rebuild import begin_anew
+from tracklake.pipeline.lake import catalog, files
+from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
+from tracklake.pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, remove_leftovers, store
+from tracklake.pipeline.lake.rebuild import begin_anew
 
 LOCK = ".lock"
 KEPT_GENERATIONS = 2

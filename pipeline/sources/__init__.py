@@ -1,8 +1,8 @@
 """The datasets tracklake reads: one file each, listed here and nowhere else."""
 
-from pipeline.sources.base import RawFile, Source, SourceError
-from pipeline.sources.highd import HIGHD
-from pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.highd import HIGHD
+from tracklake.pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.source import RawFile, Source, SourceError
 
 SOURCES: tuple[Source, ...] = (HIGHD, NGSIM)
 

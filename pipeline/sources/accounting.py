@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from pipeline.sources.base import Part
-from pipeline.sources.lines import REJECT_SCHEMA
-from pipeline.sources.raw_files import LINE, fetch_lines
-from schemas import INGEST_LOG, REJECTS
+from tracklake.pipeline.sources.csv.lines import REJECT_SCHEMA
+from tracklake.pipeline.sources.csv.raw_files import LINE, fetch_lines
+from tracklake.pipeline.sources.source import Part
+from tracklake.schemas import INGEST_LOG, REJECTS
 
 FILE = "file_index"
 DUPLICATE = "duplicate row"

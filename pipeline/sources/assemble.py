@@ -5,11 +5,11 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.sources.base import RawFile, Subset
-from pipeline.transforms.gaps import add_gaps
-from pipeline.transforms.kinematics import add_kinematics, central_difference
-from schemas import SUBSETS, TRACKS, VEHICLES
-from schemas.columns import Dataset
+from tracklake.pipeline.sources.source import RawFile, Subset
+from tracklake.pipeline.transforms.tracks.gaps import add_gaps
+from tracklake.pipeline.transforms.tracks.kinematics import add_kinematics, central_difference
+from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.columns import Dataset
 
 
 def assemble_subset(

@@ -6,12 +6,12 @@ from math import floor
 
 import polars as pl
 
-from pipeline.sources.accounting import DUPLICATE
-from pipeline.sources.base import Subset
-from pipeline.sources.derived import IN_FULLER_FILE
-from schemas import COMPLETENESS, VEHICLES
-from schemas.columns import Dataset
-from schemas.completeness import PUBLISHED
+from tracklake.pipeline.sources.accounting import DUPLICATE
+from tracklake.pipeline.sources.derived import IN_FULLER_FILE
+from tracklake.pipeline.sources.source import Subset
+from tracklake.schemas import COMPLETENESS, VEHICLES
+from tracklake.schemas.columns import Dataset
+from tracklake.schemas.completeness import PUBLISHED
 
 VEHICLE = ["source_vehicle_id", "entries_announced"]
 """What identifies a vehicle to its source: on arterials it may stand in several subsets, each with some of its rows."""

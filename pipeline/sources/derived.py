@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from pipeline.sources.accounting import FILE
-from pipeline.sources.raw_files import LINE
+from tracklake.pipeline.sources.accounting import FILE
+from tracklake.pipeline.sources.csv.raw_files import LINE
 
 IN_FULLER_FILE = "duplicate row: the same entry stands in a fuller file"
 

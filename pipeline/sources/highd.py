@@ -9,11 +9,12 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
-from pipeline.sources.assemble import assemble_subset
-from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
-from pipeline.sources.completeness import Announced, compare
-from pipeline.sources.highd_rows import (
+from tracklake.pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
+from tracklake.pipeline.sources.assemble import assemble_subset
+from tracklake.pipeline.sources.completeness import Announced, compare
+from tracklake.pipeline.sources.csv.lines import Chunk, Layout, read_chunks
+from tracklake.pipeline.sources.csv.raw_files import LINE
+from tracklake.pipeline.sources.highd_rows import (
     DIRECTION,
     STRANGER,
     add_directions,
@@ -21,12 +22,11 @@ from pipeline.sources.highd_rows import (
     split_impossible,
     split_strangers,
 )
-from pipeline.sources.lines import Chunk, Layout, read_chunks
-from pipeline.sources.raw_files import LINE
-from pipeline.transforms.orientation import LOWER, UPPER, orient_highd
-from schemas import Table
-from schemas.completeness import RECORDING_META, TRACKS_META
-from schemas.raw_highd import (
+from tracklake.pipeline.sources.source import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
+from tracklake.pipeline.transforms.tracks.orientation import LOWER, UPPER, orient_highd
+from tracklake.schemas import Table
+from tracklake.schemas.completeness import RECORDING_META, TRACKS_META
+from tracklake.schemas.raw_highd import (
     RAW_HIGHD_RECORDING,
     RAW_HIGHD_TRACKS,
     RAW_HIGHD_VEHICLES,

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.sources.base import RawFile, SourceError
-from pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, RECORDING, VEHICLES, gather_sets, read_metadata
-from pipeline.transforms.split_tables import COLUMNS
+from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, RECORDING, VEHICLES, gather_sets, read_metadata
+from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.pipeline.transforms.splits.tables import COLUMNS
 
 
 @dataclass(frozen=True)

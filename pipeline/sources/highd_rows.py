@@ -3,10 +3,10 @@
 import numpy as np
 import polars as pl
 
-from pipeline.sources.base import RawFile, SourceError
-from pipeline.sources.raw_files import LINE
-from pipeline.transforms.orientation import LOWER, UPPER
-from schemas import TRACKS
+from tracklake.pipeline.sources.csv.raw_files import LINE
+from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.pipeline.transforms.tracks.orientation import LOWER, UPPER
+from tracklake.schemas import TRACKS
 
 STRANGER = "vehicle without a row in tracksMeta"
 DIRECTION = "drivingDirection"

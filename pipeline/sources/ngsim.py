@@ -7,19 +7,29 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
-from pipeline.sources.assemble import assemble_subset
-from pipeline.sources.base import Canonical, Grouping, Part, RawFile, Source, SourceError, Spilled, Subset, Unit
-from pipeline.sources.completeness import Announced, compare
-from pipeline.sources.derived import IN_FULLER_FILE, split_derived
-from pipeline.sources.lines import REJECT_SCHEMA, Chunk, map_chunks
-from pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording, site_of
-from pipeline.sources.raw_files import LINE, read_head
-from pipeline.transforms.identities import identify_vehicles
-from pipeline.transforms.orientation import DIRECTIONS, orient_ngsim
-from schemas.columns import FOOT_M
-from schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
-from schemas.raw_ngsim import RAW_NGSIM
+from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
+from tracklake.pipeline.sources.assemble import assemble_subset
+from tracklake.pipeline.sources.completeness import Announced, compare
+from tracklake.pipeline.sources.csv.lines import REJECT_SCHEMA, Chunk, map_chunks
+from tracklake.pipeline.sources.csv.raw_files import LINE, read_head
+from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
+from tracklake.pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording, site_of
+from tracklake.pipeline.sources.source import (
+    Canonical,
+    Grouping,
+    Part,
+    RawFile,
+    Source,
+    SourceError,
+    Spilled,
+    Subset,
+    Unit,
+)
+from tracklake.pipeline.transforms.tracks.identities import identify_vehicles
+from tracklake.pipeline.transforms.tracks.orientation import DIRECTIONS, orient_ngsim
+from tracklake.schemas.columns import FOOT_M
+from tracklake.schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
+from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 FRAME_RATE_HZ = 10.0
 CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}

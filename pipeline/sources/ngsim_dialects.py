@@ -5,10 +5,10 @@ from datetime import UTC, datetime
 from functools import cache
 from zoneinfo import ZoneInfo
 
-from pipeline.sources.base import SourceError
-from pipeline.sources.lines import UNNAMED, Layout
-from pipeline.sources.raw_files import LINE
-from schemas.raw_ngsim import RAW_NGSIM
+from tracklake.pipeline.sources.csv.lines import UNNAMED, Layout
+from tracklake.pipeline.sources.csv.raw_files import LINE
+from tracklake.pipeline.sources.source import SourceError
+from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 TEXT_FIELDS = (
     *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y"),

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
-from pipeline.settings import Settings
-from pipeline.stages import repair
-from pipeline.stages.base import Job, make_entry, make_job, recordings, upstream
-from pipeline.transforms.assess_starts import assess_starts
-from schemas import START_ASSESSMENTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import repair
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings, upstream
+from tracklake.pipeline.transforms.starts.assessment import assess_starts
+from tracklake.schemas import START_ASSESSMENTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS
 
 VERSION = 1
 

@@ -6,12 +6,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake import Entry, LakeFile, Manifest, connect, is_intact, scan, write_aside
-from pipeline.lake.files import REPORTS
-from pipeline.settings import Settings
-from pipeline.stages.base import Job, make_entry, make_job, recordings
-from quality_reports.page_names import FOLDER, name_pages
-from schemas import SPLITS
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, connect, is_intact, scan, write_aside
+from tracklake.pipeline.lake.files import REPORTS
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
+from tracklake.schemas import SPLITS
 
 VERSION = 1
 
@@ -51,8 +51,8 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
 
 def build(root: Path, job: Job, _settings: Settings) -> Entry:
     """Query what the lake holds of one recording and write its subsets' pages into reports/subsets/."""
-    from quality_reports.subset_pages import render_pages
-    from quality_reports.summaries import collect
+    from tracklake.quality_reports.pages.subsets import render_pages
+    from tracklake.quality_reports.summaries import collect
 
     provenance = {
         "lake": root.resolve().name,

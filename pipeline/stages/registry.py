@@ -1,7 +1,7 @@
 """The stages after ingestion, in the order in which `tracklake run` goes through them."""
 
-from pipeline.stages import assess, pages, repair, report, samples, score, split, tensors, validate
-from pipeline.stages.base import Stage
+from tracklake.pipeline.stages import assess, pages, repair, report, samples, score, split, tensors, validate
+from tracklake.pipeline.stages.stage import Stage
 
 STAGES: tuple[Stage, ...] = (
     Stage("validate", "Check every entry against the rules.", validate.plan, validate.build),

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
-from pipeline.settings import Settings
-from pipeline.stages.base import Job, make_entry, make_job, recordings
-from pipeline.transforms.late_starts import estimate_missing_starts, judge_starts
-from schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
+from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
 
 VERSION = 2
 

@@ -7,17 +7,17 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake import Entry, Manifest, connect, load
-from pipeline.lake.files import REPORTS, remove
-from pipeline.lake.manifest import remove_leftovers
-from pipeline.settings import PROTOCOL_SETTINGS, Settings
-from pipeline.sources import SOURCES
-from pipeline.stages.base import Job, make_entry, make_job, recordings
-from pipeline.stages.pages import find_pages, write_report_file
-from pipeline.stages.score import collect_scores, finished_runs
-from quality_reports.page_names import FOLDER
-from quality_reports.rules import RULES, resolve
-from quality_reports.split_page import SPLITS_PAGE
+from tracklake.pipeline.lake import Entry, Manifest, connect, load
+from tracklake.pipeline.lake.files import REPORTS, remove
+from tracklake.pipeline.lake.manifest import remove_leftovers
+from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
+from tracklake.pipeline.sources import SOURCES
+from tracklake.pipeline.stages.pages import find_pages, write_report_file
+from tracklake.pipeline.stages.score import collect_scores, finished_runs
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.quality_reports.pages.page_names import FOLDER
+from tracklake.quality_reports.pages.splits import SPLITS_PAGE
+from tracklake.quality_reports.rules.registry import RULES, resolve
 
 VERSION = 4
 PAGE, DOCUMENT = "index.html", "quality.json"
@@ -69,7 +69,7 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Query the lake and write reports/index.html and reports/quality.json; the subsets' pages are there by then."""
-    from quality_reports.report import build_report
+    from tracklake.quality_reports.pages.report import build_report
 
     manifest = load(root)
     provenance = {

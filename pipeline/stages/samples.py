@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
-from pipeline.settings import Settings
-from pipeline.stages import repair, validate
-from pipeline.stages.base import Job, make_entry, make_job, recordings, upstream
-from pipeline.transforms.samples import TRACK_COLUMNS, draw_samples
-from schemas import (
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import repair, validate
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings, upstream
+from tracklake.pipeline.transforms.samples.selection import TRACK_COLUMNS, draw_samples
+from tracklake.schemas import (
     FINDINGS,
     MISSING_STARTS,
     NEIGHBORS,

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipeline.lake import Entry, LakeFile, Manifest, load
-from pipeline.lake.files import MODELS, TENSORS
-from pipeline.settings import Settings
-from pipeline.stages import tensors
-from pipeline.stages.base import Job, make_entry, make_job, upstream
-from pipeline.stages.tensors import tensor_folder
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load
+from tracklake.pipeline.lake.files import MODELS, TENSORS
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import tensors
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, upstream
+from tracklake.pipeline.stages.tensors import tensor_folder
 
 VERSION = 2
 BASELINE = "constant-velocity"
@@ -27,7 +27,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
 
 def build(root: Path, job: Job, settings: Settings) -> Entry:
     """Evaluate the baseline and write it as a run like any other."""
-    from training.train import train
+    from tracklake.training.train import train
 
     out = root / MODELS / BASELINE
     metrics = train(BASELINE, tensor_folder(root, load(root), settings), out)
@@ -56,7 +56,7 @@ def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None
     Returns:
         {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
     """
-    from training.running.runs import StaleRunError, read_config
+    from tracklake.training.runs.run_folder import StaleRunError, read_config
 
     if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
         return []
@@ -79,7 +79,7 @@ def _read_score(path: Path) -> dict[str, Any] | None:
     Raises:
         StaleRunError: the file is damaged.
     """
-    from training.running.runs import AGAIN, StaleRunError
+    from tracklake.training.runs.run_folder import AGAIN, StaleRunError
 
     try:
         evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]

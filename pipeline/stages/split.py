@@ -4,13 +4,13 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.lake import Entry, Manifest, load, scan, write_table
-from pipeline.settings import Settings
-from pipeline.stages import samples
-from pipeline.stages.base import Job, make_entry, make_job, upstream
-from pipeline.stages.leakage import Leakage, measure, open_tables, refuse_leaks
-from pipeline.stages.split_makers import Made, Material, make_split
-from schemas import (
+from tracklake.pipeline.lake import Entry, Manifest, load, scan, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import samples
+from tracklake.pipeline.stages.split_leakage import Leakage, measure, open_tables, refuse_leaks
+from tracklake.pipeline.stages.split_makers import Made, Material, make_split
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, upstream
+from tracklake.schemas import (
     SAMPLES,
     SPLIT_BALANCE,
     SPLIT_CONTEXT,
@@ -22,8 +22,8 @@ from schemas import (
     SUBSET_STATUS,
     SUBSETS,
 )
-from schemas.protocols import Protocol
-from schemas.split_recipes import MEANINGS, SplitRecipe
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.split_recipes import MEANINGS, SplitRecipe
 
 VERSION = 3
 

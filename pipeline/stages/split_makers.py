@@ -6,11 +6,11 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.lake import Manifest, scan
-from pipeline.transforms.split_comparisons import divide_by_id, divide_by_recording
-from pipeline.transforms.split_tables import Allocation
-from pipeline.transforms.splits import allocate_flow_balanced, write_up
-from pipeline.transforms.time_blocks import (
+from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, write_up
+from tracklake.pipeline.transforms.splits.comparisons import divide_by_id, divide_by_recording
+from tracklake.pipeline.transforms.splits.tables import Allocation
+from tracklake.pipeline.transforms.splits.time_blocks import (
     VISITS,
     WEIGHTS,
     count_samples,
@@ -20,9 +20,9 @@ from pipeline.transforms.time_blocks import (
     find_visits,
     recount_blocks,
 )
-from schemas import SAMPLES, SPLIT_LEFT_OUT, TRACKS, VEHICLES
-from schemas.protocols import Protocol
-from schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCED, TIME_BLOCKS, SplitRecipe
+from tracklake.schemas import SAMPLES, SPLIT_LEFT_OUT, TRACKS, VEHICLES
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCED, TIME_BLOCKS, SplitRecipe
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,17 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.lake import Entry, Manifest, free_path, load, scan, write_folder
-from pipeline.lake.files import TENSORS
-from pipeline.settings import Settings
-from pipeline.stages import split, validate
-from pipeline.stages.base import Job, StageError, make_entry, make_job, upstream
-from pipeline.tensor_files import write_tensors
-from pipeline.transforms.resample import put_on_clock
-from pipeline.transforms.tensors import SubsetTensors, build_subset_tensors
-from schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS, VEHICLES
-from schemas.protocols import Protocol
-from schemas.tensors import INDEX_FILE
+from tracklake.pipeline.lake import Entry, Manifest, free_path, load, scan, write_folder
+from tracklake.pipeline.lake.files import TENSORS
+from tracklake.pipeline.lake.tensor_files import write_tensors
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import split, validate
+from tracklake.pipeline.stages.stage import Job, StageError, make_entry, make_job, upstream
+from tracklake.pipeline.transforms.resample import put_on_clock
+from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
+from tracklake.schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.tensors import INDEX_FILE
 
 VERSION = 4
 

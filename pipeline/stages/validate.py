@@ -4,14 +4,14 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
-from pipeline.settings import Settings
-from pipeline.stages.base import Job, make_entry, make_job, recordings
-from quality_reports.findings import judge_subset
-from quality_reports.judging import judge, tracks_needed
-from quality_reports.rules import RULES, resolve
-from quality_reports.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, find_lacking
-from schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
+from tracklake.quality_reports.rules.findings import judge_subset
+from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, find_lacking
+from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
 
 VERSION = 2
 

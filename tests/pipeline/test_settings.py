@@ -4,9 +4,9 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from pipeline.cli import app
-from pipeline.settings import Settings
-from schemas.protocols import PROTOCOLS
+from tracklake.pipeline.cli.app import app
+from tracklake.pipeline.settings import Settings
+from tracklake.schemas.protocols import PROTOCOLS
 
 
 @pytest.fixture(autouse=True)

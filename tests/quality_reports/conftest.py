@@ -6,9 +6,9 @@ import duckdb
 import polars as pl
 import pytest
 
-from pipeline.lake.macros import MACROS
-from quality_reports.report import Report, build_report
-from schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES
+from tracklake.pipeline.lake.macros import MACROS
+from tracklake.quality_reports.pages.report import Report, build_report
+from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES
 
 SHA = "0123456789abcdef" * 4
 UNCHECKED = ["negative_headway_recorded", "overlap", "headway_mismatch", "implausible_size", "outside_lane"]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from schemas.protocols import CSP, HEADLINES, MEANINGS, PROTOCOLS, Protocol
-from schemas.protocols_markdown import write_protocols
-from schemas.split_recipes import SPLIT_NAMES
+from tracklake.schemas.protocols import CSP, HEADLINES, MEANINGS, PROTOCOLS, Protocol
+from tracklake.schemas.protocols_markdown import write_protocols
+from tracklake.schemas.split_recipes import SPLIT_NAMES
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.tensors import ARRAYS, POSITION_STORAGES, SAFETENSORS_DTYPES, STEPS_M
-from schemas.tensors_markdown import LETTERS, write_tensors_page
+from tracklake.schemas.tensors import ARRAYS, POSITION_STORAGES, SAFETENSORS_DTYPES, STEPS_M
+from tracklake.schemas.tensors_markdown import LETTERS, write_tensors_page
 
 PAGE = Path(__file__).parents[2] / "docs" / "tensors.md"
 

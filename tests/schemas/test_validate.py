@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pandera.errors import SchemaErrors
 
-from schemas import TABLES
-from schemas.columns import StructureError, Table, column
+from tracklake.schemas import TABLES
+from tracklake.schemas.columns import StructureError, Table, column
 
 TABLE = Table(
     "things",

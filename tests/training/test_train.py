@@ -12,14 +12,14 @@ from tensor_tables import TINY, sample_everything, split_row, write
 from tensor_tables import drive as drive_vehicles
 from tiny_network import PARTS, RECIPE, Forgetful, read_log, register, write_tiny
 
-import training.train
-from schemas.protocols import CSP
-from training.evaluate import evaluate
-from training.models import MODELS
-from training.prediction import NotFiniteError
-from training.recipes import Phase, Recipe
-from training.tensors import TensorFolder
-from training.train import DivergedError, TrainConfig, train
+import tracklake.training.train
+from tracklake.schemas.protocols import CSP
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.evaluation.evaluate import evaluate
+from tracklake.training.models import MODELS
+from tracklake.training.models.prediction import NotFiniteError
+from tracklake.training.models.recipes import Phase, Recipe
+from tracklake.training.train import DivergedError, TrainConfig, train
 
 FEW = TrainConfig(steps=9, log_steps=2)
 
@@ -256,7 +256,7 @@ def test_threads_are_as_before(tensors, tmp_path, monkeypatch):
 
 def test_the_time_budget_ends_the_training_and_is_shared_by_the_phases(tensors, tmp_path, monkeypatch):
     clock = iter(range(1000))
-    monkeypatch.setattr(training.train.time, "monotonic", lambda: float(next(clock)))
+    monkeypatch.setattr(tracklake.training.train.time, "monotonic", lambda: float(next(clock)))
     built = register(monkeypatch)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(seconds=60.0))
     losses = [loss for loss, *_ in built[0].seen]
@@ -305,7 +305,7 @@ def test_patience_ends_the_last_phase_and_keeps_the_best_weights(tensors, tmp_pa
 
 def test_validation_is_the_loss_over_val_without_dropout(tensors, tmp_path, monkeypatch):
     built = register(monkeypatch, recipe=replace(RECIPE, phases=(Phase("mse", 1),)))
-    monkeypatch.setattr("training.train.VALIDATION_BATCH", 50)
+    monkeypatch.setattr("tracklake.training.train.VALIDATION_BATCH", 50)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(patience=1))
     shown = sorted(
         tuple(row.flatten().tolist()) for _, training, future in built[0].seen if not training for row in future

@@ -11,11 +11,11 @@ Source: Choi, Yim, Baek and Lee 2021, Machine Learning-Based Vehicle Trajectory 
 On-Board Sensors, Electronics 10(4), 420, https://doi.org/10.3390/electronics10040420.
 """
 
-from training.lane_changes.fitting import fit_lane_forest
-from training.lane_changes.forest import ForestError, LaneForest
-from training.lane_changes.grid import GridScores, evaluate_grid
-from training.lane_changes.learning import learn_curve
-from training.lane_changes.settings import LaneForestSettings
+from tracklake.training.lane_changes.fitting import fit_lane_forest
+from tracklake.training.lane_changes.forest import ForestError, LaneForest
+from tracklake.training.lane_changes.grid import GridScores, evaluate_grid
+from tracklake.training.lane_changes.learning_curve import learn_curve
+from tracklake.training.lane_changes.settings import LaneForestSettings
 
 __all__ = [
     "ForestError",

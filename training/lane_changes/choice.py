@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
-from training.batches import Bytes, Floats
-from training.lane_changes.features import NAMES
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.training.data.batches import Bytes, Floats
+from tracklake.training.lane_changes.features import NAMES
 
 
 @dataclass(frozen=True)

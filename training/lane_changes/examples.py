@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from training.augmentation import SWAPPED
-from training.batches import Bytes, Floats, Integers
-from training.lane_changes.cells import find_columns
-from training.lane_changes.features import describe_targets, mirror_targets, shift_targets
-from training.lane_changes.labels import KEEP, LEFT, RIGHT, find_judged, find_maneuvers, label_rows
-from training.lane_changes.settings import LaneForestSettings
-from training.reading import NEAREST
-from training.surroundings import gather_surroundings
-from training.tensors import TensorFolder
+from tracklake.training.data.augmentation import SWAPPED
+from tracklake.training.data.batches import Bytes, Floats, Integers
+from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.lane_changes.cells import find_columns
+from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets
+from tracklake.training.lane_changes.labels import KEEP, LEFT, RIGHT, find_judged, find_maneuvers, label_rows
+from tracklake.training.lane_changes.settings import LaneForestSettings
+from tracklake.training.models.inputs import NEAREST
 
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: by the label."""

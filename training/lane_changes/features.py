@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from training.batches import Floats, Integers
-from training.lane_changes.cells import find_columns
-from training.observed import ObservedScene
+from tracklake.training.data.batches import Floats, Integers
+from tracklake.training.data.observed import ObservedScene
+from tracklake.training.lane_changes.cells import find_columns
 
 FIT_S = 1.0
 """Speeds and accelerations are those of a parabola fitted to this much history."""

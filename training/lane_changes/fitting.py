@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
-from training.batches import Bytes, Floats
-from training.lane_changes.choice import choose_features
-from training.lane_changes.examples import (
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.training.data.batches import Bytes, Floats
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.lane_changes.choice import choose_features
+from tracklake.training.lane_changes.examples import (
     STRATA,
     Examples,
     augment,
@@ -17,10 +18,9 @@ from training.lane_changes.examples import (
     gather_examples,
     judge_samples,
 )
-from training.lane_changes.features import NUMBER
-from training.lane_changes.forest import LaneForest
-from training.lane_changes.settings import LaneForestSettings
-from training.tensors import TensorFolder
+from tracklake.training.lane_changes.features import NUMBER
+from tracklake.training.lane_changes.forest import LaneForest
+from tracklake.training.lane_changes.settings import LaneForestSettings
 
 if TYPE_CHECKING:
     from sklearn.ensemble import RandomForestClassifier

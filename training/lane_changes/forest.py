@@ -13,11 +13,11 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
-from training.batches import Bytes, Floats
-from training.lane_changes.features import NAMES, NUMBER, describe_targets
-from training.lane_changes.settings import LaneForestSettings
-from training.observed import ObservedScene
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.training.data.batches import Bytes, Floats
+from tracklake.training.data.observed import ObservedScene
+from tracklake.training.lane_changes.features import NAMES, NUMBER, describe_targets
+from tracklake.training.lane_changes.settings import LaneForestSettings
 
 VERSION = 1
 """Counts changes of the file that older readers cannot read."""

@@ -1,7 +1,7 @@
 """Scores of predicted cells: the column from a model's own place or from the forest, the row from the model's place.
 
 Truth and labels come from the future: they are compared with, and group the scores. What predicts is given samples as
-`training.observed` lets them be seen.
+`training.data.observed` lets them be seen.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
-from training.batches import Flags, Floats, Integers
-from training.evaluate import BATCH_SIZE
-from training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
-from training.lane_changes.examples import STRATA, Judged, judge_samples
-from training.lane_changes.features import NUMBER, describe_targets
-from training.lane_changes.forest import LaneForest, decide
-from training.lane_changes.labels import KEEP, LEFT
-from training.lane_changes.settings import LaneForestSettings
-from training.models import MODELS, Predictor, Reads
-from training.models.constant_velocity import ConstantVelocity
-from training.observed import FutureInputError, Observed, ObservedScene, part_batch
-from training.prediction import NotFiniteError, Prediction
-from training.reading import NEAREST
-from training.running.runs import refuse_leak
-from training.scoring.guard import refuse_future
-from training.surroundings import gather_surroundings
-from training.tensors import TensorFolder
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.training.data.batches import Flags, Floats, Integers
+from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.observed import FutureInputError, Observed, ObservedScene, part_batch
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.evaluation.evaluate import BATCH_SIZE
+from tracklake.training.evaluation.guard import refuse_future
+from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
+from tracklake.training.lane_changes.examples import STRATA, Judged, judge_samples
+from tracklake.training.lane_changes.features import NUMBER, describe_targets
+from tracklake.training.lane_changes.forest import LaneForest, decide
+from tracklake.training.lane_changes.labels import KEEP, LEFT
+from tracklake.training.lane_changes.settings import LaneForestSettings
+from tracklake.training.models import MODELS, Predictor, Reads
+from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.inputs import NEAREST
+from tracklake.training.models.prediction import NotFiniteError, Prediction
+from tracklake.training.runs.run_folder import refuse_leak
 
 ALL = "all"
 MOST = 200_000

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from schemas.columns import LATERAL_MANEUVERS
-from schemas.protocols import Protocol
-from schemas.tensors import NOMINAL_LANE_M
-from training.batches import Bytes, Flags, Integers
-from training.mapped.windows import place
-from training.tensors import TensorFolder
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.tensors import NOMINAL_LANE_M
+from tracklake.training.data.batches import Bytes, Flags, Integers
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.windows import place
 
 KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from training.lane_changes.labels import START_S, TOLERANCE_M
+from tracklake.training.lane_changes.labels import START_S, TOLERANCE_M
 
 AUGMENTATIONS = ("mirror", "shift")
 

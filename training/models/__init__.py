@@ -7,12 +7,12 @@ from importlib.util import find_spec
 from typing import Any, Literal
 from typing import Protocol as Interface
 
-from schemas.protocols import Protocol
-from training.prediction import Prediction
-from training.recipes import Phase, Recipe
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.models.prediction import Prediction
+from tracklake.training.models.recipes import Phase, Recipe
 
 Reads = Literal["grid", "scene"]
-"""What a model is given: `training.observed.Observed` or `ObservedScene`."""
+"""What a model is given: `training.data.observed.Observed` or `ObservedScene`."""
 
 
 class Predictor(Interface):
@@ -65,7 +65,7 @@ class Model:
             raise ValueError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
         if self.learns:
             require_torch(self.name)
-        make: Callable[..., Any] = getattr(import_module(f"training.models.{self.module}"), self.builder)
+        make: Callable[..., Any] = getattr(import_module(f"tracklake.training.models.{self.module}"), self.builder)
         return make(protocol, **{**self.parameters, **parameters})
 
 

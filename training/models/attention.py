@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from schemas.protocols import Protocol
-from training.batches import Flags, Floats
-from training.models.attention_layers import MultiHeadAttention, perceptron
-from training.models.constant_velocity import velocity_ticks
-from training.models.gaussians import gaussian_nll, to_gaussian
-from training.models.network import Network, check_phase, to_numpy
-from training.models.scene_features import Vehicles, count_features, describe_lanes, describe_vehicles
-from training.observed import ObservedScene, Truth
-from training.prediction import Density, Prediction
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.batches import Flags, Floats
+from tracklake.training.data.observed import ObservedScene, Truth
+from tracklake.training.models.attention_layers import MultiHeadAttention, perceptron
+from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.gaussians import gaussian_nll, to_gaussian
+from tracklake.training.models.network import Network, check_phase, to_numpy
+from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.models.scene_features import Vehicles, count_features, describe_lanes, describe_vehicles
 
 VEHICLE_WIDTH, LANE_WIDTH = 16, 4
 """Numbers of an embedding."""

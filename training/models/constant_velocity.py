@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from schemas.protocols import Protocol
-from training.batches import Floats
-from training.observed import Observed
-from training.prediction import Prediction
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.batches import Floats
+from tracklake.training.data.observed import Observed
+from tracklake.training.models.prediction import Prediction
 
 VELOCITY_S = 0.2
 """Seconds of history that the velocity is taken from."""

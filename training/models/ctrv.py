@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from schemas.protocols import Protocol
-from training.batches import Floats
-from training.models.constant_velocity import velocity_ticks
-from training.observed import Observed
-from training.prediction import Prediction
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.batches import Floats
+from tracklake.training.data.observed import Observed
+from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.prediction import Prediction
 
 TURN_S = 1.0
 """Seconds that each of the two ways lasts whose directions give the yaw rate."""

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from schemas.protocols import Protocol
-from training.models.network import PlaceNetwork
-from training.models.straight import Straight
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.models.network import PlaceNetwork
+from tracklake.training.models.straight import Straight
 
 WIDTH = 256
 """Of the embedding, of every LSTM layer and of the output layer (Choi et al. 2021)."""

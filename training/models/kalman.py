@@ -3,10 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
-from schemas.protocols import Protocol
-from training.batches import Floats
-from training.observed import Observed
-from training.prediction import Density, Prediction
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.batches import Floats
+from tracklake.training.data.observed import Observed
+from tracklake.training.models.prediction import Density, Prediction
 
 Doubles = npt.NDArray[np.float64]
 

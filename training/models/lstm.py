@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor, nn
 
-from schemas.protocols import Protocol
-from training.models.constant_velocity import velocity_ticks
-from training.models.network import PlaceNetwork
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.network import PlaceNetwork
 
 SPEED_SCALE_MPS = 15.0
 """Speeds are divided by this: motorway traffic then lies between 0 and about 3."""

@@ -8,8 +8,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from training.observed import Observed, Truth
-from training.prediction import Prediction
+from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.models.prediction import Prediction
 
 Answer = TypeVar("Answer")
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from training.observed import ObservedScene
+from tracklake.training.data.observed import ObservedScene
 
 PLACE_SCALE_M = (50.0, 5.0)
 """What last positions (along, across the road) are divided by, so that inputs are of the order of 1."""

@@ -2,9 +2,9 @@
 
 from torch import Tensor, nn
 
-from schemas.protocols import Protocol
-from training.models.network import PlaceNetwork
-from training.models.straight import Straight
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.models.network import PlaceNetwork
+from tracklake.training.models.straight import Straight
 
 
 class StackedLstm(PlaceNetwork):

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from schemas.protocols import Protocol
-from training.models.constant_velocity import extrapolate, velocity_ticks
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.models.constant_velocity import extrapolate, velocity_ticks
 
 
 class Straight(nn.Module):

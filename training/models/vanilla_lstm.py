@@ -3,12 +3,12 @@
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-from schemas.protocols import Protocol
-from training.models.gaussians import gaussian_nll, to_gaussian
-from training.models.network import Network, check_phase, mean_squared_distance, to_numpy
-from training.models.straight import Straight
-from training.observed import Observed, Truth
-from training.prediction import Density, Prediction
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.models.gaussians import gaussian_nll, to_gaussian
+from tracklake.training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.models.straight import Straight
 
 SLOPE = 0.1
 """Of the leaky ReLUs where the input is negative."""

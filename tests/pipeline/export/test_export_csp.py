@@ -9,14 +9,14 @@ from csp_script import PARTS, ScriptDataset, run_script
 from export_lakes import KEYS, ingest, run_stages
 from scipy.io import loadmat
 
-from pipeline.export import csp
-from pipeline.export.csp import FILES, CspOptions, export_csp
-from pipeline.export.csp_card import CARD
-from pipeline.export.folder import ExportError
-from pipeline.lake import LakeMissingError, load, scan
-from pipeline.settings import Settings
-from pipeline.stages.base import StageError
-from schemas import SAMPLES, VEHICLES
+from tracklake.pipeline.export.csp import export as csp
+from tracklake.pipeline.export.csp.card import CARD
+from tracklake.pipeline.export.csp.export import FILES, CspOptions, export_csp
+from tracklake.pipeline.export.folder import ExportError
+from tracklake.pipeline.lake import LakeMissingError, load, scan
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import StageError
+from tracklake.schemas import SAMPLES, VEHICLES
 
 NEEDED_BY_CLEAN = ("validate", "repair", "samples", "split")
 
@@ -258,7 +258,7 @@ def test_files_that_stand_there_are_replaced_on_request_only(ngsim, tmp_path):
 
 
 def test_a_file_beyond_the_formats_size_is_refused_with_advice(ngsim, tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.export.csp.LARGEST_BYTES", 100_000)
+    monkeypatch.setattr("tracklake.pipeline.export.csp.export.LARGEST_BYTES", 100_000)
     with pytest.raises(ExportError, match=r"`traj` of .*Nothing was written.*--dataset"):
         export_csp(Settings(lake=ngsim), tmp_path / "out", CspOptions())
     assert list(tmp_path.iterdir()) == []

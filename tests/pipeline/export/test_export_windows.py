@@ -11,15 +11,15 @@ import pytest
 from export_lakes import ingest, run_stages
 from typer.testing import CliRunner
 
-from pipeline.cli import app
-from pipeline.export import windows
-from pipeline.export.folder import ExportError
-from pipeline.export.windows import export_windows
-from pipeline.lake import load, scan
-from pipeline.settings import Settings
-from pipeline.stages import tensors
-from pipeline.stages.base import StageError, pending
-from schemas import NEIGHBORS, SAMPLES, SPLITS, TRACKS
+from tracklake.pipeline.cli.app import app
+from tracklake.pipeline.export.folder import ExportError
+from tracklake.pipeline.export.windows import export as windows
+from tracklake.pipeline.export.windows.export import export_windows
+from tracklake.pipeline.lake import load, scan
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import tensors
+from tracklake.pipeline.stages.stage import StageError, pending
+from tracklake.schemas import NEIGHBORS, SAMPLES, SPLITS, TRACKS
 
 STAGES = ("validate", "repair", "samples", "split", "tensors")
 NAMES = {"train.parquet", "val.parquet", "eval.parquet", "README.md"}
@@ -216,7 +216,7 @@ def test_a_failure_leaves_nothing(lake, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("pipeline.export.windows_card.write_card", fail)
+    monkeypatch.setattr("tracklake.pipeline.export.windows.card.write_card", fail)
     with pytest.raises(OSError, match="disk full"):
         export_windows(Settings(lake=lake), tmp_path / "out", "npz")
     assert list(tmp_path.iterdir()) == []

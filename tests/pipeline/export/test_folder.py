@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.export.folder import ExportError, refuse_taken, write_files
+from tracklake.pipeline.export.folder import ExportError, refuse_taken, write_files
 
 NAMES = ("a", "b", "c")
 

@@ -12,9 +12,9 @@ import polars as pl
 import pytest
 from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
 
-from pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
-from schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
-from schemas import SUBSETS as SUBSETS_TABLE
+from tracklake.pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
+from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
+from tracklake.schemas import SUBSETS as SUBSETS_TABLE
 
 SQL_NAMES = {
     pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
@@ -295,7 +295,7 @@ def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, folder: Path):
     """In a process of its own, for DuckDB may end it: the file system itself refuses."""
     before = snapshot(folder)
     script = (
-        "import sys; from pipeline.lake import connect; connection = connect(sys.argv[1]);"
+        "import sys; from tracklake.pipeline.lake import connect; connection = connect(sys.argv[1]);"
         "options = f\"storage = 'file', storage_path = '{sys.argv[1]}/splits'\";"
         "raw = connection._raw;"  # past the admission of statements
         "raw.execute(f'FROM enable_logging({options})').fetchall();"

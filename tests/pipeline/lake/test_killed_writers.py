@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from small_lake import Nursery, check_lake, find_files, write_round
 
-from pipeline.lake import load
+from tracklake.pipeline.lake import load
 
 STRIDE = 9
 """Every so manieth step of a session is died at; 1 is thorough and takes half a minute."""

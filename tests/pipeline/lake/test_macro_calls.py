@@ -8,9 +8,9 @@ import duckdb
 import pytest
 from macro_lake import CALLS, CHANGES, PAIRS, call, put_subset
 
-from pipeline.lake import QueryError, connect
-from pipeline.lake.macros import MACROS
-from schemas import TRACKS
+from tracklake.pipeline.lake import QueryError, connect
+from tracklake.pipeline.lake.macros import MACROS
+from tracklake.schemas import TRACKS
 
 
 @pytest.fixture(scope="module")

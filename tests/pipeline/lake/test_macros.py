@@ -7,9 +7,9 @@ import duckdb
 import pytest
 from macro_lake import PAIRS, entry, put_subset
 
-from pipeline.lake import connect
-from pipeline.lake.sandbox import LakeConnection
-from schemas import TRACKS
+from tracklake.pipeline.lake import connect
+from tracklake.pipeline.lake.query import LakeConnection
+from tracklake.schemas import TRACKS
 
 
 @pytest.fixture

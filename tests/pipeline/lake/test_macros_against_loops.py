@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from macro_lake import entry, put_subset
 
-from pipeline.lake import connect
-from pipeline.lake.sandbox import LakeConnection
+from tracklake.pipeline.lake import connect
+from tracklake.pipeline.lake.query import LakeConnection
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.lake import Entry, LakeFile, Manifest
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest
 
 KEYS = st.sampled_from(["ingest/highd/01", "ingest/highd/02", "validate/highd/01", "split"])
 COMMITS = st.tuples(KEYS, st.lists(st.integers(0, 2), max_size=3, unique=True))

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_lake import check_lake, commit_round, find_files, make_status, put, put_round, write_round
 
-from pipeline.lake import (
+from tracklake.pipeline.lake import (
     Entry,
     LakeError,
     LakeFile,
@@ -30,14 +30,14 @@ from pipeline.lake import (
     scan,
     write_folder,
 )
-from schemas import SUBSET_STATUS
+from tracklake.schemas import SUBSET_STATUS
 
 UPPER = {"dataset": "highd", "subset": "01-upper"}
 KEY = "validate/highd/01-upper"
 HOLD = (
     "import os, sys, time\n"
     "from pathlib import Path\n"
-    "from pipeline.lake import open_for_writing\n"
+    "from tracklake.pipeline.lake import open_for_writing\n"
     "with open_for_writing(Path(sys.argv[1])):\n"
     "    child = os.fork() if sys.argv[2] == 'fork' else 0\n"
     "    if child == 0 and sys.argv[2] == 'fork':\n"
@@ -290,7 +290,7 @@ def test_a_forked_child_that_runs_on_does_not_write(tmp_path: Path):
     script = (
         "import os, sys\n"
         "from pathlib import Path\n"
-        "from pipeline.lake import LakeError, open_for_writing\n"
+        "from tracklake.pipeline.lake import LakeError, open_for_writing\n"
         "with open_for_writing(Path(sys.argv[1])) as writer:\n"
         "    child = os.fork()\n"
         "    if child == 0:\n"

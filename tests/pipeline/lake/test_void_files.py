@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from small_lake import find_files, put_round
 
-from pipeline.lake import load, open_for_writing
-from pipeline.settings import Settings
-from pipeline.stages import tensors
-from pipeline.stages.base import Job
-from schemas import SPLIT_LEFT_OUT
-from schemas.tensors import INDEX_FILE
+from tracklake.pipeline.lake import load, open_for_writing
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import tensors
+from tracklake.pipeline.stages.stage import Job
+from tracklake.schemas import SPLIT_LEFT_OUT
+from tracklake.schemas.tensors import INDEX_FILE
 
 
 def test_what_a_rebuild_found_is_neither_used_again_nor_replaced(tmp_path: Path):

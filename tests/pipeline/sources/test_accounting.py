@@ -18,10 +18,10 @@ from raw_texts import (
     write,
 )
 
-from pipeline.sources.accounting import DUPLICATE, split_duplicates
-from pipeline.sources.base import SourceError
-from pipeline.sources.ngsim import NGSIM
-from schemas import StructureError
+from tracklake.pipeline.sources.accounting import DUPLICATE, split_duplicates
+from tracklake.pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.source import SourceError
+from tracklake.schemas import StructureError
 
 KEYS = (1118846978900, 1163030300)
 ROWS = [

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raw_texts import TEXT_NAMES, as_csv, ngsim, ngsim_row, read_highd, read_ngsim, write
 
-from pipeline.sources.base import Subset
-from pipeline.sources.completeness import Announced, compare
-from pipeline.sources.ngsim_dialects import RECORDINGS
-from schemas import COMPLETENESS, INGEST_LOG, SUBSETS
-from schemas import TRACKS as TRACKS_TABLE
-from schemas import VEHICLES as VEHICLES_TABLE
-from schemas.completeness import MEASURES, PUBLISHED_TOTALS
+from tracklake.pipeline.sources.completeness import Announced, compare
+from tracklake.pipeline.sources.ngsim_dialects import RECORDINGS
+from tracklake.pipeline.sources.source import Subset
+from tracklake.schemas import COMPLETENESS, INGEST_LOG, SUBSETS
+from tracklake.schemas import TRACKS as TRACKS_TABLE
+from tracklake.schemas import VEHICLES as VEHICLES_TABLE
+from tracklake.schemas.completeness import MEASURES, PUBLISHED_TOTALS
 
 INT32_MAX = 2**31 - 1
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raw_texts import EXPORT_NAMES, TEXT_NAMES, as_csv, as_text, check_accounts, ngsim_row, read_ngsim, tracks_of, write
 
-from pipeline.sources.accounting import DUPLICATE, FILE
-from pipeline.sources.derived import IN_FULLER_FILE, split_derived
+from tracklake.pipeline.sources.accounting import DUPLICATE, FILE
+from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
 
 FEW = ["Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel"]
 ROWS = [ngsim_row(vehicle, frame, Local_Y=100 * vehicle + 5 * frame) for vehicle in (1, 2, 3) for frame in (1, 2, 3, 4)]

@@ -7,11 +7,11 @@ import pytest
 from highd_files import TRACKS, VEHICLES, meta_row, track_row, vehicle_row, write_recording
 from raw_texts import check_accounts, raw_file, read_highd, tracks_of, write
 
-from pipeline.sources.base import Part, SourceError
-from pipeline.sources.highd import HIGHD
-from schemas import SUBSETS
-from schemas import TRACKS as TRACKS_TABLE
-from schemas import VEHICLES as VEHICLES_TABLE
+from tracklake.pipeline.sources.highd import HIGHD
+from tracklake.pipeline.sources.source import Part, SourceError
+from tracklake.schemas import SUBSETS
+from tracklake.schemas import TRACKS as TRACKS_TABLE
+from tracklake.schemas import VEHICLES as VEHICLES_TABLE
 
 TRACKS_FILE = ["01_tracks.csv"]
 

@@ -10,10 +10,10 @@ import pytest
 from highd_files import VEHICLES, meta_row, vehicle_row, write_recording
 from typer.testing import CliRunner
 
-from pipeline.cli import app
-from pipeline.sources import SourceError
-from pipeline.sources.highd_plan import announce_subsets
-from pipeline.stages.discovery import recognise
+from tracklake.pipeline.cli.app import app
+from tracklake.pipeline.ingest.discovery import recognise
+from tracklake.pipeline.sources import SourceError
+from tracklake.pipeline.sources.highd_plan import announce_subsets
 
 
 def write_metadata(folder, number="01", **given):

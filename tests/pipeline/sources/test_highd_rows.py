@@ -4,8 +4,8 @@ import pytest
 from highd_files import TRACKS, VEHICLES, track_row, vehicle_row, write_recording
 from raw_texts import read_highd
 
-from pipeline.sources import SourceError
-from pipeline.sources.highd_rows import LANE, SPEED, STRANGER
+from tracklake.pipeline.sources import SourceError
+from tracklake.pipeline.sources.highd_rows import LANE, SPEED, STRANGER
 
 BOX = (100, 13, 4, 2)
 

@@ -16,10 +16,10 @@ from raw_texts import (
     write,
 )
 
-from pipeline.sources.base import SourceError
-from pipeline.sources.ngsim import NGSIM
-from pipeline.sources.ngsim_dialects import name_recording, site_of
-from schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.ngsim_dialects import name_recording, site_of
+from tracklake.pipeline.sources.source import SourceError
+from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
 PEACHTREE_1600 = 1163030300
 TWO = [

@@ -1,15 +1,14 @@
 """Real NGSIM excerpts, where they lie beside the repository."""
 
 from functools import cache
-from pathlib import Path
 
 import polars as pl
 import pytest
+from lake_sources import EXCERPTS
 from raw_texts import check_accounts, read_ngsim, tracks_of
 
-from schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
-EXCERPTS = Path(__file__).parents[3] / "../shared/data/ngsim"
 PORTAL, PLAIN = "socrata_head_10000.csv", "socrata_head_5000_plain.csv"
 
 

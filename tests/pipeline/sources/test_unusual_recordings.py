@@ -3,8 +3,8 @@
 import pytest
 from raw_texts import TEXT_NAMES, US_101_0750, as_csv, ngsim, ngsim_row, raw_file, read_ngsim, write
 
-from pipeline.sources.base import SourceError
-from pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.ngsim import NGSIM
+from tracklake.pipeline.sources.source import SourceError
 
 PEACHTREE = 1163030300
 

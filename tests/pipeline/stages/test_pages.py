@@ -3,23 +3,20 @@
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import polars as pl
 import pytest
-
-from pipeline.lake import Entry, load, open_for_writing, write_table
-from pipeline.settings import Settings
-from pipeline.stages import ingest
-from pipeline.stages.discovery import Digests, discover
-from pipeline.stages.registry import STAGE_BY_NAME
-from pipeline.stages.removal import remove_recordings
-from pipeline.work import outstanding
-from schemas import SPLITS
-
-sys.path.append(str(Path(__file__).parents[2]))
 from small_recordings import write_highd
+
+from tracklake.pipeline.ingest import ingest
+from tracklake.pipeline.ingest.discovery import Digests, discover
+from tracklake.pipeline.ingest.removal import remove_recordings
+from tracklake.pipeline.lake import Entry, load, open_for_writing, write_table
+from tracklake.pipeline.orchestration.run_plan import outstanding
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.registry import STAGE_BY_NAME
+from tracklake.schemas import SPLITS
 
 LOW = {"high_acceleration_mps2": 1.0}
 

@@ -5,9 +5,9 @@ import shutil
 import polars as pl
 import pytest
 
-from pipeline.lake import connect, load
-from pipeline.settings import Settings
-from pipeline.stages import samples
+from tracklake.pipeline.lake import connect, load
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import samples
 
 OVERLAPS = """
 SELECT s.dataset, s.subset, s.vehicle_id, s.tick

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.lake.files import MODELS, TENSORS
-from pipeline.stages.score import collect_scores
-from training.running.runs import RUN_VERSION
+from tracklake.pipeline.lake.files import MODELS, TENSORS
+from tracklake.pipeline.stages.score import collect_scores
+from tracklake.training.runs.run_folder import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
 INDEX = {"protocol": {"name": "tiny", "digest": "0"}, "blocks": [{"part": "eval"}]}

@@ -7,12 +7,12 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from pipeline.lake import Entry, connect, load, open_for_writing, write_table
-from pipeline.settings import Settings
-from pipeline.stages import split, tensors
-from pipeline.stages.base import Job, StageError
-from schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
-from schemas.split_recipes import SPLIT_NAMES, SplitRecipe
+from tracklake.pipeline.lake import Entry, connect, load, open_for_writing, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import split, tensors
+from tracklake.pipeline.stages.stage import Job, StageError
+from tracklake.schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitRecipe
 
 SECONDS, RATE_HZ, ON_ROAD_S = 60, 5, 4
 """Each vehicle is on the road for so long, and a new one comes every second."""

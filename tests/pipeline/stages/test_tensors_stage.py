@@ -6,11 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.lake import connect, load, open_for_writing
-from pipeline.settings import Settings
-from pipeline.stages import samples, split, tensors, validate
-from pipeline.stages.tensors import tensor_folder
-from training.tensors import TensorFolder
+from tracklake.pipeline.lake import connect, load, open_for_writing
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import samples, split, tensors, validate
+from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.training.data.tensor_folder import TensorFolder
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, cut_runs, find_stride, put_on_clock
+from tracklake.pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, cut_runs, find_stride, put_on_clock
 
 INT32_MAX = 2**31 - 1
 

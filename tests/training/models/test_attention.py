@@ -11,11 +11,11 @@ from scipy.stats import multivariate_normal
 from slow_attention import restate
 from wandering_scenes import change, pad, reorder, wander
 
-from schemas.protocols import CSP
-from training.models import MODELS, find_model
-from training.models.attention_layers import MultiHeadAttention
-from training.models.constant_velocity import velocity_ticks
-from training.models.scene_features import describe_vehicles
+from tracklake.schemas.protocols import CSP
+from tracklake.training.models import MODELS, find_model
+from tracklake.training.models.attention_layers import MultiHeadAttention
+from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.scene_features import describe_vehicles
 
 H, F = CSP.history_ticks, CSP.horizon_ticks
 TEN_HZ = replace(CSP, rate_hz=10)
@@ -65,7 +65,7 @@ def test_layers_are_as_large_as_published(heads):
 def test_constructor_and_registry_have_the_same_defaults():
     from inspect import signature
 
-    from training.models.attention import SceneAttention
+    from tracklake.training.models.attention import SceneAttention
 
     own = {name: each.default for name, each in signature(SceneAttention).parameters.items() if name != "protocol"}
     for heads in HEADS:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from training.models.gaussians import (
+from tracklake.training.models.gaussians import (
     CORRELATION_LIMIT,
     SIGMA_LIMITS_M,
     gaussian_nll,

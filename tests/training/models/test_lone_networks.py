@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from lone_vehicles import TWO_SECONDS, observe, reveal, seeds, wander
 from scipy.stats import multivariate_normal
 
-from schemas.protocols import CSP
-from training.models import MODELS, find_model
-from training.models.straight import Straight
+from tracklake.schemas.protocols import CSP
+from tracklake.training.models import MODELS, find_model
+from tracklake.training.models.straight import Straight
 
 LONE = ("lstm", "v-lstm", "stacked-lstm", "lstm-encoder-decoder")
 RESIDUAL = tuple(name for name in LONE if "residual" in MODELS[name].parameters)

@@ -11,10 +11,10 @@ from lone_vehicles import TWO_SECONDS, observe, seeds, wander
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
-from schemas.protocols import CSP
-from training.models import MODELS, find_model
-from training.models.ctrv import ConstantTurnRate
-from training.models.kalman import ACCELERATION_M2PS3, MEASUREMENT_M, KalmanConstantVelocity
+from tracklake.schemas.protocols import CSP
+from tracklake.training.models import MODELS, find_model
+from tracklake.training.models.ctrv import ConstantTurnRate
+from tracklake.training.models.kalman import ACCELERATION_M2PS3, MEASUREMENT_M, KalmanConstantVelocity
 
 PROTOCOLS = (CSP, TWO_SECONDS)
 UNTAUGHT = [name for name, model in MODELS.items() if not model.learns]

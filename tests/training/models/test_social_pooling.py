@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from schemas.protocols import Protocol
-from training.models import MODELS
-from training.models.recurrence import last_state, unroll
-from training.observed import Observed, Truth
+from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.models import MODELS
+from tracklake.training.models.recurrence import last_state, unroll
 
 SHORT = Protocol(name="short", rate_hz=2, history_s=1.5, horizon_s=2.0)
 """4 positions of history, 4 of future."""

@@ -1,0 +1,71 @@
+"""The generated sample of the commands: written, found again, and kept out of lakes of real recordings.
+
+Like the commands, it imports heavy libraries where they are used.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from tracklake.pipeline.cli.session import failure
+
+if TYPE_CHECKING:
+    from tracklake.pipeline.cli.console import Terminal
+    from tracklake.pipeline.synthetic import SampleSummary
+
+SAMPLE = "sample"
+"""Its folder's name, beside the lake."""
+
+
+def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: "Terminal") -> Path:
+    """The generated sample beside the lake, made where it is not there or asked for otherwise."""
+    out = lake.parent / SAMPLE
+    if minutes is None and seed is None and (out / "truth.parquet").exists():
+        terminal.say(f"the generated sample in {out}", style="dim")
+        return out
+    summary = write_generated(out, minutes, seed, terminal)
+    terminal.say(f"generated {summary.rows:,} rows of {summary.recordings} recordings in {out}", style="dim")
+    return out
+
+
+def refuse_mixing(lake: Path, sample: str) -> None:
+    """Keep simulated recordings out of a lake of real ones, which they might even replace."""
+    from tracklake.pipeline.lake import LakeError, LakeMissingError, load
+    from tracklake.pipeline.orchestration.run_plan import INGEST, Order, survey
+
+    try:
+        entries = load(lake).of_stage(INGEST)
+    except LakeMissingError:
+        return
+    order = Order(str(lake.absolute()), (INGEST,), sample)
+    ours = {file.name for _, unit in survey(order).units for file in unit.files}
+    hashes = {file.sha256 for _, unit in survey(order).units for file in unit.files}
+    for source in (source for entry in entries for source in entry.built_from["sources"]):
+        if source["file"] not in ours or source["sha256"] not in hashes:
+            raise LakeError(
+                f"{lake}: holds recordings that are not this generated sample ({source['file']}). Without SOURCE, the "
+                "sample is what is ingested: name your own files as SOURCE, or another lake with --lake."
+            )
+
+
+def write_generated(
+    out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
+) -> "SampleSummary":
+    """Write the sample, and turn what a user can mend into a message."""
+    from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
+
+    if unknown := [name for name in formats or () if name not in ALL_FORMATS]:
+        raise typer.BadParameter(f"--format is one of {', '.join(ALL_FORMATS)}; got {', '.join(unknown)}")
+    try:
+        return write_sample(
+            out,
+            formats=tuple(formats) if formats else DEFAULT_FORMATS,
+            minutes=DEFAULT_MINUTES if minutes is None else minutes,
+            seed=1 if seed is None else seed,
+            progress=lambda text: terminal.say(text, style="dim"),
+        )
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    except SumoError as error:
+        raise failure(terminal, str(error)) from None

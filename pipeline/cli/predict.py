@@ -1,0 +1,279 @@
+"""`tracklake predict`: samples drawn with what came and what models say, on the road with its lanes.
+
+Like the other commands, it imports heavy libraries where they are used.
+"""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption
+from tracklake.pipeline.cli.session import command, read_settings
+
+if TYPE_CHECKING:
+    from tracklake.pipeline.cli.console import Terminal
+    from tracklake.training.data.tensor_folder import TensorFolder
+    from tracklake.training.plots.picture import Picture
+    from tracklake.training.runs.forecasters import Forecaster
+
+FOLDER = "predictions"
+"""Of the lake."""
+SUFFIXES = (".svg", ".png")
+MOST_MODELS = 4
+BASELINE = "constant-velocity"
+
+
+class Pick(StrEnum):
+    """Kinds of samples."""
+
+    LANE_CHANGE = "lane-change"
+    LANE_KEEP = "lane-keep"
+    BRAKE = "brake"
+    WORST = "worst"
+    RANDOM = "random"
+
+
+def predict(
+    models: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="RUN_OR_MODEL",
+            help="Up to four; constant velocity is drawn beside them where there is room. None: the newest runs.",
+        ),
+    ] = None,
+    lake: LakeOption = None,
+    protocol: ProtocolOption = None,
+    sample: Annotated[int | None, typer.Option("--sample", metavar="N", help="A sample by its number.")] = None,
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", metavar="SUBSET:ID", help="A vehicle, for instance 02-lower:21.")
+    ] = None,
+    time: Annotated[
+        float | None, typer.Option("--time", metavar="S", help="With --vehicle: seconds since the recording began.")
+    ] = None,
+    pick: Annotated[
+        Pick | None,
+        typer.Option(
+            "--pick",
+            help="Draw samples of a kind; worst: of the last model, or newest run (default: random).",
+        ),
+    ] = None,
+    part: Annotated[str, typer.Option("--part", help="With --pick: train, val or eval.")] = "eval",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: of the draw.")] = 0,
+    count: Annotated[int, typer.Option("--count", min=1, max=100, help="With --pick: how many samples.")] = 1,
+    all_vehicles: Annotated[
+        bool, typer.Option("--all-vehicles", help="Predict every sample of the moment; a model of scenes: everyone.")
+    ] = False,
+    attention: Annotated[
+        bool, typer.Option("--attention", help="Also draw what a model with attention looks at, per head.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE|FOLDER", help="A .svg or .png, or a folder (default: LAKE/predictions)."),
+    ] = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Draw samples: history, neighbors, truth, predictions and their uncertainty, on the road with its lanes."""
+    with command(quiet=quiet, json=json) as terminal:
+        from tracklake.pipeline.lake import load, write_aside
+        from tracklake.pipeline.lake.files import MODELS
+        from tracklake.pipeline.stages.tensors import tensor_folder
+        from tracklake.training.data.tensor_folder import TensorFolder
+        from tracklake.training.plots.drawing import draw_picture
+
+        _check(models or [], sample, vehicle, time, pick, part, count, out)
+        settings = read_settings(lake=lake, protocol=protocol)
+        root = settings.lake
+        folder = TensorFolder.open(tensor_folder(root, load(root), settings))
+        samples = _find(folder, sample, vehicle, time)
+        parts = _parts_of(folder, samples) if samples else frozenset({part})
+        asked = _open_all(terminal, models or [], folder, root / MODELS, parts, alone=all_vehicles)
+        if attention:
+            _refuse_inattentive(asked)
+        if not samples:
+            judge = asked[-1] if models else next((own for own in asked if own.name != BASELINE), asked[0])
+            samples = _pick(terminal, folder, pick or Pick.RANDOM, part, count, seed, judge)
+        drawn: list[dict[str, Any]] = []
+        for number in samples:
+            picture = _ask(folder, number, asked, all_vehicles=all_vehicles)
+            file = _name_file(out, root / FOLDER, picture, all_vehicles=all_vehicles)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_aside(file, draw_picture(picture).render(file.suffix))
+            _tell(terminal, picture, file)
+            drawn.append({"file": file, **picture.to_dict()})
+        maps = _draw_attention(folder, asked, samples, file.parent) if attention else []
+        for map_file in maps:
+            terminal.say(f"  {map_file}", style="bold green")
+        terminal.give({"pictures": drawn, "attention": maps})
+
+
+def _check(
+    models: list[str],
+    sample: int | None,
+    vehicle: str | None,
+    time: float | None,
+    pick: Pick | None,
+    part: str,
+    count: int,
+    out: Path | None,
+) -> None:
+    """Refuse options that contradict each other, before anything is opened."""
+    from tracklake.schemas.columns import PARTS
+
+    if part not in PARTS:
+        raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
+    if len(dict.fromkeys(models)) > MOST_MODELS:
+        raise typer.BadParameter(f"a drawing holds {MOST_MODELS} models at most; got {', '.join(models)}")
+    given = [
+        name for name, value in (("--sample", sample), ("--vehicle", vehicle), ("--pick", pick)) if value is not None
+    ]
+    if len(given) > 1:
+        raise typer.BadParameter(
+            f"--sample, --vehicle and --pick each say what to draw: give one; got {' and '.join(given)}"
+        )
+    if (vehicle is None) != (time is None):
+        raise typer.BadParameter("--vehicle SUBSET:ID and --time S go together")
+    if count > 1 and (sample is not None or vehicle is not None):
+        raise typer.BadParameter("--count goes with --pick")
+    if out is not None and out.suffix and out.suffix.lower() not in SUFFIXES and not out.is_dir():
+        raise typer.BadParameter(f"--out ends in {' or '.join(SUFFIXES)}, or is a folder; got {out}")
+    if count > 1 and out is not None and out.suffix.lower() in SUFFIXES:
+        raise typer.BadParameter(f"--out is a folder where --count is more than 1; got {out}")
+
+
+def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
+    """The sample that was named, if one was."""
+    from tracklake.training.plots.picking import find_sample
+
+    if sample is not None:
+        last = len(folder.sample_row) - 1
+        if not 0 <= sample <= last:
+            raise typer.BadParameter(f"--sample is a number from 0 to {last:,}; got {sample}")
+        return [sample]
+    if vehicle is not None and time is not None:
+        return [find_sample(folder, vehicle, time)]
+    return []
+
+
+def _parts_of(folder: "TensorFolder", samples: list[int]) -> frozenset[str]:
+    from tracklake.schemas.columns import PARTS
+
+    return frozenset(PARTS[folder.sample_part[number]] for number in samples)
+
+
+def _open_all(
+    terminal: "Terminal", names: list[str], folder: "TensorFolder", models: Path, parts: frozenset[str], *, alone: bool
+) -> list["Forecaster"]:
+    """The models named, or the newest runs that fit the tensors; constant velocity first, where there is room.
+
+    Args:
+        terminal: told what is passed by.
+        names: those named.
+        folder: the tensors.
+        models: the folder of the runs.
+        parts: that they are asked about.
+        alone: no constant velocity beside others.
+    """
+    from tracklake.training.runs.forecasters import open_forecaster
+    from tracklake.training.runs.run_folder import StaleRunError
+
+    found = [open_forecaster(name, folder, models, parts) for name in dict.fromkeys(names)]
+    if not names:
+        finished = sorted(models.glob("[!.]*/metrics.json"), key=lambda file: file.stat().st_mtime, reverse=True)
+        runs = [file.parent.name for file in finished if file.parent.name != BASELINE]
+        for name in runs:
+            if len(found) == (1 if alone else MOST_MODELS - 1):
+                terminal.say(
+                    f"note: {len(runs)} runs in the lake, of which the newest are drawn; name others", style="dim"
+                )
+                break
+            try:
+                found.append(open_forecaster(name, folder, models, parts))
+            except (StaleRunError, ImportError) as unfit:
+                terminal.complain(str(unfit), label="passed by")
+    named = {own.name for own in found}
+    if BASELINE not in named and len(found) < MOST_MODELS and not (alone and found):
+        found.insert(0, open_forecaster(BASELINE, folder, models, parts))
+    return found
+
+
+def _pick(
+    terminal: "Terminal",
+    folder: "TensorFolder",
+    pick: Pick,
+    part: str,
+    count: int,
+    seed: int,
+    judge: "Forecaster",
+) -> list[int]:
+    """Samples of a kind."""
+    from tracklake.training.plots.picking import MOST_LOOKED_AT, pick_samples
+
+    found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
+    if pick is Pick.WORST:
+        many = len(folder.samples_of(part))
+        among = f"{MOST_LOOKED_AT:,} drawn of {many:,}" if many > MOST_LOOKED_AT else f"{many:,}"
+        terminal.say(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
+    if len(found) < count:
+        terminal.say(f"note: there are only {len(found)} such samples", style="dim")
+    return [int(number) for number in found]
+
+
+def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_vehicles: bool) -> "Picture":
+    """Let models predict, then look up what came."""
+    from tracklake.training.data.observed import FutureInputError
+    from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
+    from tracklake.training.plots.picture import take_picture
+
+    try:
+        if all_vehicles:
+            return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
+        run = folder.runs_of(folder.sample_row[[sample]])
+        own = int(folder.run_vehicle_id[run[0]])
+        return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})
+    except FutureInputError as leak:
+        raise ValueError(str(leak)) from leak
+
+
+def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_vehicles: bool) -> Path:
+    """Where a drawing goes: to the file named, or into a folder under a name that says what it shows."""
+    if out is not None and out.suffix.lower() in SUFFIXES and not out.is_dir():
+        return out
+    whose = f"{picture.own.vehicle_id}{'-and-all' if all_vehicles else ''}"
+    name = "_".join([picture.subset, whose, f"{picture.time_s:.1f}s", *picture.models])
+    return (predictions if out is None else out) / f"{name}.svg"
+
+
+def _tell(terminal: "Terminal", picture: "Picture", file: Path) -> None:
+    """Where the drawing is, and how far each model is from the truth at its end."""
+    from tracklake.training.plots.rows import list_errors
+
+    last = {row["model"]: row for row in list_errors(picture) if row["own"]}
+    off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
+    seconds = max((row["seconds"] for row in last.values()), default=0.0)
+    terminal.say(f"vehicle {picture.own.vehicle_id} of {picture.subset} at {picture.time_s:.1f} s ({picture.part})")
+    terminal.say(f"  off after {seconds:g} s: {off}", style="dim")
+    terminal.say(f"  {file}", style="bold green")
+
+
+def _refuse_inattentive(asked: list["Forecaster"]) -> None:
+    """Refuse to draw what nobody looks at, before anything is drawn."""
+    if all(own.reads != "scene" for own in asked):
+        raise typer.BadParameter(
+            "--attention needs a run of a model with attention, for instance attention-h4; got "
+            f"{', '.join(own.name for own in asked)}"
+        )
+
+
+def _draw_attention(folder: "TensorFolder", asked: list["Forecaster"], samples: list[int], target: Path) -> list[Path]:
+    """Attention maps of every model that has any, in a folder of its name."""
+    from tracklake.training.plots.attention_maps import export_attention
+
+    found = []
+    for own in asked:
+        if own.reads == "scene":
+            network: Any = own.predictor  # a network with attention
+            found += export_attention(folder, network, samples, target / own.name)
+    return found

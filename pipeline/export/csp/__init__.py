@@ -1,0 +1,1 @@
+"""Export in the format of convolutional social pooling."""

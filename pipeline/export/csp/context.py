@@ -1,0 +1,79 @@
+"""What `export csp --clean` reads of the lake: the three parts, late starts, and what validation excludes."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import polars as pl
+
+from tracklake.pipeline.export.folder import ExportError
+from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages import split
+from tracklake.pipeline.stages.split_makers import Material, make_split
+from tracklake.pipeline.stages.stage import upstream
+from tracklake.pipeline.transforms.csp.subset import Context
+from tracklake.schemas import MISSING_STARTS, SPLITS, SUBSET_STATUS, VEHICLE_STARTS
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.split_recipes import LEAKAGE_FREE
+
+Contexts = dict[tuple[str, str], Context | None]
+
+
+def read_context(
+    settings: Settings, manifest: Manifest, subsets: Sequence[dict[str, Any]], notes: list[str]
+) -> Contexts:
+    """Read it for every subset; None for one that validation excludes.
+
+    The files have three parts. Where the lake's split (setting `split`) has a validation part it is used; else the
+    split is planned as `validation_part = true` would make it.
+
+    Args:
+        settings: the lake, protocol and split.
+        manifest: of the lake.
+        subsets: dataset and subset of each.
+        notes: what the user should know is added.
+
+    Raises:
+        StageError: validation, repair, samples or the split has not run, or on other inputs than now.
+        ExportError: the split is one whose parts share something.
+    """
+    root, protocol = settings.lake, settings.get_protocol()
+    if protocol.split not in LEAKAGE_FREE:
+        raise ExportError(
+            f"--clean is for splits whose parts share nothing, and the setting `split` is {protocol.split!r}. Set it "
+            f"to one of {', '.join(LEAKAGE_FREE)}, or leave --clean out: the files are then cut by vehicle id."
+        )
+    upstream(split.plan, root, manifest, settings)
+    names = {facts["dataset"] for facts in subsets}
+    splits = scan(root, manifest, SPLITS).filter(split=protocol.split).collect()
+    parts = splits.select("dataset", "part").unique().rows()
+    if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
+        recipe = settings.get_split_recipe()
+        material = Material(root, manifest, split.gather_subsets(root, manifest, protocol), protocol)
+        allocation = make_split(replace(recipe, validation=True), material).allocation
+        splits = allocation.splits
+        notes.append(
+            f"the lake's split {protocol.split} has no validation part; the files hold the one that `validation_part = "
+            "true` makes: TestSet.mat is not the lake's eval part, and TrainSet.mat may hold some of it"
+        )
+        notes += [
+            f"split of {dataset} is relaxed: {reason}"
+            for dataset, reason in sorted(allocation.relaxations.items())
+            if dataset in names
+        ]
+    excluded = set(scan(root, manifest, SUBSET_STATUS).filter("excluded").select("dataset", "subset").collect().rows())
+    found: Contexts = {}
+    for facts in subsets:
+        values = {"dataset": facts["dataset"], "subset": facts["subset"]}
+        key = (facts["dataset"], facts["subset"])
+        found[key] = (
+            None
+            if key in excluded
+            else Context(
+                blocks=splits.filter(pl.col("dataset") == key[0], pl.col("subset") == key[1]),
+                vehicle_starts=scan(root, manifest, VEHICLE_STARTS, **values).collect(),
+                missing_starts=scan(root, manifest, MISSING_STARTS, **values).collect(),
+            )
+        )
+    return found

@@ -1,0 +1,1 @@
+"""Export of samples as windows that need no tracklake to be read."""

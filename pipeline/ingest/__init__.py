@@ -1,0 +1,1 @@
+"""Raw files to tracks, vehicles and subsets: discovery, ingestion and removal."""

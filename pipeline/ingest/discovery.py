@@ -1,0 +1,267 @@
+"""Which raw files a folder holds, recognised by content."""
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path, PurePosixPath
+
+from tracklake.pipeline.lake import write_aside
+from tracklake.pipeline.lake.manifest import MANIFEST
+from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
+from tracklake.pipeline.sources.csv.archives import ENDING, Contents, is_archive, list_members
+from tracklake.pipeline.sources.csv.raw_files import hash_raw, read_head
+from tracklake.pipeline.sources.source import Unit
+
+SUFFIXES = (".csv", ".txt", ".dat", ".gz", ENDING, "")
+"""Endings under which trajectory files circulate; others (pictures, Parquet, documents) are passed by."""
+
+PROSE = (".txt", ".dat", ENDING, "")
+"""Of these, endings that documents share: unrecognised, they are passed by and named, not refused."""
+
+HASHES = ".hashes.json"
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What a SOURCE holds.
+
+    Args:
+        units: files to be read together, by source.
+        refusals: messages about files that look like raw data but cannot be used.
+        passed_by: names of files that are no raw data.
+        recognised: every file of a known format, whether or not it could be grouped with its others.
+    """
+
+    units: tuple[tuple[Source, Unit], ...]
+    refusals: tuple[str, ...]
+    passed_by: tuple[str, ...]
+    recognised: tuple[RawFile, ...] = ()
+
+
+def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawFile], str]) -> Discovery:
+    """Find and group the raw files of a file or folder.
+
+    Args:
+        source: a file, or a folder searched at any depth (hidden folders apart); an archive is a folder.
+        dataset: take files for this dataset only.
+        digest: sha256 of a file's bytes; it may raise SourceError.
+
+    Raises:
+        SourceError: nothing there, or nothing recognised in it.
+    """
+    candidates = _candidates(source)
+    search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest)
+    for path in candidates:
+        search.look_at(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+    search.identify()
+    units: list[tuple[Source, Unit]] = []
+    refusals = search.refusals
+    for item in search.sources:
+        grouping = item.group(search.recognised[item.name])
+        units += [(item, unit) for unit in grouping.units]
+        refusals += grouping.refusals
+    if not units and not refusals:
+        raise SourceError(_nothing(source, candidates, search.sources))
+    return Discovery(tuple(units), tuple(refusals), tuple(search.passed_by), tuple(chain(*search.recognised.values())))
+
+
+def recognise(source: Path, dataset: str) -> list[RawFile]:
+    """Find a dataset's raw files by their first lines alone: nothing is read through, and none is given its hash.
+
+    Args:
+        source: as for `discover`.
+        dataset: whose.
+
+    Raises:
+        SourceError: no such file or folder.
+    """
+    search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
+    for path in _candidates(source):
+        search.look_at(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+    return search.found
+
+
+class _Search:
+    """What has been found so far."""
+
+    def __init__(self, sources: list[Source], source: Path, digest: Callable[[RawFile], str]) -> None:
+        self.sources = sources
+        self.recognised: dict[str, list[RawFile]] = {item.name: [] for item in sources}
+        self.refusals: list[str] = []
+        self.passed_by: list[str] = []
+        self._single = source if source.is_file() else None
+        self._digest = digest
+        self._found: list[tuple[Source, RawFile]] = []
+
+    @property
+    def found(self) -> list[RawFile]:
+        """What was recognised, before it has hashes."""
+        return [file for _, file in self._found]
+
+    def look_at(self, file: RawFile) -> None:
+        """Sort a file of the source, or the members of an archive, into recognised, refused and passed by."""
+        if file.path.suffix.lower() not in SUFFIXES:
+            self.passed_by.append(file.name)
+            return
+        with self._refusing(file):
+            if is_archive(file.path):
+                self._look_into(file)
+            else:
+                self._take(file)
+
+    def _look_into(self, archive: RawFile) -> None:
+        contents = list_members(archive, SUFFIXES)
+        before = self._outcome()
+        self.refusals += contents.refusals
+        for member in contents.files:
+            with self._refusing(member):
+                self._take(member)
+        self.passed_by += contents.others
+        if self._outcome() == before:
+            self._pass_by(archive, _no_raw_files(archive, contents, self.sources))
+
+    def _outcome(self) -> tuple[int, int]:
+        return len(self._found), len(self.refusals)
+
+    def _take(self, file: RawFile) -> None:
+        head = read_head(file)
+        found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.filename)) is not None)
+        source, dialect = next(found, (None, ""))
+        if source is None:
+            self._pass_by(file, _unknown(file.name, head, self.sources))
+            return
+        self._found.append((source, replace(file, dialect=dialect)))
+
+    def identify(self) -> None:
+        """Give the files that were found their hashes; of two with the same bytes the second is refused."""
+        seen: dict[str, str] = {}
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
+            hashes = [threads.submit(self._digest, file) for _, file in self._found]
+        for (source, file), hashed in zip(self._found, hashes, strict=True):
+            with self._refusing(file):
+                sha256 = hashed.result()
+                if sha256 in seen and source.spill is not None:
+                    raise SourceError(
+                        f"{file.name}: the same bytes as {seen[sha256]}, which was read; remove one of the two."
+                    )
+                seen[sha256] = file.name
+                self.recognised[source.name].append(replace(file, sha256=sha256))
+
+    @contextmanager
+    def _refusing(self, file: RawFile) -> Iterator[None]:
+        """Refuse a file that cannot be used and go on with the others."""
+        try:
+            yield
+        except SourceError as damage:
+            self.refusals.append(str(damage))
+        except OSError as refused:
+            self.refusals.append(
+                f"{file.name}: cannot be read ({refused.strerror}). Give yourself the right to read it."
+            )
+
+    def _pass_by(self, file: RawFile, refusal: str) -> None:
+        """Pass an unrecognised file by where its ending promises no data and the user did not name it; else refuse."""
+        named_by_user = file.member is None and file.path == self._single
+        if PurePosixPath(file.filename).suffix.lower() in PROSE and not named_by_user:
+            self.passed_by.append(file.name)
+        else:
+            self.refusals.append(refusal)
+
+
+def _candidates(source: Path) -> list[Path]:
+    if not source.exists():
+        raise SourceError(
+            f"{source}: no such file or folder. Give the folder with the raw files as downloaded, or one file; "
+            "`tracklake sample --out sample` generates some to try with."
+        )
+    if source.is_file():
+        return [source]
+    found: list[Path] = []
+    visited: set[str] = set()
+    for folder, below, names in os.walk(source, followlinks=True):
+        real = os.path.realpath(folder)
+        below[:] = [] if real in visited else [name for name in below if not name.startswith(".")]
+        if real not in visited:
+            found += [Path(folder, name) for name in names if not name.startswith(".")]
+        visited.add(real)
+    return sorted(path for path in found if path.is_file())
+
+
+def _expected(sources: list[Source]) -> str:
+    return "; ".join(item.looks_like for item in sources)
+
+
+def _unknown(name: str, head: bytes, sources: list[Source]) -> str:
+    if not head.strip():
+        return f"{name}: empty file. Expected {_expected(sources)}. Download it again."
+    line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
+    shown = line if len(line) <= 100 else f"{line[:100]}..."
+    return (
+        f"{name}, line 1: not a known trajectory file. Expected {_expected(sources)}. Got {shown!r}. "
+        "Move the file out of the folder, or restore its header."
+    )
+
+
+def _no_raw_files(archive: RawFile, contents: Contents, sources: list[Source]) -> str:
+    held = [*contents.others, *(file.name for file in contents.files)]
+    got = ", ".join(name.removeprefix(f"{archive.name}/") for name in held[:5]) + (", ..." if len(held) > 5 else "")
+    return (
+        f"{archive.name}: an archive with no raw recordings in it. Expected {_expected(sources)}. "
+        f"Got {got or 'an empty archive'}. Give the archive as downloaded."
+    )
+
+
+def _nothing(source: Path, candidates: list[Path], sources: list[Source]) -> str:
+    got = ", ".join(path.name for path in candidates[:5]) + (", ..." if len(candidates) > 5 else "")
+    return (
+        f"{source}: no raw recordings in it. Expected {_expected(sources)}. "
+        f"Got {got or 'an empty folder'}. Give the folder with the downloads, unpacked or not."
+    )
+
+
+_HASHED: dict[str, list[object]] = {}
+"""Of this process: a lake that is still to be made has no place to keep hashes, and no file is read twice for them."""
+
+
+class Digests:
+    """sha256 of files, remembered by path, size and modification time so that idle reruns read nothing.
+
+    Those of an archive's members are remembered by the archive's size and time, and the member's name.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._path = root / HASHES
+        self._known: dict[str, list[object]] = {}
+        try:
+            remembered = json.loads(self._path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            remembered = None  # nothing remembered, or not as it was written: everything is hashed again
+        if isinstance(remembered, dict):
+            self._known = {path: known for path, known in remembered.items() if isinstance(known, list)}
+        self._changed = False
+
+    def __call__(self, file: RawFile) -> str:
+        """The sha256 of a file's bytes.
+
+        Raises:
+            SourceError: it is a member of a damaged archive.
+        """
+        stat = file.path.stat()
+        key = "/".join([str(file.path.resolve()), *([] if file.member is None else [file.member])])
+        state = [stat.st_size, stat.st_mtime_ns]
+        if self._known.get(key, [])[:2] == state:
+            return str(self._known[key][2])
+        if _HASHED.get(key, [])[:2] != state:
+            _HASHED[key] = [*state, hash_raw(file)]
+        self._known[key] = _HASHED[key]
+        self._changed = True
+        return str(self._known[key][2])
+
+    def save(self) -> None:
+        """Keep what was computed beside the lake's manifest, where there is a lake."""
+        if self._changed and self._path.with_name(MANIFEST).exists():
+            write_aside(self._path, json.dumps(self._known).encode())

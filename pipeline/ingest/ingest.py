@@ -1,0 +1,294 @@
+"""Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from tracklake.pipeline.ingest.discovery import Discovery
+from tracklake.pipeline.ingest.memory_budget import Room
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, write_table
+from tracklake.pipeline.lake.files import STAGING
+from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
+from tracklake.pipeline.sources.accounting import count_reasons, to_rejects
+from tracklake.pipeline.sources.csv.raw_files import unpacked_bytes
+from tracklake.pipeline.sources.source import Canonical, Part
+from tracklake.pipeline.stages.stage import Job, make_entry, make_job
+from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
+
+VERSION = 2
+SPREADSHEET_ROWS = 1_048_575
+REJECTS_FILE = "rejects.parquet"
+REASONS_SHOWN = 3
+"""Of those for which all rows of a recording were dropped."""
+ROOM = Room(256 << 20)
+"""Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
+
+_PLANNING_FACTS = ("subset", "freeway")
+SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
+
+
+@dataclass(frozen=True)
+class FileContents:
+    """What reading a spilled file told: a small record the manifest remembers by the file's sha256."""
+
+    dataset: str
+    version: int
+    rows_read: int
+    recordings: list[str]
+    unassigned: int
+
+
+def files_to_read(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
+    """Files that hold several recordings and whose contents the manifest does not know."""
+    return [
+        (source, unit.files[0])
+        for source, unit in discovery.units
+        if source.spill is not None and not _known_contents(source, unit.files[0], manifest)
+    ]
+
+
+def _known_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[str, Any] | None:
+    contents = manifest.sources.get(file.sha256)
+    return contents if contents is not None and contents["version"] == source.version else None
+
+
+def spill_folder(root: Path, file: RawFile) -> Path:
+    """Where a file's rows wait, by recording, for the length of a writing session."""
+    return root / STAGING / "spilled" / file.sha256
+
+
+def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
+    """Spill one file that holds several recordings; returns its FileContents as a dict.
+
+    Raises:
+        SourceError: not one of its rows could be read.
+    """
+    source = SOURCE_BY_NAME[dataset]
+    assert source.spill is not None
+    folder = spill_folder(root, file)
+    folder.mkdir(parents=True, exist_ok=True)
+    spilled = source.spill(file, folder)
+    if not spilled.recordings:
+        raise SourceError(_unreadable(file, spilled.rows_read, spilled.rejects))
+    spilled.rejects.write_parquet(folder / REJECTS_FILE)
+    return vars(
+        FileContents(
+            dataset=dataset,
+            version=source.version,
+            rows_read=spilled.rows_read,
+            recordings=sorted(spilled.recordings),
+            unassigned=spilled.rejects.height if len(spilled.recordings) > 1 else 0,
+        )
+    )
+
+
+def _unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:
+    if rejects.is_empty():
+        return f"{file.name}: a header and no rows. Download it again."
+    line, reason, text = rejects.row(0)
+    return (
+        f"{file.name}, line {line}: none of its {rows_read} rows can be read; this one: {reason}. "
+        f"Got {text[:100]!r}. Download the file again, or repair it."
+    )
+
+
+def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
+    """One job per recording that the discovered files hold, and one per file with lines that belong to no recording.
+
+    Files whose contents are not known yet (see `files_to_read`) give no jobs.
+    """
+    by_recording: dict[tuple[str, str], list[RawFile]] = {}
+    jobs = []
+    for source, unit in discovery.units:
+        if unit.recording is not None:
+            by_recording[source.name, unit.recording] = list(unit.files)
+            continue
+        contents = _known_contents(source, unit.files[0], manifest)
+        if contents is None:
+            continue
+        for recording in contents["recordings"]:
+            by_recording.setdefault((source.name, recording), []).append(unit.files[0])
+        if contents["unassigned"]:
+            jobs.append(_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
+    jobs += [_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
+    return jobs
+
+
+def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
+    """Messages, by key, about recordings whose earlier files these jobs do not hold: their rows would be lost.
+
+    A file of the same name with other content is a new version of that file, and replaces it.
+    """
+    messages = {}
+    for job in jobs:
+        entry = manifest.entries.get(job.key)
+        if entry is None:
+            continue
+        if lost := find_lost(job, entry):
+            names = (source["file"] for source in job.built_from["sources"])
+            messages[job.key] = (
+                f"recording {job.title}: it is in the lake already, from {', '.join(s['file'] for s in lost)}, and now "
+                f"came from {', '.join(sorted(names))}. Give all its files at once (a folder), or let these replace "
+                "those with --replace."
+            )
+    return messages
+
+
+def find_lost(job: Job, entry: Entry) -> list[dict[str, Any]]:
+    """The sources of a recording's entry that a job for it does not hold, neither by name nor by content."""
+    names, hashes = ({source[part] for source in job.built_from["sources"]} for part in ("file", "sha256"))
+    return [s for s in entry.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
+
+
+def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
+    sources = [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files]
+    job = make_job(
+        f"ingest/{dataset}/{title}",
+        version_of_stage=VERSION,
+        made_of={
+            "sources": sources,
+            "source_version": SOURCE_BY_NAME[dataset].version,
+        },
+        inputs={
+            "dataset": dataset,
+            "recording": recording,
+            "files": [file.to_dict() for file in files],
+        },
+    )
+    # Where they stand is remembered, and is no part of the fingerprint: a moved folder has the same content.
+    placed = [{**source, "path": str(file.path)} for source, file in zip(sources, files, strict=True)]
+    return replace(job, built_from={**job.built_from, "sources": placed})
+
+
+def files_of(job: Job) -> list[RawFile]:
+    """The raw files of an ingest job."""
+    return [RawFile.from_dict(file) for file in job.inputs["files"]]
+
+
+def needs_spill(job: Job) -> bool:
+    """Whether the job's files must have been read into the staging folder first."""
+    return SOURCE_BY_NAME[job.inputs["dataset"]].spill is not None
+
+
+def build(root: Path, job: Job) -> Entry:
+    """Make one recording's tables and account for the rows of its files.
+
+    Raises:
+        SourceError, schemas.StructureError: the recording cannot be used.
+    """
+    recording, files = job.inputs["recording"], files_of(job)
+    if recording is None:
+        return _build_unassigned(root, job, files[0])
+    if needs_spill(job):
+        return _build_recording(root, job, [_spilled_part(root, file, recording) for file in files])
+    with ROOM.taken(sum(map(unpacked_bytes, files))):
+        return _build_recording(root, job, [Part(file) for file in files])
+
+
+def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
+    dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
+    canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
+    if not canonical.subsets:
+        raise SourceError(_nothing_left(recording, canonical))
+    written = _write(root, job, canonical)
+    info = {
+        "dataset": dataset,
+        "recording": recording,
+        "notes": [*canonical.notes, *_suspect_truncation(root, files, canonical)],
+        "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
+        "rows_read": int(canonical.log["rows_read"].sum()),
+        "rows_dropped": int(canonical.log["rows_dropped"].sum()),
+    }
+    return make_entry(job, written, info)
+
+
+def _nothing_left(recording: str, canonical: Canonical) -> str:
+    """Why not one row of a recording could be used: the commonest reasons, and a line of each to look at."""
+    reasons = (
+        canonical.rejects.sort("file", "line")
+        .group_by("reason")
+        .agg(pl.len().alias("rows"), pl.col("file", "line", "text").first())
+        .sort("rows", "reason", descending=[True, False])
+    )
+    shown = [
+        f"{rows:,} {'row' if rows == 1 else 'rows'} ({reason}; first {file}, line {line}: {text[:60]!r})"
+        for reason, rows, file, line, text in reasons.head(REASONS_SHOWN).rows()
+    ]
+    more = [f"{reasons['rows'][REASONS_SHOWN:].sum():,} for other reasons"] if len(reasons) > REASONS_SHOWN else []
+    return (
+        f"recording {recording}: no carriageway has entries. Expected rows that can be used, got dropped ones only: "
+        f"{', '.join([*shown, *more])}. Restore the original files, or repair these lines."
+    )
+
+
+def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:
+    """Files of exactly as many rows as a spreadsheet can hold have circulated; what lay beyond is missing."""
+    known = load(root).sources
+    rows = dict(canonical.log.select("sha256", "rows_read").iter_rows())
+    rows |= {file.sha256: known[file.sha256]["rows_read"] for file in files if file.sha256 in known}
+    return [
+        f"{file.name}: exactly {SPREADSHEET_ROWS:,} rows, a spreadsheet's limit: probably TRUNCATED. Compare with the "
+        "publisher's count and download the file again."
+        for file in files
+        if rows[file.sha256] == SPREADSHEET_ROWS
+    ]
+
+
+def _spilled_part(root: Path, file: RawFile, recording: str) -> Part:
+    folder = spill_folder(root, file)
+    alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
+    rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
+    return Part(file, pl.scan_ipc(folder / recording / "*.arrow"), rejects)
+
+
+def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFile]]:
+    dataset, recording = job.inputs["dataset"], job.inputs["recording"]
+    files: dict[str, list[LakeFile]] = {}
+    for subset in canonical.subsets:
+        values = {"dataset": dataset, "subset": subset.name}
+        for table, frame in ((TRACKS, subset.tracks), (VEHICLES, subset.vehicles), (SUBSETS, subset.facts)):
+            written = write_table(root, table, frame, values, job.fingerprint, where=f"recording {recording}")
+            files.setdefault(table.name, []).extend(written)
+    for table, frame in (
+        (INGEST_LOG, canonical.log),
+        (REJECTS, canonical.rejects),
+        (COMPLETENESS, canonical.completeness),
+    ):
+        files[table.name] = write_table(
+            root, table, frame, {"dataset": dataset}, job.fingerprint, where=f"recording {recording}"
+        )
+    return files
+
+
+def _build_unassigned(root: Path, job: Job, file: RawFile) -> Entry:
+    dataset = job.inputs["dataset"]
+    lines = pl.read_parquet(spill_folder(root, file) / REJECTS_FILE)
+    log = {
+        "dataset": dataset,
+        "recording": None,
+        "file": file.name,
+        "sha256": file.sha256,
+        "dialect": file.dialect,
+        "rows_read": lines.height,
+        "rows_kept": 0,
+        "rows_dropped": lines.height,
+        "dropped_by_reason": count_reasons(lines),
+    }
+    rejects = to_rejects(lines.with_columns(file=pl.lit(file.name)), dataset, None)
+    values = {"dataset": dataset}
+    files = {
+        table.name: write_table(root, table, frame, values, job.fingerprint, where=file.name)
+        for table, frame in ((INGEST_LOG, pl.DataFrame([log], schema=INGEST_LOG.dtypes)), (REJECTS, rejects))
+    }
+    info = {
+        "dataset": dataset,
+        "recording": None,
+        "notes": [f"{file.name}: {lines.height} lines belong to no recording and stand in rejects"],
+        "subsets": [],
+        "rows_read": lines.height,
+        "rows_dropped": lines.height,
+    }
+    return make_entry(job, files, info)

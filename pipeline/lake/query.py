@@ -1,0 +1,257 @@
+"""A lake opened for SQL: an in-memory connection with its views and macros, read-only in fact."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import polars as pl
+
+from tracklake.pipeline.lake.catalog import fill, literally, quote
+from tracklake.pipeline.lake.errors import QueryError
+from tracklake.pipeline.lake.macros import MACROS
+from tracklake.pipeline.lake.manifest import load
+from tracklake.schemas import TABLES
+
+if TYPE_CHECKING:
+    import duckdb
+
+_EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", re.IGNORECASE)
+_WORD = re.compile(r'\w+|"(""|[^"])*"')
+_SWITCHES = {
+    *("enable_logging", "disable_logging", "enable_profiling", "disable_profiling"),
+    *("query", "json_execute_serialized_sql"),
+}
+"""Functions by which a SELECT changes a setting in spite of the locked configuration, or runs a text it made up. What
+they would write is refused by the file system all the same, but DuckDB then ends the whole process."""
+
+_PIVOT_HINT = (
+    " A PIVOT that finds out the values by itself creates a type first; with the values named it is one SELECT: "
+    "PIVOT ... ON lane IN (1, 2, 3)."
+)
+
+Parameters = Mapping[str, Any] | Sequence[Any]
+
+
+class LakeResult:
+    """What a SELECT found; DuckDB computes it when it is fetched.
+
+    Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`.
+    """
+
+    def __init__(self, relation: "duckdb.DuckDBPyRelation") -> None:
+        self._relation = relation
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns' names."""
+        return self._relation.columns
+
+    @property
+    def types(self) -> list[Any]:
+        """The columns' DuckDB types; `str` gives their SQL names."""
+        return list(self._relation.types)
+
+    @property
+    def description(self) -> list[tuple[Any, ...]]:
+        """One tuple per column, as PEP 249 has it: its name, its type, and five that are unknown."""
+        return list(self._relation.description)
+
+    def fetchall(self) -> list[tuple[Any, ...]]:
+        """All rows that were not fetched yet."""
+        return self._relation.fetchall()
+
+    def fetchone(self) -> tuple[Any, ...] | None:
+        """The next row, or None after the last one."""
+        return self._relation.fetchone()
+
+    def count(self) -> int:
+        """How many rows there are, by asking anew."""
+        ((rows,),) = self._relation.count("*").fetchall()
+        return int(rows)
+
+    def pl(self) -> pl.DataFrame:
+        """The rows as a Polars frame; whole numbers of 128 bits, as DuckDB's sums are, in 64 where they fit.
+
+        Where they do not, they are Decimal, which JSON writes as text.
+        """
+        frame = self._relation.pl()
+        wide = [column for column, kind in zip(frame, self.types, strict=True) if str(kind) in ("HUGEINT", "UHUGEINT")]
+        fitting = [column.cast(pl.Int64, strict=False) for column in wide]
+        return frame.with_columns(
+            narrow for column, narrow in zip(wide, fitting, strict=True) if narrow.null_count() == column.null_count()
+        )
+
+    def limit(self, n: int, offset: int = 0) -> "LakeResult":
+        """At most n rows, after the first `offset`."""
+        return LakeResult(self._relation.limit(n, offset))
+
+    def project(self, expressions: str) -> "LakeResult":
+        """Other columns computed of these, a list of SQL expressions.
+
+        Raises:
+            QueryError: not admitted, or DuckDB's own message.
+        """
+        _refuse_switches(expressions)
+        with query_errors():
+            return LakeResult(self._relation.project(expressions))
+
+
+class LakeConnection:
+    """A lake opened for SQL; made by `connect`. One SELECT at a time, and nothing else, as in `query`.
+
+    What it returns is a `LakeResult`: `.pl()`, `.fetchall()`, `.columns` and the rest of what reads.
+    """
+
+    def __init__(self, raw: "duckdb.DuckDBPyConnection") -> None:
+        self._raw = raw
+
+    def sql(self, statement: str, parameters: Parameters | None = None) -> LakeResult:
+        """The result of a statement.
+
+        Args:
+            statement: one SELECT.
+            parameters: values of its $names, or of its question marks in order.
+
+        Raises:
+            QueryError: see `query`.
+        """
+        return _select_only(self._raw, statement, parameters)
+
+    execute = sql
+    """As DuckDB's connections have it."""
+
+    def close(self) -> None:
+        """Let go of the lake's files."""
+        self._raw.close()
+
+    def __enter__(self) -> "LakeConnection":
+        """Use it in a `with` block."""
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        """Close it."""
+        self.close()
+
+
+def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection:
+    """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
+
+    Nothing but the lake's live files can be reached, no statement but a SELECT is admitted, no extension loaded, no
+    setting changed.
+
+    Args:
+        lake: the lake's folder, wherever it stands now.
+        recording: as if the lake held only this one (`dataset/recording`), but for tables over the whole lake.
+
+    Raises:
+        LakeMissingError: no lake there.
+        LakeError: a live file is missing or unreadable.
+    """
+    import duckdb
+
+    root = Path(lake).resolve()
+    manifest = load(root) if recording is None else load(root).of_recording(recording)
+    connection = duckdb.connect(
+        ":memory:",
+        config={
+            "autoinstall_known_extensions": False,
+            "autoload_known_extensions": False,
+            "allow_community_extensions": False,
+        },
+    )
+    fill(connection, root, manifest, locate=lambda path: literally(str(root / path)))
+    live = [str(root / file.path) for table in TABLES for file in manifest.live(table.name)]
+    # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
+    allowed = ", ".join(quote(path) for path in {*live, *map(literally, live)})
+    for setting in (
+        "temp_directory = ''",
+        "python_enable_replacements = false",
+        "allow_persistent_secrets = false",
+        f"allowed_paths = [{allowed}]",
+        "enable_external_access = false",
+        "lock_configuration = true",
+    ):
+        connection.execute(f"SET {setting}")
+    return LakeConnection(connection)
+
+
+def query(connection: LakeConnection, sql: str) -> LakeResult:
+    """Run one SELECT and return its result; EXPLAIN of one, DESCRIBE, SUMMARIZE and SHOW are selects, too.
+
+    DuckDB computes a result when it is fetched: what fails only then fails there, see `query_errors`.
+
+    Raises:
+        QueryError: not exactly one SELECT, or DuckDB's own message with the lists of tables and macros.
+    """
+    return connection.sql(sql)
+
+
+def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: Parameters | None) -> LakeResult:
+    import duckdb
+
+    with query_errors():
+        statements = connection.extract_statements(sql)
+        kinds = [statement.type for statement in statements]
+        allowed = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+        if len(statements) != 1 or kinds[0] not in allowed:
+            asked = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
+            hint = _PIVOT_HINT if any(word.lower() == "pivot" for word in _split(sql)) else ""
+            raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.{hint}")
+        if kinds[0] == duckdb.StatementType.EXPLAIN:
+            _refuse_explained_writes(connection, statements[0].query)
+        _refuse_switches(sql)
+        return LakeResult(connection.sql(statements[0].query, params=parameters or None))
+
+
+def _refuse_switches(sql: str) -> None:
+    words = _split(sql)
+    for place, word in enumerate(words):
+        name, following = word.strip('"').lower(), words[place + 1 :]
+        if name in _SWITCHES and following[:1] == ["("] and not _goes_on_as_a_with(following):
+            raise QueryError(f"{name}(...) is not available here; the lake is read-only.")
+
+
+def _split(sql: str) -> list[str]:
+    """A statement's words and signs, as DuckDB itself reads it: without comments, and a quote for every text."""
+    import duckdb
+
+    text, tokens = sql.encode(), duckdb.tokenize(sql)
+    starts = [*(start for start, _ in tokens), len(text)]
+    words = []
+    for (start, kind), end in zip(tokens, starts[1:], strict=True):
+        token = text[start:end].decode()  # with the blanks and comments behind it
+        word = _WORD.match(token)
+        words.append("'" if kind == duckdb.token_type.string_const else word[0] if word else token[0])
+    return words
+
+
+def _goes_on_as_a_with(following: list[str]) -> bool:
+    """Whether a name's following words are `(x, y) AS (`, as in a WITH; after no call of a function are they."""
+    end = following.index(")") if ")" in following else 0
+    is_list = all(word == "," or _WORD.fullmatch(word) for word in following[1:end])
+    return is_list and [word.upper() for word in following[end + 1 : end + 3]] == ["AS", "("]
+
+
+@contextmanager
+def query_errors() -> Iterator[None]:
+    """Turn what DuckDB raises, also on fetching, into a QueryError with the lists of tables and macros."""
+    import duckdb
+
+    try:
+        yield
+    except duckdb.Error as failed:
+        tables = ", ".join(table.name for table in TABLES)
+        macros = ", ".join(macro.signature for macro in MACROS)
+        raise QueryError(f"{failed}\nTables: {tables}.\nMacros: {macros}.") from failed
+
+
+def _refuse_explained_writes(connection: "duckdb.DuckDBPyConnection", sql: str) -> None:
+    """EXPLAIN ANALYZE runs what it explains, so that must be a SELECT as well."""
+    import duckdb
+
+    inner = _EXPLAIN.sub("", sql)
+    kinds = [statement.type for statement in connection.extract_statements(inner)]
+    if kinds != [duckdb.StatementType.SELECT]:
+        raise QueryError("EXPLAIN explains a SELECT here; the lake is read-only.")

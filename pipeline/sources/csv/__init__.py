@@ -1,0 +1,1 @@
+"""Delimited text to typed columns with every line accounted for, from files or archives."""

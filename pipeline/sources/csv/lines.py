@@ -1,0 +1,330 @@
+"""Delimited text to typed columns with every line accounted for: kept, or rejected with line number and reason.
+
+A file is read in chunks of whole lines. A chunk is parsed strictly and at once; only when that does not account for
+all of its lines is the chunk (not the file) looked at line by line.
+"""
+
+import re
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import TypeVar
+
+import polars as pl
+
+from tracklake.pipeline.sources.csv.quoting import are_paired, unquote_thousands
+from tracklake.pipeline.sources.csv.raw_files import (
+    BOM,
+    CHUNK_BYTES,
+    LINE,
+    count_byte,
+    count_lines,
+    open_raw,
+    separate_fields,
+    split_lines,
+    squeeze_blanks,
+    whole_lines,
+)
+from tracklake.pipeline.sources.source import RawFile
+
+Result = TypeVar("Result")
+
+REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
+THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
+"""A count or a length that may carry thousands separators: `1,156` is one, `1,15` is not."""
+
+UNNAMED = "#"
+"""In the name of a field that is not wanted, precedes its number where its own name is missing or taken."""
+
+WELL_QUOTED = r'^("[^"]*"|[^",]*)(,("[^"]*"|[^",]*))*$'
+"""Quotes surround whole fields or do not occur."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the lines of a file are to be read.
+
+    Args:
+        names: of all fields, in the file's order, as the raw schema calls them.
+        dtypes: of the fields that are wanted.
+        required: wanted fields that may not be empty.
+        thousands: wanted numeric fields that may carry thousands separators.
+        bounds: least and greatest value of numeric fields.
+        choices: the only values a text field may have (compared in lower case).
+        header_lines: 1 where line 1 names the fields, else 0.
+        blanks: fields are separated by runs of blanks instead of commas.
+    """
+
+    names: tuple[str, ...]
+    dtypes: Mapping[str, pl.DataType]
+    required: frozenset[str]
+    thousands: frozenset[str] = frozenset()
+    bounds: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    header_lines: int = 1
+    blanks: bool = False
+
+    @property
+    def separator(self) -> str:
+        """Between fields, once runs of blanks are squeezed."""
+        return " " if self.blanks else ","
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """What became of some consecutive lines.
+
+    Args:
+        frame: kept rows: the wanted fields plus `line` (Int64, from 1).
+        rejects: `line`, `reason`, `text` of the others.
+        rows_read: data lines seen; always the sum of the two.
+    """
+
+    frame: pl.DataFrame
+    rejects: pl.DataFrame
+    rows_read: int
+
+
+def read_chunks(file: RawFile, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Chunk]:
+    """Read a file chunk by chunk; see `map_chunks`."""
+    return map_chunks(file, layout, lambda _number, chunk: chunk, threads=1, chunk_bytes=chunk_bytes)
+
+
+def map_chunks(
+    file: RawFile,
+    layout: Layout,
+    work: Callable[[int, Chunk], Result],
+    *,
+    threads: int,
+    chunk_bytes: int = CHUNK_BYTES,
+) -> Iterator[Result]:
+    """Read a file chunk by chunk and do something with each; gives the results in order.
+
+    Args:
+        file: the file, compressed or not.
+        layout: how to read its lines.
+        work: takes a chunk's number, from 0, and the chunk; called in the thread that parsed it.
+        threads: how many chunks are parsed and worked on at once; as many are held, and one more.
+        chunk_bytes: about how much is read at once.
+
+    Raises:
+        SourceError: a compressed file is damaged or cut short.
+    """
+    line = 1
+    numbers = count()
+    ahead: deque[Future[Result]] = deque()
+
+    def parse_and_work(number: int, data: bytes, first_line: int) -> Result:
+        return work(number, parse(data, layout, first_line=first_line))
+
+    with open_raw(file) as handle, ThreadPoolExecutor(threads) as pool:
+        for data in whole_lines(handle, chunk_bytes, file, heading_lines=layout.header_lines):
+            if line > layout.header_lines:
+                ahead.append(pool.submit(parse_and_work, next(numbers), data, line))
+            line += count_lines(data)
+            if len(ahead) > threads:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    if line == layout.header_lines + 1 > 1:
+        yield parse_and_work(0, b"", line)  # a header and nothing under it is not an empty file
+
+
+def parse(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:
+    """Parse whole lines.
+
+    Args:
+        data: the lines; the last may lack its newline.
+        layout: how to read them.
+        first_line: number of the first of them in its file.
+    """
+    if first_line == 1:
+        data = data.removeprefix(BOM)
+    rows_read = count_lines(data)
+    kept = _parse_strictly(data, layout, rows_read, first_line)
+    if kept is not None:
+        return Chunk(kept, pl.DataFrame(schema=REJECT_SCHEMA), rows_read)
+    return _parse_line_by_line(data, layout, rows_read, first_line)
+
+
+def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int) -> pl.DataFrame | None:
+    """All lines typed at once, or None where a single one cannot be accounted for."""
+    # A byte order mark inside a file comes from joining files; the CSV reader would take it only at a chunk's start.
+    if b"\0" in data or (BOM[:1] in data and BOM in data):
+        return None
+    if not rows_read:
+        return pl.DataFrame(schema={LINE: pl.Int64(), **layout.dtypes})
+    if layout.blanks:
+        if b"," in data or b'"' in data:
+            return None
+        data, layout = separate_fields(data), replace(layout, blanks=False)
+    elif b'"' in data:
+        if not are_paired(data):
+            return None
+        data = unquote_thousands(data) if layout.thousands else data
+    try:
+        frame = _scan(data, layout, layout.dtypes, first_line=first_line)
+    except (pl.exceptions.ComputeError, pl.exceptions.NoDataError, pl.exceptions.SchemaError):
+        return None
+    # Where a line has too few fields its last one is missing; if then the separators come to the right number, no
+    # line has too many either, which the reader, looking no further than what it was asked for, would not notice.
+    if frame.height != rows_read or frame[layout.names[-1]].null_count():
+        return None
+    surplus = count_byte(data, layout.separator) - rows_read * (len(layout.names) - 1)
+    if surplus:
+        texts = [name for name in layout.names if not layout.dtypes.get(name, pl.String()).is_numeric()]
+        if b'"' not in data or surplus != _count_separators(_scan_text(data, layout, texts), layout):
+            return None
+    frame = frame.select(pl.col(LINE).cast(pl.Int64), *layout.dtypes)
+    return frame if frame.select(_is_sound(layout)).item() else None
+
+
+def _count_separators(fields: pl.DataFrame, layout: Layout) -> int:
+    """Separators inside quoted fields."""
+    counts = fields.select(pl.all().str.count_matches(layout.separator, literal=True).sum())
+    return int(counts.sum_horizontal().sum())
+
+
+def _is_sound(layout: Layout) -> pl.Expr:
+    """True for typed rows without a value that may not be: empty, not finite or not among those allowed."""
+    sound = [pl.col(name).null_count() == 0 for name in sorted(layout.required)]
+    sound += [pl.col(name).is_finite().all() for name, dtype in layout.dtypes.items() if dtype.is_float()]
+    for name, (low, high) in layout.bounds.items():
+        sound += [] if low is None else [pl.col(name).min().fill_null(low) >= low]
+        sound += [] if high is None else [pl.col(name).max().fill_null(high) <= high]
+    sound += [~_not_among(pl.col(name).unique(), allowed).any() for name, allowed in layout.choices.items()]
+    # Blanks around a text are taken off line by line only; texts of given choices have none, as those are compared.
+    free = [name for name, dtype in layout.dtypes.items() if dtype == pl.String() and name not in layout.choices]
+    sound += [~pl.col(name).ne_missing(pl.col(name).str.strip_chars()).any() for name in free]
+    return pl.all_horizontal(sound)
+
+
+def _outside(name: str, low: float | None, high: float | None) -> pl.Expr:
+    below = pl.lit(value=False) if low is None else pl.col(name) < low
+    above = pl.lit(value=False) if high is None else pl.col(name) > high
+    return (below | above).fill_null(value=False)
+
+
+def _not_among(values: pl.Expr, allowed: tuple[str, ...]) -> pl.Expr:
+    return ~values.str.to_lowercase().is_in(list(allowed)).fill_null(value=True)
+
+
+def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line: int) -> Chunk:
+    lines = split_lines(data, first_line)
+    reason = _structural_reason(lines, layout)
+    sound = lines.filter(reason.is_null())
+    fields = _split_fields(sound["text"].str.replace_all(BOM.decode(), "", literal=True), layout)
+    cells = fields.with_columns(sound[LINE])
+    numeric = [name for name, dtype in layout.dtypes.items() if dtype.is_numeric()]
+    # What is not well formed stays as it is and fails its cast below.
+    well_formed = {name: pl.col(name).str.contains(THOUSANDS) for name in layout.thousands & layout.dtypes.keys()}
+    cells = cells.with_columns(
+        pl.when(yes).then(pl.col(name).str.replace_all(",", "", literal=True)).otherwise(pl.col(name)).alias(name)
+        for name, yes in well_formed.items()
+    ).with_columns(
+        # Programs that know no empty whole number write 1156 as 1156.0.
+        pl.col(name).str.replace(r"^([+-]?\d+)\.0+$", "${1}")
+        for name in numeric
+        if layout.dtypes[name].is_integer()
+    )
+    typed = cells.select(
+        LINE,
+        *(
+            pl.col(name).cast(dtype, strict=False) if name in numeric else pl.col(name)
+            for name, dtype in layout.dtypes.items()
+        ),
+    )
+    complaint = pl.coalesce(_complaints(layout, numeric))
+    judged = typed.with_columns(cells[name].alias(f"{name}.cell") for name in numeric).with_columns(
+        complaint.alias("reason")
+    )
+    kept = judged.filter(pl.col("reason").is_null()).select(LINE, *layout.dtypes)
+    rejects = pl.concat(
+        [
+            lines.with_columns(reason).filter(pl.col("reason").is_not_null()),
+            judged.select(LINE, "reason").filter(pl.col("reason").is_not_null()).join(lines, on=LINE),
+        ],
+        how="diagonal",
+    ).select(pl.col(name).cast(dtype) for name, dtype in REJECT_SCHEMA.items())
+    return Chunk(kept, rejects.sort(LINE), rows_read)
+
+
+def _complaints(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
+    """What is wrong with a row's values, the first complaint that applies; `<name>.cell` is the text of a number."""
+    complaints = [pl.lit(None, pl.String)]
+    for name in numeric:
+        cell = pl.col(f"{name}.cell")
+        finite = cell.cast(pl.Float64, strict=False).is_finite().fill_null(value=False)
+        complaints.append(_say(cell.is_not_null() & ~finite, f"not a number: {name}"))
+        if layout.dtypes[name].is_integer():
+            unread = cell.is_not_null() & pl.col(name).is_null()
+            whole = cell.str.contains(r"^[+-]?\d+$")
+            complaints.append(_say(unread & ~whole, f"not a plain whole number: {name}"))
+            complaints.append(_say(unread, f"out of range: {name}"))
+    complaints += [_say(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
+    complaints += [_say(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
+    complaints += [
+        _say(_not_among(pl.col(name), allowed), f"unknown value: {name}") for name, allowed in layout.choices.items()
+    ]
+    return complaints
+
+
+def _say(applies: pl.Expr, complaint: str) -> pl.Expr:
+    return pl.when(applies).then(pl.lit(complaint))
+
+
+def _structural_reason(lines: pl.DataFrame, layout: Layout) -> pl.Series:
+    text = pl.col("text").str.replace_all(BOM.decode(), "", literal=True)
+    if layout.blanks:
+        fields = text.str.strip_chars(" \t\r").str.count_matches(r"[ \t\r]+") + 1
+        unbalanced = misplaced = pl.lit(value=False)
+        header = text.str.contains(r"^\s*[A-Za-z_]+(\s+[A-Za-z_]+)+\s*$")
+    else:
+        fields = text.str.replace_all(r'"[^"]*"', "").str.count_matches(",", literal=True) + 1
+        unbalanced = text.str.count_matches('"', literal=True) % 2 == 1
+        misplaced = ~text.str.contains(WELL_QUOTED)
+        first_name = layout.names[0].lower().partition(UNNAMED)[0] or layout.names[0]
+        header = text.str.to_lowercase().str.strip_chars_start(' "').str.contains(f'^{re.escape(first_name)}"?,')
+    return lines.select(
+        pl.when(~pl.col("utf8")).then(pl.lit("not UTF-8"))
+        .when(text.str.strip_chars() == "").then(pl.lit("blank line"))
+        .when(text.str.contains("\0", literal=True)).then(pl.lit("NUL byte"))
+        .when(header).then(pl.lit("repeated header"))
+        .when(unbalanced).then(pl.lit("unbalanced quotes"))
+        .when(misplaced).then(pl.lit("misplaced quotes"))
+        .when(fields != len(layout.names)).then(pl.format("{} fields instead of {}", fields, pl.lit(len(layout.names))))
+        .alias("reason")
+    ).to_series()  # fmt: skip
+
+
+def _split_fields(text: pl.Series, layout: Layout) -> pl.DataFrame:
+    """The wanted fields of structurally sound lines, as text; empty is null."""
+    if text.is_empty():
+        return pl.DataFrame(schema=dict.fromkeys(layout.dtypes, pl.String()))
+    data = "\n".join(text.to_list()).encode()
+    data = squeeze_blanks(data) if layout.blanks else data
+    return _scan_text(data, layout, [*layout.dtypes]).with_columns(pl.all().str.strip_chars().replace("", None))
+
+
+def _scan_text(data: bytes, layout: Layout, names: Sequence[str]) -> pl.DataFrame:
+    return _scan(data, layout, dict.fromkeys(names, pl.String()), first_line=1).select(*names)
+
+
+def _scan(data: bytes, layout: Layout, dtypes: Mapping[str, pl.DataType], *, first_line: int) -> pl.DataFrame:
+    """The fields of `dtypes`, the line's last one, and its number."""
+    wanted = list(dict.fromkeys((*dtypes, layout.names[-1])))
+    return (
+        pl.scan_csv(
+            data,
+            has_header=False,
+            separator=layout.separator,
+            quote_char=None if layout.blanks else '"',
+            schema={name: dtypes.get(name, pl.String()) for name in layout.names},
+            row_index_name=LINE,
+            row_index_offset=first_line,
+        )
+        .select(LINE, *wanted)
+        .collect()
+    )

@@ -1,0 +1,117 @@
+"""A sample to try everything on: simulated recordings in the raw formats, with noise, known defects and the truth."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from tracklake.pipeline.synthetic.build import README_FILE, TRUTH_FILE, build
+from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
+from tracklake.pipeline.synthetic.sumo import SumoError
+from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
+
+ALL_FORMATS = FORMATS
+DEFAULT_MINUTES = 1.0
+
+__all__ = ["ALL_FORMATS", "DEFAULT_FORMATS", "DEFAULT_MINUTES", "SampleSummary", "SumoError", "write_sample"]
+
+
+@dataclass(frozen=True)
+class SampleSummary:
+    """What was written.
+
+    Args:
+        files: all of them, in the sample's folder.
+        rows: data lines in the files of tracks, damaged ones included.
+        recordings: continuous recordings; a highD recording has two subsets.
+        seconds: how long it took.
+    """
+
+    files: tuple[Path, ...]
+    rows: int
+    recordings: int
+    seconds: float
+
+
+def write_sample(
+    out: Path,
+    *,
+    formats: tuple[str, ...] = DEFAULT_FORMATS,
+    minutes: float = DEFAULT_MINUTES,
+    seed: int = 1,
+    progress: Callable[[str], None] | None = None,
+) -> SampleSummary:
+    """Write a sample: raw files, `truth.parquet` and a README.
+
+    The folder appears whole or not at all: everything is written aside and renamed.
+
+    Args:
+        out: the folder; absent, empty, or holding nothing but an earlier sample, which is replaced.
+        formats: some of `ALL_FORMATS`.
+        minutes: length of the recordings, each of which is 0.4 to 1.9 times that.
+        seed: same seed, formats and minutes, same bytes.
+        progress: is told about each step.
+
+    Raises:
+        ValueError: an argument makes no sense, or `out` holds something else.
+        SumoError: SUMO is not installed, or failed.
+    """
+    unknown = [name for name in formats if name not in ALL_FORMATS]
+    if unknown or not formats:
+        raise ValueError(f"formats: expected some of {', '.join(ALL_FORMATS)}, got {', '.join(unknown) or 'none'}")
+    if not LEAST_MINUTES <= minutes <= MOST_MINUTES:
+        raise ValueError(f"minutes: expected {LEAST_MINUTES:g} to {MOST_MINUTES:g}, got {minutes}")
+    if seed < 0:
+        raise ValueError(f"seed: expected a whole number from 0, got {seed}")
+    out = Path(out).absolute()
+    _require_replaceable(out)
+    began = time.perf_counter()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    aside = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    old = out.with_name(f".{out.name}.{os.getpid()}.old")
+    for leftover in (aside, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    aside.mkdir()
+    try:
+        built = build(aside, formats, minutes, seed, progress or (lambda _: None))
+        _require_replaceable(out)
+        if out.exists():
+            out.rename(old)
+        aside.rename(out)
+    finally:
+        for leftover in (aside, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+    return SampleSummary(
+        files=tuple(out / name for name in built.files),
+        rows=built.rows,
+        recordings=built.recordings,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _require_replaceable(out: Path) -> None:
+    """Raise unless writing to `out` destroys nothing but an earlier sample."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise ValueError(f"{out} is a file; expected a folder that is absent or empty. Name another one with --out.")
+    present = {path.name for path in out.iterdir()}
+    if not present:
+        return
+    advice = "Name another folder with --out, or empty this one."
+    truth = out / TRUTH_FILE
+    if not truth.is_file():
+        raise ValueError(f"{out} is not empty and holds no sample ({TRUTH_FILE} is missing). {advice}")
+    try:
+        table = pl.read_parquet(truth)
+    except pl.exceptions.ComputeError as error:
+        raise ValueError(f"{truth} cannot be read, so {out} is not known to be a sample. {advice}") from error
+    if table.schema != pl.Schema(TRUTH_SCHEMA):
+        raise ValueError(f"{truth} is not that of a sample of this version. {advice}")
+    foreign = sorted(present - set(table["file"].drop_nulls()) - {TRUTH_FILE, README_FILE})
+    if foreign:
+        raise ValueError(f"{out} holds a sample, but also {foreign[0]}, which would be lost. {advice}")

@@ -1,0 +1,286 @@
+"""From scenarios to files: simulate, add noise, inject defects, write, read back, tell the truth."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import polars as pl
+
+from tracklake.pipeline.synthetic import damaged_lines as damage
+from tracklake.pipeline.synthetic import defects, highd, ngsim, truth
+from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
+from tracklake.pipeline.synthetic.scenarios import (
+    FREEWAY,
+    HIGHD,
+    NGSIM_CSV,
+    NGSIM_SOCRATA,
+    NGSIM_TEXT,
+    HighdScenario,
+    NgsimScenario,
+    Plan,
+    Road,
+    Traffic,
+)
+from tracklake.pipeline.synthetic.sumo import find_sumo, simulate
+
+AT_ONCE = 2
+"""Simulations running at the same time; each is a process of one thread."""
+
+BOM = b"\xef\xbb\xbf"
+TRUTH_FILE = "truth.parquet"
+README_FILE = "README.md"
+README = """# A generated sample
+
+These files have the raw formats of highD and NGSIM, but nobody drove there: SUMO simulated the traffic, and tracking
+noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes).
+
+- `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
+  describe the rows in the files.
+- `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
+- `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
+"""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One carriageway to simulate; `index` keeps its random numbers apart from all others'."""
+
+    index: int
+    road: Road
+    traffic: Traffic
+    frames: int
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Where a subset comes from and goes to."""
+
+    dataset: str
+    recording: str
+    subset: str
+    file: str
+    run: _Run
+
+
+@dataclass(frozen=True)
+class Built:
+    """What was written: file names and the number of data lines in the files of tracks."""
+
+    files: tuple[str, ...]
+    rows: int
+    recordings: int
+
+
+def build(folder: Path, formats: tuple[str, ...], minutes: float, seed: int, progress: Callable[[str], None]) -> Built:
+    """Write a whole sample into an empty folder.
+
+    Args:
+        folder: exists and is empty.
+        formats: which to write.
+        minutes: length of a recording of share 1.
+        seed: same seed, same bytes.
+        progress: is told about each step.
+    """
+    home = find_sumo()
+    recordings = HIGHD if "highd" in formats else ()
+    groups: list[tuple[str, str, tuple[NgsimScenario, ...]]] = [
+        (kind, file, scenarios)
+        for kind, file, scenarios in (
+            ("ngsim-text", "trajectories-us-101-0930.txt", NGSIM_TEXT),
+            ("socrata", "us-101-export.csv", NGSIM_SOCRATA),
+            ("ngsim-csv", "trajectories-us-101-1015.csv", NGSIM_CSV),
+        )
+        if kind in formats
+    ]
+    jobs = _jobs(recordings, groups, minutes)
+    progress(f"simulating {len(jobs)} carriageways")
+    clean = _simulate_all(home, jobs, seed, progress)
+    found = truth.Found()
+    rows: list[dict[str, object]] = []
+    for scenario in recordings:
+        progress(f"writing highD recording {scenario.recording}")
+        pair = [job for job in jobs if job.dataset == "highd" and job.recording == scenario.recording]
+        rows += _write_highd(folder, scenario, pair, clean, seed)
+        truth.read_highd(folder, scenario.recording, found)
+    for kind, file, scenarios in groups:
+        progress(f"writing {file}")
+        rows += _write_ngsim(folder, kind, file, scenarios, [job for job in jobs if job.file == file], clean, seed)
+        names = {ngsim.global_time_base(each.start_time): ngsim.recording_name(each.start_time) for each in scenarios}
+        truth.read_ngsim(folder / file, names, found)
+    progress("writing the truth")
+    truth.truth_table(rows + truth.rows_of(found)).write_parquet(folder / TRUTH_FILE)
+    (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes), encoding="utf-8")
+    return Built(
+        files=tuple(sorted(path.name for path in folder.iterdir())),
+        rows=sum(count.read for count in found.files if not count.file.endswith("Meta.csv")),
+        recordings=len(recordings) + sum(len(scenarios) for _, _, scenarios in groups),
+    )
+
+
+def _jobs(
+    recordings: tuple[HighdScenario, ...], groups: list[tuple[str, str, tuple[NgsimScenario, ...]]], minutes: float
+) -> list[_Job]:
+    jobs = []
+    for place, scenario in enumerate(HIGHD):
+        frames = max(1, round(scenario.share * minutes * 60 * scenario.road.rate_hz))
+        for side, traffic in (("upper", scenario.upper), ("lower", scenario.lower)):
+            run = _Run(2 * place + (side == "lower"), scenario.road, traffic, frames)
+            name = scenario.recording
+            jobs.append(_Job("highd", name, f"{name}-{side}", f"{name}_tracks.csv", run))
+    jobs = jobs if recordings else []
+    order = {each.start_time: 100 + i for i, each in enumerate(NGSIM_TEXT + NGSIM_SOCRATA + NGSIM_CSV)}
+    for _, file, scenarios in groups:
+        for each in scenarios:
+            frames = max(1, round(each.share * minutes * 60 * FREEWAY.rate_hz))
+            name = ngsim.recording_name(each.start_time)
+            run = _Run(order[each.start_time], FREEWAY, each.traffic, frames)
+            jobs.append(_Job("ngsim", name, name, file, run))
+    return jobs
+
+
+def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[str], None]) -> dict[str, pl.DataFrame]:
+    def one(job: _Job, folder: Path) -> pl.DataFrame:
+        place = folder / job.subset
+        place.mkdir()
+        # SUMO's seed is a non-negative 32-bit number.
+        own_seed = int(np.random.default_rng([seed, job.run.index, 0]).integers(2**31))
+        return simulate(home, place, job.run.road, job.run.traffic, frames=job.run.frames, seed=own_seed)
+
+    with TemporaryDirectory(prefix="tracklake-sample-") as folder, ThreadPoolExecutor(AT_ONCE) as pool:
+        # The congested ones take longest and go first.
+        slowest = sorted(jobs, key=lambda job: job.run.traffic.bottleneck_mps is None)
+        waiting = {job.subset: pool.submit(one, job, Path(folder)) for job in slowest}
+        tracks = {}
+        for done, (subset, future) in enumerate(waiting.items(), start=1):
+            tracks[subset] = future.result()
+            progress(f"simulated {subset} ({done}/{len(waiting)})")
+    return tracks
+
+
+def _first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
+    firsts = tracks.group_by("vehicle", maintain_order=True).agg(
+        pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"), pl.len(), pl.col("x").first()
+    )
+    return [
+        {
+            "kind": "first_frame", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
+            "file": job.file, "vehicle_id": vehicle, "first_frame": first, "last_frame": last, "entries": entries,
+            "value": x,
+        }
+        for vehicle, first, last, entries, x in firsts.iter_rows()
+    ]  # fmt: skip
+
+
+def _spoil(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, list[dict[str, object]]]:
+    """Noise and defects; returns the damaged tracks and the truth about them."""
+    random = np.random.default_rng([seed, job.run.index, 1])
+    is_ngsim = job.dataset == "ngsim"
+    noisy = add_noise(tracks, job.run.road, MAST if is_ngsim else DRONE, random)
+    plan: Plan = job.run.traffic.plan
+    injected = defects.inject(
+        noisy,
+        plan,
+        rate_hz=job.run.road.rate_hz,
+        on_ramp_lane=job.run.road.lanes + 2 if job.run.road.ramp else None,
+        unseen_leaders=is_ngsim,
+        random=random,
+    )
+    told: list[dict[str, object]] = [
+        {
+            "kind": "defect", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
+            "file": job.file, "vehicle_id": each.vehicle, "name": each.name, "first_frame": each.first_frame,
+            "last_frame": each.last_frame, "entries": each.entries, "value": each.value,
+        }
+        for each in injected.defects
+    ]  # fmt: skip
+    return injected.tracks, _first_frames(tracks, job) + told
+
+
+def _line_truth(
+    found: list[damage.LineDefect], dataset: str, recording: str | None, file: str
+) -> list[dict[str, object]]:
+    return [
+        {
+            "kind": "defect", "dataset": dataset, "recording": recording, "file": file, "line": each.line,
+            "name": each.name, "entries": 1,
+        }
+        for each in found
+    ]  # fmt: skip
+
+
+def _write_highd(
+    folder: Path, scenario: HighdScenario, pair: list[_Job], clean: dict[str, pl.DataFrame], seed: int
+) -> list[dict[str, object]]:
+    # Ids count over both carriageways, in order of the first frame.
+    both = [clean[job.subset].with_columns(side=pl.lit(i)) for i, job in enumerate(pair)]
+    numbered = (
+        pl.concat(both)
+        .group_by("side", "vehicle")
+        .agg(pl.col("frame").min())
+        .sort("frame", "side", "vehicle")
+        .with_columns(number=pl.int_range(1, pl.len() + 1, dtype=pl.Int32))
+    )
+    spoiled, rows = [], []
+    for side, job in enumerate(pair):
+        ids = numbered.filter(pl.col("side") == side).select("vehicle", "number")
+        tracks = (
+            clean[job.subset]
+            .join(ids, on="vehicle", maintain_order="left")
+            .with_columns(vehicle=pl.col("number"))
+            .drop("number")
+            .sort("vehicle", "frame")
+        )
+        damaged, told = _spoil(tracks, job, seed)
+        spoiled.append(damaged)
+        rows += told
+    files = highd.build_recording(scenario, spoiled[0], spoiled[1], frames=pair[0].run.frames)
+    text = files.tracks
+    if scenario.damaged:
+        random = np.random.default_rng([seed, pair[0].run.index, 2])
+        dialect = damage.Dialect(header=True, separator=",", number_field=6)
+        lines, hurt = damage.damage(text.splitlines(), dialect, random)
+        rows += _line_truth(hurt, "highd", scenario.recording, pair[0].file)
+        text = "\n".join(lines) + "\n"
+    for suffix, content in (
+        ("recordingMeta", files.recording_meta),
+        ("tracksMeta", files.tracks_meta),
+        ("tracks", text),
+    ):
+        (folder / f"{scenario.recording}_{suffix}.csv").write_bytes(content.encode())
+    return rows
+
+
+def _write_ngsim(
+    folder: Path,
+    kind: str,
+    file: str,
+    scenarios: tuple[NgsimScenario, ...],
+    jobs: list[_Job],
+    clean: dict[str, pl.DataFrame],
+    seed: int,
+) -> list[dict[str, object]]:
+    written, rows = [], []
+    for scenario, job in zip(scenarios, jobs, strict=True):
+        shift = scenario.first_vehicle_id - 1
+        tracks = clean[job.subset].with_columns(pl.col("vehicle") + pl.lit(shift, pl.Int32))
+        damaged, told = _spoil(tracks, job, seed)
+        written.append(ngsim.feet_rows(damaged, scenario.start_time))
+        rows += told
+    random = np.random.default_rng([seed, jobs[0].run.index, 2])
+    together = pl.concat(written)
+    if kind == "ngsim-text":
+        lines, dialect = ngsim.text_lines(together), damage.Dialect(header=False, separator=None, number_field=5)
+    elif kind == "ngsim-csv":
+        lines, dialect = ngsim.csv_lines(together), damage.Dialect(header=True, separator=",", number_field=5)
+    else:
+        lines = ngsim.portal_lines(ngsim.shuffle_like_the_portal(together, random))
+        dialect = damage.Dialect(header=True, separator=",", number_field=5, quotes=True)
+    lines, hurt = damage.damage(lines, dialect, random)
+    recording = jobs[0].recording if len(jobs) == 1 else None
+    rows += _line_truth(hurt, "ngsim", recording, file)
+    end, start = ("\r\n", BOM) if kind == "socrata" else ("\n", b"")
+    (folder / file).write_bytes(start + (end.join(lines) + end).encode())
+    return rows

@@ -1,0 +1,221 @@
+"""The written files read back, and the table of what stands in them.
+
+This and `judging` are the places of the project that loop over entries in Python, on purpose: they share no code with
+the pipeline, its sources or its rules, so that equal counts mean something.
+"""
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import polars as pl
+
+from tracklake.pipeline.synthetic.expected_findings import Entry, Surface, count_rules
+
+TRUTH_SCHEMA = {
+    "kind": pl.String(),
+    "dataset": pl.String(),
+    "recording": pl.String(),
+    "subset": pl.String(),
+    "file": pl.String(),
+    "line": pl.Int64(),
+    "vehicle_id": pl.Int64(),
+    "name": pl.String(),
+    "first_frame": pl.Int64(),
+    "last_frame": pl.Int64(),
+    "entries": pl.Int64(),
+    "vehicles": pl.Int64(),
+    "value": pl.Float64(),
+}
+"""kind = `defect`: an injected defect (`name`), on a vehicle's entries or a file's line.
+`first_frame`: a vehicle's TRUE first and last frame and number of frames in the window, before any defect; value is
+its true x_m at the first, from the window's entrance along the direction of travel (noise apart).
+`rule`: entries and vehicles of a subset that break a rule (`name`), as counted from the files; value is the number of
+runs of consecutive frames. `rows`: lines of a file that are `read` (the header apart), `kept`, `malformed`,
+`duplicate`. Null where a column does not apply."""
+
+METRES_PER_FOOT = 0.3048
+NGSIM_CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
+
+
+@dataclass
+class FileCount:
+    """Lines of one file."""
+
+    file: str
+    dataset: str
+    recording: str | None
+    read: int = 0
+    kept: int = 0
+    malformed: int = 0
+    duplicate: int = 0
+
+
+@dataclass
+class Found:
+    """Everything read back: entries by subset and (vehicle, frame), and what became of the lines."""
+
+    entries: dict[tuple[str, str, str], dict[tuple[int, int], Entry]] = field(default_factory=dict)
+    surfaces: dict[str, Surface] = field(default_factory=dict)
+    files: list[FileCount] = field(default_factory=list)
+
+
+def _usable(line: str, separator: str | None, fields: int) -> list[str] | None:
+    """The fields of a line, or None where it is not a row of so many fields."""
+    if "\0" in line or not line.strip():
+        return None
+    if separator is not None and line.count('"') % 2:
+        return None
+    parts: list[str] = line.split() if separator is None else next(csv.reader([line]))
+    return parts if len(parts) == fields else None
+
+
+def _number(text: str) -> float:
+    value = float(text.replace(",", ""))
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def _lines(path: Path) -> list[str]:
+    text = path.read_bytes().decode("utf-8-sig")
+    lines = text.split("\n")
+    if lines[-1] == "":
+        lines.pop()
+    return [line.removesuffix("\r") for line in lines]
+
+
+def read_highd(folder: Path, recording: str, found: Found) -> None:
+    """Read the three files of a recording back."""
+    for suffix, fields in (("recordingMeta", 15), ("tracksMeta", 16)):
+        name = f"{recording}_{suffix}.csv"
+        count = FileCount(name, "highd", recording)
+        for line in _lines(folder / name)[1:]:
+            count.read += 1
+            if _usable(line, ",", fields) is None:
+                count.malformed += 1
+            else:
+                count.kept += 1
+        found.files.append(count)
+    direction, kinds = {}, {}
+    for line in _lines(folder / f"{recording}_tracksMeta.csv")[1:]:
+        meta = line.split(",")
+        direction[int(meta[0])] = int(meta[7])
+        kinds[int(meta[0])] = meta[6].lower()
+    facts = _lines(folder / f"{recording}_recordingMeta.csv")[1].split(",")
+    upper, lower = ([float(y) for y in field.split(";")] for field in facts[13:15])
+    markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
+    for side, places in markings.items():
+        found.surfaces[f"{recording}-{side}"] = Surface(float(facts[1]), tuple(places), headway_stands_in=False)
+    name = f"{recording}_tracks.csv"
+    count = FileCount(name, "highd", recording)
+    seen = set()
+    for line in _lines(folder / name)[1:]:
+        count.read += 1
+        parts = _usable(line, ",", 25)
+        try:
+            numbers = [_number(part) for part in parts] if parts else None
+        except ValueError:
+            numbers = None
+        if numbers is None:
+            count.malformed += 1
+            continue
+        if line in seen:
+            count.duplicate += 1
+            continue
+        seen.add(line)
+        count.kept += 1
+        vehicle, frame = int(numbers[1]), int(numbers[0])
+        left = direction[vehicle] == 1
+        along = -1 if left else 1
+        middle, lanes, lane = numbers[3] + numbers[5] / 2, len(upper) - 1, int(numbers[24])
+        entry = Entry(
+            front=-numbers[2] if left else numbers[2] + numbers[4],
+            length=numbers[4],
+            speed=along * numbers[6],
+            accel=along * numbers[8],
+            leader=int(numbers[16]),
+            headway=numbers[12],
+            y=upper[-1] - middle if left else middle - lower[0],
+            width=numbers[5],
+            lane=lanes + 2 - lane if left else lane - lanes - 2,
+            kind=kinds[vehicle],
+        )
+        subset = f"{recording}-{'upper' if left else 'lower'}"
+        found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry
+    found.files.append(count)
+
+
+def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
+    """Read an NGSIM file back.
+
+    Args:
+        path: 18-column text, 18-column CSV or 25-column CSV.
+        recordings: their names by Global_Time - 100 * Frame_ID.
+        found: is added to.
+    """
+    lines = _lines(path)
+    header = lines[0].startswith("Vehicle_ID")
+    fields = lines[0].count(",") + 1 if header else 18
+    # Behind the lane, the 25-column export has six more columns before Preceding.
+    behind = 14 + (6 if fields == 25 else 0)
+    count = FileCount(path.name, "ngsim", next(iter(recordings.values())) if len(recordings) == 1 else None)
+    seen = set()
+    for line in lines[1:] if header else lines:
+        count.read += 1
+        parts = _usable(line, "," if header else None, fields)
+        try:
+            numbers = [_number(part) for part in parts[:14] + parts[behind : behind + 4]] if parts else None
+        except ValueError:
+            numbers = None
+        if numbers is None:
+            count.malformed += 1
+            continue
+        if line in seen:
+            count.duplicate += 1
+            continue
+        seen.add(line)
+        count.kept += 1
+        recording = recordings[int(numbers[3]) - 100 * int(numbers[1])]
+        found.entries.setdefault(("ngsim", recording, recording), {})[int(numbers[0]), int(numbers[1])] = Entry(
+            front=numbers[5] * METRES_PER_FOOT,
+            length=numbers[8] * METRES_PER_FOOT,
+            speed=numbers[11] * METRES_PER_FOOT,
+            accel=numbers[12] * METRES_PER_FOOT,
+            leader=int(numbers[14]),
+            headway=numbers[16] * METRES_PER_FOOT,
+            y=numbers[4] * METRES_PER_FOOT,
+            width=numbers[9] * METRES_PER_FOOT,
+            lane=int(numbers[13]),
+            kind=NGSIM_CLASSES[int(numbers[10])],
+        )
+    found.files.append(count)
+
+
+def rows_of(found: Found) -> list[dict[str, object]]:
+    """The `rule` and `rows` rows of the truth table."""
+    rows: list[dict[str, object]] = []
+    for (dataset, recording, subset), entries in sorted(found.entries.items()):
+        for rule, (hits, vehicles, runs) in count_rules(entries, found.surfaces.get(subset, Surface())).items():
+            rows.append(
+                {
+                    "kind": "rule", "dataset": dataset, "recording": recording, "subset": subset, "name": rule,
+                    "entries": hits, "vehicles": vehicles, "value": float(runs),
+                }
+            )  # fmt: skip
+    rows.extend(
+        {
+            "kind": "rows", "dataset": count.dataset, "recording": count.recording, "file": count.file,
+            "name": name, "entries": getattr(count, name),
+        }
+        for count in found.files
+        for name in ("read", "kept", "malformed", "duplicate")
+    )  # fmt: skip
+    return rows
+
+
+def truth_table(rows: Iterable[dict[str, object]]) -> pl.DataFrame:
+    """Put rows, of which any column may be missing, into TRUTH_SCHEMA."""
+    return pl.DataFrame([{name: row.get(name) for name in TRUTH_SCHEMA} for row in rows], schema=TRUTH_SCHEMA)

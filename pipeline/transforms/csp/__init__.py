@@ -1,0 +1,1 @@
+"""Tracks as convolutional social pooling's own script writes them."""

@@ -1,0 +1,179 @@
+"""Which entries go into TrainSet, ValSet and TestSet, and which of them are samples."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from tracklake.pipeline.transforms.csp.entries import CspEntries
+from tracklake.schemas.columns import PARTS
+
+TRAIN, VAL, TEST = range(3)
+"""Places in `schemas.columns.PARTS`."""
+NO_PART = -1
+HISTORY_ROWS = 31
+"""3 s at 10 Hz and the entry itself: tracks with fewer rows stop the script."""
+FULL_FUTURE_ROWS = 50
+"""5 s at 10 Hz, all that the Dataset class reads ahead."""
+TRAIN_SHARE, TRAIN_VAL_SHARE = np.float32(0.7), np.float32(0.8)
+"""Of the highest vehicle id: where the validation and the test set begin."""
+
+NO_LANE, EXCLUDED, SAME_ID, ID_ZERO = "no_lane", "excluded_subset", "same_id_and_frame", "id_zero"
+OUTSIDE_SPLIT, IN_TWO_PARTS = "outside_split", "in_two_parts"
+SHORT_TRACK, SHORT_HISTORY, SHORT_FUTURE, NO_FULL_FUTURE = (
+    "short_track",
+    "short_history",
+    "short_future",
+    "no_full_future",
+)
+EARLY, WOULD_BE = "early_vehicle", "would_be_neighbor"
+REASONS = {
+    NO_LANE: "the subset has no lanes: neither tracks nor samples of it are written",
+    EXCLUDED: "validation excludes the subset: neither tracks nor samples of it are written",
+    SAME_ID: "another vehicle has the same id in the same frame: not in tracks either",
+    ID_ZERO: "the format counts ids from 1, 0 is nobody: not in tracks either",
+    OUTSIDE_SPLIT: "in no part of the split: not in tracks either",
+    IN_TWO_PARTS: "the vehicle is in train as well, or in val and eval: not in tracks either",
+    SHORT_TRACK: "of tracks under 31 frames, on which the original stops",
+    SHORT_HISTORY: "before the track's 31st frame",
+    SHORT_FUTURE: "the track's last frame is not later than the next frame",
+    NO_FULL_FUTURE: "fewer than 50 frames of the track follow (--full-future)",
+    EARLY: "the road ahead was not yet recorded when the vehicle entered (--clean)",
+    WOULD_BE: "a vehicle whose track starts late is missing around the entry (--clean)",
+}
+"""Why an entry is no sample, in the order in which it is tested; an entry is dropped for the first that applies."""
+
+Parts = NDArray[np.int8]
+
+
+def part_by_id(track_id: NDArray[np.int32]) -> Parts:
+    """Part as the script does: up to round(0.7 max id) train, up to round(0.8 max id) validation, the rest test.
+
+    By the highest id and not by the count of vehicles; in single precision, halves away from zero.
+
+    Args:
+        track_id: (N,) of one subset.
+    """
+    if not track_id.size:
+        return np.zeros(0, np.int8)
+    highest = np.float32(track_id.max())
+    last_train, last_val = (int(np.floor(float(share * highest) + 0.5)) for share in (TRAIN_SHARE, TRAIN_VAL_SHARE))
+    return np.where(track_id <= last_train, TRAIN, np.where(track_id <= last_val, VAL, TEST)).astype(np.int8)
+
+
+def part_by_split(
+    clock: pl.DataFrame, blocks: pl.DataFrame, *, first_frame: int, stride: float
+) -> tuple[Parts, NDArray[np.int32], Parts]:
+    """Part by the lake's split, which no vehicle, no frame and no history crosses.
+
+    Args:
+        clock: vehicle_id, tick.
+        blocks: rows of `splits` of this subset.
+        first_frame: the recording's first frame, where tick 0 lies.
+        stride: source frames per tick.
+
+    Returns:
+        (N,) each: the part, NO_PART = none; the row of `blocks`, -1 = none; the part in which an entry would stand if
+        its vehicle were in no other part (of a vehicle in two parts only the entries in train stay, if there are any).
+    """
+    vehicle = clock["vehicle_id"].to_numpy()
+    frame = first_frame + clock["tick"].to_numpy() * stride
+    block = np.full(clock.height, -1, np.int32)
+    codes = np.full(blocks.height + 1, NO_PART, np.int8)
+    names = ("first_frame", "last_frame", "first_vehicle_id", "last_vehicle_id", "part")
+    for number, (first, last, first_id, last_id, part) in enumerate(blocks.select(names).iter_rows()):
+        within = (frame >= first) & (frame <= last)
+        within &= (vehicle >= (first_id if first_id is not None else vehicle.min(initial=0))) & (
+            vehicle <= (last_id if last_id is not None else vehicle.max(initial=0))
+        )
+        block[within] = number
+        codes[number] = PARTS.index(part)
+    intended = codes[block]
+    spread = (
+        pl.DataFrame({"vehicle": vehicle, "part": intended})
+        .filter(pl.col("part") != NO_PART)
+        .group_by("vehicle")
+        .agg(parts=pl.col("part").n_unique())
+        .filter(pl.col("parts") > 1)["vehicle"]
+    )
+    in_two = pl.Series(vehicle).is_in(spread.implode()).to_numpy() & (intended != TRAIN)
+    return np.where(in_two, np.int8(NO_PART), intended), block, intended
+
+
+def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, NDArray[np.bool_]]:
+    """Tell which entries the script's filter drops (preprocess_data.m, 'Filter edge cases'), and --full-future's.
+
+    The script keeps an entry at frame t where the 31st frame of its track <= t and the last one > t + 1.
+
+    Args:
+        entries: of one subset.
+        full_future: whether a sample needs 50 rows after it.
+
+    Returns:
+        (N,) by reason; reasons may overlap.
+    """
+    row = np.arange(entries.height)
+    first, last = entries.bound_tracks()
+    drops = {
+        SHORT_TRACK: last - first + 1 < HISTORY_ROWS,
+        SHORT_HISTORY: row - first < HISTORY_ROWS - 1,
+        SHORT_FUTURE: entries.frame[last] <= entries.frame + np.float32(1),
+    }
+    if full_future:
+        drops[NO_FULL_FUTURE] = last - row < FULL_FUTURE_ROWS
+    return drops
+
+
+def keep_samples(part: Parts, drops: Mapping[str, NDArray[np.bool_]]) -> tuple[NDArray[np.bool_], dict[str, list[int]]]:
+    """Keep the entries to which no reason applies, and count the others.
+
+    Args:
+        part: (N,) of PARTS.
+        drops: by reason, (N,).
+
+    Returns:
+        (N,) kept; by reason how many were dropped of each part.
+    """
+    kept = np.ones(part.size, np.bool_)
+    counts = {}
+    for reason in REASONS:
+        if reason in drops:
+            counts[reason] = count_parts(part[kept & drops[reason]])
+            kept &= ~drops[reason]
+    return kept, counts
+
+
+def count_parts(part: Parts) -> list[int]:
+    """How many entries stand in each part."""
+    return [int(count) for count in np.bincount(part, minlength=len(PARTS))]
+
+
+ORIGINAL_ORDER = ("us-101-0750", "us-101-0805", "us-101-0820", "i-80-1600", "i-80-1700", "i-80-1715")
+"""The script's data sets 1 to 6."""
+
+
+def number_datasets(subsets: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+    """Give every subset its data set id, a row of `tracks`.
+
+    NGSIM's six freeway recordings have the script's 1 to 6 as soon as one of them is there; the others follow, NGSIM's
+    before highD's, by name.
+
+    Args:
+        subsets: (dataset, subset), each once.
+    """
+    asked = set(subsets)
+    original = {("ngsim", name): number for number, name in enumerate(ORIGINAL_ORDER, start=1)}
+    known = {subset: number for subset, number in original.items() if subset in asked}
+    others = sorted(asked - known.keys(), key=lambda subset: (subset[0] != "ngsim", subset))
+    return known | {subset: number for number, subset in enumerate(others, start=1 + len(original) * bool(known))}
+
+
+def count_rows(ids: Mapping[tuple[str, str], int]) -> int:
+    """Rows of `tracks`: the script's six if one of them is there, and one for each other subset.
+
+    Args:
+        ids: from `number_datasets`.
+    """
+    has_known = any(dataset == "ngsim" and subset in ORIGINAL_ORDER for dataset, subset in ids)
+    return max([*ids.values(), len(ORIGINAL_ORDER) * has_known])

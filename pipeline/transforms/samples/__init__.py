@@ -1,0 +1,1 @@
+"""Prediction origins with their maneuvers and neighbors."""

@@ -1,0 +1,1 @@
+"""Which subsets train, validate and evaluate."""

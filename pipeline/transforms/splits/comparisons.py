@@ -1,0 +1,81 @@
+"""Splits to compare with: the one that published tables stand on, and recordings drawn at random."""
+
+import numpy as np
+import polars as pl
+
+from tracklake.pipeline.transforms.csp.parts import part_by_id
+from tracklake.pipeline.transforms.splits.tables import Allocation, tabulate
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.split_recipes import find_shares
+
+
+def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = "csp-2018") -> Allocation:
+    """Cut each subset at 70 and 80 % of its highest vehicle id, as conv-social-pooling's preprocessing does.
+
+    Ids are given in the order of appearance, so that the parts overlap in time, and cars either side of a cut are
+    neighbors. A part that would have no vehicles has no row.
+
+    Args:
+        subsets: the columns of `split_tables.COLUMNS`.
+        vehicles: dataset, subset, vehicle_id, weight (kept samples) of every vehicle of these subsets.
+        split: the name to write into the tables.
+
+    Source: Deo and Trivedi 2018, `preprocess_data.m`.
+    """
+    units = [subsets.with_columns(part=pl.lit(None, pl.String)).clear()]
+    for (dataset, subset), own in vehicles.group_by("dataset", "subset", maintain_order=True):
+        codes = part_by_id(own["vehicle_id"].cast(pl.Int32).to_numpy())
+        ranges = (
+            own.with_columns(part=pl.Series([PARTS[code] for code in codes], dtype=pl.String))
+            .group_by("part")
+            .agg(
+                vehicles=pl.len().cast(pl.Int64),
+                weight=pl.col("weight").sum().cast(pl.Int64),
+                first_vehicle_id=pl.col("vehicle_id").min().cast(pl.Int32),
+                last_vehicle_id=pl.col("vehicle_id").max().cast(pl.Int32),
+            )
+            .sort("first_vehicle_id")
+            .with_row_index("block")
+        )
+        whole = subsets.filter((pl.col("dataset") == dataset) & (pl.col("subset") == subset))
+        units.append(whole.drop("vehicles", "weight").join(ranges, how="cross"))
+    return tabulate(pl.concat(units, how="diagonal_relaxed"), split=split, parts=PARTS)
+
+
+def divide_by_recording(
+    subsets: pl.DataFrame,
+    *,
+    split: str = "by-recording-random",
+    train_share: float = 0.8,
+    validation: bool = False,
+    seed: int = 0,
+) -> Allocation:
+    """Draw recordings at random, all subsets of one into the same part, by the shares of the flow-balanced split.
+
+    Shares are of recordings, to the nearest whole one, but at least one evaluates where there are two, and one is in
+    val where there are three.
+
+    Args:
+        subsets: the columns of `split_tables.COLUMNS` and `recording`.
+        split: the name to write into the tables.
+        train_share: of the recordings, to train where there is no `val`.
+        validation: whether there is a part `val`.
+        seed: of the draw; a dataset's draw does not depend on other datasets.
+
+    Raises:
+        ValueError: a part would have no share.
+    """
+    shares = find_shares(train_share, validation=validation)
+    drawn = [pl.DataFrame(schema={"dataset": pl.String, "recording": pl.String, "part": pl.String})]
+    for (dataset,), rows in subsets.group_by("dataset"):
+        names = rows["recording"].unique().sort()
+        order = np.random.default_rng([seed, *str(dataset).encode()]).permutation(len(names))
+        parts: list[str] = []
+        for part in reversed(shares):  # eval first: train has what is left
+            wanted = max(1, round(len(names) * shares[part] / 1000)) if part != "train" else len(names)
+            parts += [part] * min(wanted, len(names) - len(parts) - (part != "train"))
+        drawn.append(
+            pl.DataFrame({"recording": names.gather(order), "part": parts}).with_columns(dataset=pl.lit(dataset))
+        )
+    parted = subsets.join(pl.concat(drawn, how="diagonal"), on=["dataset", "recording"])
+    return tabulate(parted, split=split, parts=list(shares))

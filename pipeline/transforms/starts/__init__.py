@@ -1,0 +1,1 @@
+"""Tracks that start late, and the frames that are missing before them."""

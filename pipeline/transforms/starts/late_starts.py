@@ -1,0 +1,275 @@
+"""Tracks that start late: which, what is missing of them, and whose surroundings are therefore incomplete.
+
+DESIGN section 6. Positions are never invented: the tables made here only say where something is missing.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from tracklake.pipeline.transforms.resample import find_stride
+from tracklake.pipeline.transforms.starts.references import Floats, References
+from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
+from tracklake.schemas.vehicles import VEHICLE_STARTS
+
+ELIGIBLE_AFTER_S = 1.0
+"""A track whose first entry lies this long after the recording's first frame was not on the road when it began."""
+CUTOFF_STEP_M = 2.0
+LEAST_REFERENCES = 10
+"""With fewer the frames are estimated from the subset's mean speed."""
+SIGMAS = 2.0
+REACH_M = 40.0
+"""A missing vehicle this near, along the road, belongs to an entry's surroundings."""
+ROUNDING_M = 1e-6
+"""Far below the precision of a position (1 mm): keeps rounding from deciding an inclusive bound."""
+
+
+def find_cutoff(start_x_m: Floats) -> float | None:
+    """Find the first c = 0, 2, 4 ... m with at least half of the starts at or before it and none in (c, c + 2].
+
+    Args:
+        start_x_m: first positions of the eligible tracks. A cut-off exists as soon as there is one.
+
+    Returns:
+        c in metres; None where there are no starts.
+    """
+    if not start_x_m.size:
+        return None
+    starts = np.sort(start_x_m)
+    steps = math.ceil(max(float(starts[-1]), 0.0) / CUTOFF_STEP_M) + 1
+    candidates = CUTOFF_STEP_M * np.arange(steps)
+    at_or_before = np.searchsorted(starts, candidates, side="right")
+    none_just_beyond = np.searchsorted(starts, candidates + CUTOFF_STEP_M, side="right") == at_or_before
+    return float(candidates[np.argmax((2 * at_or_before >= starts.size) & none_just_beyond)])
+
+
+def judge_starts(
+    vehicles: pl.DataFrame,
+    *,
+    dataset: str,
+    subset: str,
+    first_frame: int,
+    frame_rate_hz: float,
+    on_ramp_lanes: tuple[int, ...] = (),
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Judge how each track of a subset begins, against the subset's own cut-off (DESIGN section 6, points 1, 2, 5).
+
+    Where no track is eligible there is no cut-off: nobody is late, fully tracked or early. A vehicle without a lane
+    counts as not on a ramp.
+
+    Early: tracking began only at the entrance if no track (but those first seen on a ramp, whose entrance is
+    elsewhere) starts beyond the cut-off within the first second. Then vehicles first seen before the last frame of the
+    first fully tracked vehicle (by first frame) that has reached the section's end have unrecorded road ahead of them.
+    The section's end is the median last position of the fully tracked vehicles; a track that ends more than 40 m
+    before it (left by a ramp, or was still on the road when the recording ended) has not reached it.
+
+    Args:
+        vehicles: vehicle_id, first_frame, last_frame, entries, start_x_m, end_x_m, start_lane of one subset.
+        dataset: the subset's.
+        subset: its name.
+        first_frame: the recording's first frame.
+        frame_rate_hz: the source's.
+        on_ramp_lanes: lanes on which a vehicle is not yet on the road that the cut-off is about.
+
+    Returns:
+        `vehicle_starts` (a row per vehicle) and `start_cutoffs` (one row).
+    """
+    after_s = (pl.col("first_frame") - first_frame) / frame_rate_hz
+    on_ramp = pl.col("start_lane").is_in(list(on_ramp_lanes)).fill_null(value=False)
+    starts = vehicles.sort("vehicle_id").with_columns(
+        on_ramp=on_ramp, eligible=(after_s >= ELIGIBLE_AFTER_S) & ~on_ramp
+    )
+    cutoff_m = find_cutoff(starts.filter("eligible")["start_x_m"].to_numpy())
+    beyond = pl.lit(value=False) if cutoff_m is None else pl.col("start_x_m") > cutoff_m
+    without_gap = pl.col("entries") == pl.col("last_frame") - pl.col("first_frame") + 1
+    starts = starts.with_columns(
+        starts_late=pl.col("eligible") & beyond,
+        fully_tracked=pl.col("eligible") & ~beyond & without_gap,
+        tracked_from_within=~pl.col("on_ramp") & (after_s < ELIGIBLE_AFTER_S) & beyond,
+    )
+    road_seen_from_frame = _find_first_arrival(starts)
+    vehicle_starts = starts.with_columns(
+        pl.lit(dataset).alias("dataset"),
+        pl.lit(subset).alias("subset"),
+        early=(pl.col("first_frame") < road_seen_from_frame)
+        if road_seen_from_frame is not None
+        else pl.lit(value=False),
+    )
+    cutoffs = pl.DataFrame(
+        {
+            "dataset": [dataset],
+            "subset": [subset],
+            "cutoff_m": [cutoff_m],
+            "eligible": [starts["eligible"].sum()],
+            "late": [starts["starts_late"].sum()],
+            "fully_tracked": [starts["fully_tracked"].sum()],
+            "road_seen_from_frame": [road_seen_from_frame],
+        },
+        schema=START_CUTOFFS.dtypes,
+    )
+    return VEHICLE_STARTS.conform(vehicle_starts.lazy()).collect(), cutoffs
+
+
+def _find_first_arrival(starts: pl.DataFrame) -> int | None:
+    """Last frame of the first fully tracked vehicle that reached the section's end; None if tracking began everywhere.
+
+    Also None where nobody is fully tracked: then there is nothing to tell how long the road stayed unseen.
+    """
+    if starts["tracked_from_within"].any():
+        return None
+    arrived = starts.filter("fully_tracked").filter(pl.col("end_x_m") >= pl.col("end_x_m").median() - REACH_M)
+    frames = arrived.sort("first_frame", "last_frame").select("last_frame").to_series()
+    return int(frames[0]) if len(frames) else None
+
+
+def estimate_missing_starts(
+    tracks: pl.DataFrame,
+    vehicle_starts: pl.DataFrame,
+    *,
+    dataset: str,
+    subset: str,
+    cutoff_m: float | None,
+    first_frame: int,
+    frame_rate_hz: float,
+) -> pl.DataFrame:
+    """Estimate for each late start the frames between the cut-off and its first entry (DESIGN section 6, points 2, 3).
+
+    For a late start at x: frames = b0 + b1 * speed by ordinary least squares over the fully tracked vehicles that
+    reach x; frames = difference of the linearly interpolated first crossings of the cut-off and of x, speed = the
+    recorded one of the nearer of the two entries around the crossing of x (the earlier one of two equally near).
+    first_missing_frame = max(first_frame, floor(start_frame - max(1, estimate) - 2 sigma)), sigma the sample standard
+    deviation of the references' frames.
+
+    With fewer than 10 references (`method` = mean_speed) the estimate is (x - cutoff) / mean recorded speed of all the
+    subset's entries, and sigma that of the references there are, or a quarter of the estimate where there are fewer
+    than 2. Where that mean speed is not positive nothing can be estimated, and all frames since the recording's first
+    count as missing. Where all references have the same speed the slope is 0; r2 is null where their frames do not
+    vary.
+
+    Args:
+        tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
+        vehicle_starts: vehicle_id, starts_late, fully_tracked, from `judge_starts`.
+        dataset: the subset's.
+        subset: its name.
+        cutoff_m: from `judge_starts`; None = no late starts.
+        first_frame: the recording's first frame.
+        frame_rate_hz: the source's.
+
+    Returns:
+        `missing_starts`.
+    """
+    late = vehicle_starts.filter("starts_late").select("vehicle_id")
+    if cutoff_m is None or late.is_empty():
+        return MISSING_STARTS.empty()
+    first_entries = tracks.join(late, on="vehicle_id", how="semi").sort("vehicle_id", "frame")
+    first_entries = first_entries.unique("vehicle_id", keep="first", maintain_order=True)
+    references = References.gather(tracks, vehicle_starts, cutoff_m)
+    mean_speed_mps = float(tracks["speed_mps"].to_numpy().mean(dtype=np.float64))
+
+    rows = []
+    for entry in first_entries.select("vehicle_id", "lane", "frame", "x_m", "speed_mps").iter_rows(named=True):
+        frames, speeds = references.drive_to(entry["x_m"])
+        sigma = float(frames.std(ddof=1)) if frames.size >= 2 else None
+        if frames.size >= LEAST_REFERENCES:
+            fit = fit_frames(speeds, frames)
+            estimate = fit["intercept_frames"] + fit["slope_frames_per_mps"] * entry["speed_mps"]
+            method = "regression"
+        else:
+            fit, method = {}, "mean_speed"
+            estimate = (
+                (entry["x_m"] - cutoff_m) / mean_speed_mps * frame_rate_hz
+                if mean_speed_mps > 0
+                else float(entry["frame"] - first_frame)
+            )
+        if sigma is None:
+            sigma = estimate / 4
+        first_missing = math.floor(entry["frame"] - max(1.0, estimate) - SIGMAS * sigma)
+        rows.append(
+            {
+                "dataset": dataset,
+                "subset": subset,
+                "vehicle_id": entry["vehicle_id"],
+                "lane": entry["lane"],
+                "cutoff_m": cutoff_m,
+                "start_x_m": entry["x_m"],
+                "start_frame": entry["frame"],
+                "start_speed_mps": entry["speed_mps"],
+                "method": method,
+                "references": frames.size,
+                "frames_estimated": estimate,
+                "frames_sigma": sigma,
+                "first_missing_frame": max(first_frame, first_missing),
+                **fit,
+            }
+        )
+    return pl.DataFrame(rows, schema=MISSING_STARTS.dtypes)
+
+
+def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
+    """Fit frames = b0 + b1 * speed by ordinary least squares.
+
+    Returns:
+        intercept_frames (b0), slope_frames_per_mps (b1; 0 where the speeds do not vary), r2 (None where the frames do
+        not vary).
+    """
+    frames_vary = float(np.ptp(frames)) > 0
+    if not frames_vary or float(np.ptp(speed_mps)) == 0:  # what rounding leaves of a mean would pass for a slope
+        return {
+            "intercept_frames": float(frames.mean()),
+            "slope_frames_per_mps": 0.0,
+            "r2": 0.0 if frames_vary else None,
+        }
+    from sklearn.linear_model import LinearRegression  # imported only where something is fitted
+
+    speeds = speed_mps[:, np.newaxis]
+    line = LinearRegression().fit(speeds, frames)
+    return {
+        "intercept_frames": float(line.intercept_),
+        "slope_frames_per_mps": float(line.coef_[0]),
+        "r2": float(line.score(speeds, frames)),
+    }
+
+
+def find_would_be_neighbors(
+    clock: pl.DataFrame, missing_starts: pl.DataFrame, *, first_frame: int, frame_rate_hz: float, rate_hz: int
+) -> NDArray[np.bool_]:
+    """Tell which entries on the clock have a missing vehicle around them (DESIGN section 6, point 4).
+
+    In its window the missing vehicle drives at constant speed from the cut-off (at first_missing_frame) to its first
+    position (at start_frame), in its first lane. An entry with abs(dx) <= 40 m and abs(lane difference) <= 1 is a
+    would-be neighbor; where either lane is unknown, abs(dx) decides alone. A tick between the window's last frame and
+    start_frame belongs to the window: the vehicle has no entry there either.
+
+    Args:
+        clock: tick, x_m, lane, as `put_on_clock` leaves them.
+        missing_starts: of the same subset.
+        first_frame: the recording's first frame, where tick 0 lies.
+        frame_rate_hz: the source's.
+        rate_hz: the clock's.
+
+    Returns:
+        (N,) in the clock's order.
+    """
+    near = np.zeros(clock.height, np.bool_)
+    if missing_starts.is_empty() or clock.is_empty():
+        return near
+    stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
+    tick = clock["tick"].cast(pl.Int64).to_numpy()
+    order = np.argsort(tick, kind="stable")
+    tick = tick[order]
+    x_m = clock["x_m"].to_numpy()
+    lane = clock["lane"].cast(pl.Float32).fill_null(float("nan")).to_numpy()
+    columns = ("first_missing_frame", "start_frame", "cutoff_m", "start_x_m", "lane")
+    for missing, start, cutoff_m, start_x_m, start_lane in missing_starts.select(columns).iter_rows():
+        ticks = (math.ceil((missing - first_frame) / stride), math.ceil((start - first_frame) / stride))
+        begin, end = np.searchsorted(tick, ticks)
+        rows = order[begin:end]
+        elapsed = first_frame + tick[begin:end] * float(stride) - missing
+        would_be_m = cutoff_m + (start_x_m - cutoff_m) * elapsed / (start - missing)
+        within_reach = np.abs(x_m[rows] - would_be_m) <= REACH_M + ROUNDING_M
+        lane_apart = np.abs(lane[rows] - (float("nan") if start_lane is None else start_lane))
+        near[rows] |= within_reach & ~(lane_apart > 1)
+    return near

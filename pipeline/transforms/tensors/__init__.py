@@ -1,0 +1,1 @@
+"""Training tensors: flat arrays over a protocol's clock, and their index."""

@@ -1,0 +1,75 @@
+"""What `index.json` says of a tensor folder's arrays: where they come from, how large and how exact they are."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.tensors import NOMINAL_LANE_M, TENSORS_VERSION
+
+
+def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[str, Any]:
+    """One entry of the index's `subsets`, of `schemas.tensors.SUBSET_KEYS`.
+
+    Args:
+        facts: dataset, subset, frame_rate_hz, lane_markings_m (null where unknown).
+        tensors: of the subset.
+    """
+    markings = facts["lane_markings_m"]
+    last_lane = len(markings) - 1 if markings else tensors.last_lane
+    return {
+        "dataset": facts["dataset"],
+        "subset": facts["subset"],
+        "frame_rate_hz": facts["frame_rate_hz"],
+        "centre_m": list(tensors.centre_m),
+        "lane_markings_m": list(markings) if markings else None,
+        "last_lane": last_lane,
+        "width_m": float(markings[-1]) if markings else last_lane * NOMINAL_LANE_M,
+    }
+
+
+def describe_tensors(
+    subsets: Sequence[Mapping[str, Any]],
+    splits: pl.DataFrame,
+    protocol: Protocol,
+    *,
+    storage: str,
+    sizes: Mapping[str, int],
+    samples_by_part: Sequence[int],
+    max_error_m: Sequence[float],
+    squared_error_m2: Sequence[float],
+    split_recipe: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What `index.json` holds: `schemas.tensors.INDEX_KEYS`.
+
+    Args:
+        subsets: of `describe_subset`, in the order of `run_subset`.
+        splits: the split's rows of `schemas.splits.SPLITS`; they let an evaluation prove that a model was trained on
+            other data.
+        protocol: of the samples.
+        storage: of positions.
+        sizes: of all arrays, by letter.
+        samples_by_part: in the order of PARTS.
+        max_error_m: greatest rounding error of all positions: along, across.
+        squared_error_m2: sums of the squared rounding errors.
+        split_recipe: digest, parameters, left_out_vehicles; None: not known.
+    """
+    split = splits["split"].unique().sort()
+    return {
+        "version": TENSORS_VERSION,
+        "split": split[0] if len(split) == 1 else protocol.split,
+        "protocol": {**asdict(protocol), "scored_s": list(protocol.scored_s), "digest": protocol.digest},
+        "storage": storage,
+        "max_error_m": [float(error) for error in max_error_m],
+        "rms_error_m": [float(np.sqrt(square / max(1, sizes["N"]))) for square in squared_error_m2],
+        "subsets": [dict(subset) for subset in subsets],
+        "blocks": splits.drop("split").sort("dataset", "subset", "block").to_dicts(),
+        "sizes": dict(sizes),
+        "samples_by_part": {part: int(count) for part, count in zip(PARTS, samples_by_part, strict=True)},
+        "split_recipe": None if split_recipe is None else dict(split_recipe),
+    }

@@ -1,0 +1,74 @@
+"""How positions are stored in tensors: as they are, or as whole steps from the subset's centre in int16."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tracklake.schemas.tensors import STEPS_M
+
+REACH = 2**15 - 1
+"""Steps that int16 reaches either way."""
+
+_ALONG, _ACROSS = "along the road", "across it"
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Positions as they are stored, and what that cost.
+
+    Args:
+        steps: (N, 2) float32 in m, or int16 in steps.
+        centre_m: what int16 counts from: along, across; (0, 0) for float32.
+        max_error_m: greatest difference between what a reader gets and what was given: along, across.
+        squared_error_m2: the sum of its squares.
+    """
+
+    steps: npt.NDArray[np.float32] | npt.NDArray[np.int16]
+    centre_m: tuple[float, float]
+    max_error_m: tuple[float, float]
+    squared_error_m2: tuple[float, float]
+
+
+def store_positions(x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64], *, storage: str, where: str) -> Stored:
+    """Round positions to their storage and measure the error.
+
+    Args:
+        x_m: (N,) along the direction of travel.
+        y_m: (N,) across it.
+        storage: one of `schemas.tensors.POSITION_STORAGES`.
+        where: the subset, for messages.
+
+    Raises:
+        ValueError: a position lies farther from the median than int16 reaches in the storage's steps.
+
+    Source: DESIGN section 9 (decimetres around the median; centimetres only where they fit, else refused).
+    """
+    given = np.stack([x_m, y_m], axis=-1).astype(np.float64, copy=False)
+    if storage not in STEPS_M:
+        steps: npt.NDArray[np.float32] | npt.NDArray[np.int16] = given.astype(np.float32)
+        centre = np.zeros(2)
+        read = steps.astype(np.float64)
+    else:
+        step = np.array(STEPS_M[storage])
+        # The centre is a whole number of steps, so that positions on the steps' grid are stored exactly.
+        centre = np.round(np.median(given, axis=0) / step) * step if len(given) else np.zeros(2)
+        counted = np.round((given - centre) / step)
+        for axis, name in enumerate((_ALONG, _ACROSS)):
+            farthest = float(np.abs(counted[:, axis]).max(initial=0.0))
+            if farthest > REACH:
+                raise ValueError(
+                    f"{where}: positions {name} reach {farthest * step[axis]:.2f} m from the median; int16 in steps of "
+                    f"{step[axis]:g} m reaches {REACH * step[axis]:.2f} m. Set `tensor_positions` to int16-decimetres "
+                    "or float32."
+                )
+        steps = counted.astype(np.int16)
+        read = (centre + counted * step).astype(np.float32).astype(np.float64)
+    error = np.abs(read - given)
+    worst, squares = error.max(axis=0, initial=0.0), (error**2).sum(axis=0)
+    return Stored(
+        steps=steps,
+        centre_m=(float(centre[0]), float(centre[1])),
+        max_error_m=(float(worst[0]), float(worst[1])),
+        squared_error_m2=(float(squares[0]), float(squares[1])),
+    )

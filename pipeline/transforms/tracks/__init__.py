@@ -1,0 +1,1 @@
+"""Raw entries to the canonical frame: orientation, kinematics, gaps and vehicle identities."""

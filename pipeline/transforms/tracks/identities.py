@@ -1,0 +1,228 @@
+"""One id, one vehicle: source ids that stand for several vehicles are told apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from tracklake.pipeline.transforms.tracks.continuity import Moves, follow
+
+INT32_MAX = 2**31 - 1
+ROW = "row_of_entry"
+TRACK = "track_of_entry"
+SAID = "said_by_any_entry_"
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Entries with a vehicle_id that is unique within the subset.
+
+    Args:
+        entries: as given, plus vehicle_id, leader_id and follower_id (null = none), sorted by vehicle_id, frame.
+        ids_split: source ids that stood for more than one vehicle.
+    """
+
+    entries: pl.DataFrame
+    ids_split: int
+
+
+def identify_vehicles(
+    entries: pl.DataFrame,
+    *,
+    constants: Sequence[str],
+    frame_rate_hz: float,
+    announced: str | None = None,
+    one_way: bool = True,
+) -> Identified:
+    """Give every vehicle of a subset an id of its own; no entry is dropped.
+
+    A source id stands for as many vehicles as it has different sets of constants (frames announced, length, width,
+    class: the same in all rows of one vehicle; where one is missing in some rows of an id, they have the one that the
+    others have, if that is one). Within these, it stands for as many as `pipeline.transforms.tracks.continuity` tells
+    apart by how they move: several in one frame, or one that comes back where no vehicle can have got to. An id whose
+    vehicle may just have been out of sight stays one. The vehicle seen first keeps the source's id; the others get ids
+    that nothing in the subset carries or names.
+
+    A leader or follower that names an id that was split is the vehicle of that id in the same frame: for a leader the
+    nearest one ahead, for a follower the nearest one behind, one in the same lane before one in another, and only where
+    there is none, one on the other side. Where no vehicle of that id has an entry in that frame, it is the one whose
+    first and last frame lie either side of it; where that is none or several, nobody can say, and it is null. An id
+    that was not split is left as recorded. Nobody is the leader or follower of itself: where an entry names its own id
+    and no other vehicle has that, there is none.
+
+    Args:
+        entries: source_id, frame, x_m, y_m, speed_mps, lane, leader_source_id, follower_source_id (0 or null = none)
+            and the constants, in any order (sorted by source_id and frame is fastest).
+        constants: columns that are the same in all entries of one vehicle.
+        frame_rate_hz: frames per second.
+        announced: the constant that says how many entries a vehicle has.
+        one_way: all vehicles drive towards larger x_m, and none turns off and comes back.
+    """
+    if not _is_sorted(entries):
+        entries = entries.sort("source_id", "frame")
+    ids = entries["source_id"].to_numpy()
+    vehicle = ids
+    split = pl.Series("source_id", [], entries.schema["source_id"])
+    doubtful = _doubtful(entries, constants, announced, frame_rate_hz)
+    if len(doubtful):
+        some = entries.with_row_index(ROW).filter(pl.col("source_id").is_in(doubtful.implode()))
+        some = _tell_apart(some, constants, announced, frame_rate_hz, one_way)
+        vehicles, split = _name(some, entries)
+        named = some.join(vehicles, on=TRACK, maintain_order="left")
+        vehicle = ids.copy()
+        vehicle[named[ROW].to_numpy()] = named["vehicle_id"].to_numpy()
+    entries = entries.with_columns(pl.Series("vehicle_id", vehicle))
+    entries = entries.with_columns(_other("leader"), _other("follower"))
+    if len(split):
+        entries = entries.with_columns(_in_frame(entries, "leader", split), _in_frame(entries, "follower", split))
+        entries = entries.sort("vehicle_id", "frame")
+    return Identified(entries, len(split))
+
+
+def _is_sorted(entries: pl.DataFrame) -> bool:
+    ids, frames = entries["source_id"].to_numpy(), entries["frame"].to_numpy()
+    return bool(np.all((ids[1:] > ids[:-1]) | ((ids[1:] == ids[:-1]) & (frames[1:] >= frames[:-1]))))
+
+
+def _doubtful(
+    entries: pl.DataFrame, constants: Sequence[str], announced: str | None, frame_rate_hz: float
+) -> pl.Series:
+    """Source ids that may stand for more than one vehicle: a sieve, cheap because all entries pass it."""
+    ids, frames = entries["source_id"].to_numpy(), entries["frame"].to_numpy()
+    same = ids[1:] == ids[:-1]
+    step = np.where(same, frames[1:] - frames[:-1], 1)
+    differs = pl.any_horizontal(pl.col(name).ne_missing(pl.col(name).shift(1)) for name in constants)
+    found = same & (step == 0)
+    if constants:
+        found |= same & entries.select(differs)[1:].to_series().to_numpy()
+    # The few entries after an absence are looked at one by one.
+    after = np.flatnonzero(step > 1) + 1
+    if len(after):
+        moves = _moves(entries[np.stack([after - 1, after], axis=1).ravel()], None, None, frame_rate_hz, one_way=True)
+        first = np.arange(0, 2 * len(after), 2)
+        found[after - 1] |= ~moves.reachable(first, first + 1)
+    doubtful = pl.Series("source_id", ids[1:][found]).unique()
+    if announced is None or not len(after):
+        return doubtful
+    absent = entries.filter(pl.col("source_id").is_in(pl.Series(ids[after]).unique().implode()))
+    counts = absent.group_by("source_id").agg(pl.len().alias("entries"), pl.col(announced).max())
+    too_many = counts.filter(pl.col("entries") >= 1.5 * pl.col(announced), pl.col(announced) > 0)
+    return pl.concat([doubtful, too_many["source_id"]]).unique()
+
+
+def _moves(
+    entries: pl.DataFrame, group: npt.NDArray[np.int64] | None, announced: str | None, rate_hz: float, *, one_way: bool
+) -> Moves:
+    size = entries.height
+    return Moves(
+        group=np.zeros(size, np.int64) if group is None else group,
+        frame=entries["frame"].to_numpy().astype(np.int64),
+        x_m=entries["x_m"].to_numpy(),
+        y_m=entries["y_m"].to_numpy(),
+        speed_mps=entries["speed_mps"].to_numpy(),
+        announced=np.zeros(size, np.int64)
+        if announced is None
+        else entries[announced].fill_null(0).to_numpy().astype(np.int64),
+        frame_rate_hz=rate_hz,
+        one_way=one_way,
+    )
+
+
+def _tell_apart(
+    entries: pl.DataFrame, constants: Sequence[str], announced: str | None, rate_hz: float, one_way: bool
+) -> pl.DataFrame:
+    """Entries of doubtful ids, sorted, with the track of each."""
+    values = {name: pl.col(name).n_unique() - pl.col(name).has_nulls() for name in constants}
+    said = [
+        pl.when(values[name].over("source_id") == 1)
+        .then(pl.col(name).max().over("source_id"))
+        .otherwise(pl.col(name))
+        .alias(SAID + name)
+        for name in constants
+    ]
+    key = ["source_id", *(SAID + name for name in constants)]
+    rest = [name for name in entries.columns if name not in ("source_id", "frame", "x_m", ROW)]
+    # By all columns, so that the order in which entries came decides nothing.
+    entries = entries.with_columns(said).sort(*key, "frame", "x_m", *rest)
+    changes = pl.any_horizontal(pl.col(name).ne_missing(pl.col(name).shift(1)) for name in key)
+    group = entries.select(changes.cast(pl.Int64).cum_sum()).to_series().to_numpy()
+    counted = None if announced is None else SAID + announced
+    track = follow(_moves(entries, group, counted, rate_hz, one_way=one_way))
+    return entries.with_columns(pl.Series(TRACK, track))
+
+
+def _name(some: pl.DataFrame, entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.Series]:
+    """(vehicle_id of each track, source ids that have several)."""
+    vehicles = (
+        some.with_row_index("place")
+        .group_by(TRACK)
+        .agg(pl.col("source_id").first(), first=pl.col("frame").min(), place=pl.col("place").min())
+        .sort("source_id", "first", "place")
+        .with_columns(later=~pl.col("source_id").is_first_distinct())
+    )
+    extra = vehicles.filter("later")
+    split = extra["source_id"].unique()
+    known = vehicles.filter(~pl.col("later")).select(TRACK, vehicle_id="source_id")
+    if extra.is_empty():
+        return known, split
+    return pl.concat([known, extra.select(TRACK, _unused_ids(entries, extra.height).alias("vehicle_id"))]), split
+
+
+def _unused_ids(entries: pl.DataFrame, count: int) -> pl.Series:
+    used = np.concatenate(
+        [
+            entries[name].drop_nulls().unique().to_numpy()
+            for name in ("source_id", "leader_source_id", "follower_source_id")
+        ]
+    )
+    highest = int(used.max())
+    if highest + count <= INT32_MAX:
+        return pl.Series(np.arange(highest + 1, highest + 1 + count, dtype=np.int32))
+    return pl.Series(np.setdiff1d(np.arange(1, used.size + count + 1), used)[:count].astype(np.int32))
+
+
+def _other(role: str) -> pl.Expr:
+    """The id that an entry names, unless it is none or its own."""
+    named = pl.col(f"{role}_source_id")
+    return pl.when((named != 0) & (named != pl.col("source_id"))).then(named).alias(f"{role}_id")
+
+
+def _in_frame(entries: pl.DataFrame, role: str, split: pl.Series) -> pl.Series:
+    """The ids of a role, pointed at vehicles where the source id they name was split."""
+    source, sign = f"{role}_source_id", 1 if role == "leader" else -1
+    several = entries.filter(pl.col("source_id").is_in(split.implode()))
+    present = several.select("frame", "lane", "x_m", pl.col("source_id").alias(source), named="vehicle_id")
+    ahead = sign * (pl.col("x_m_right") - pl.col("x_m"))
+    naming = entries.with_row_index(ROW).select(ROW, "frame", "lane", "x_m", "vehicle_id", source)
+    naming = naming.filter(pl.col(source).is_in(split.implode()))
+    is_other = pl.col("named") != pl.col("vehicle_id")
+    candidates = (
+        naming.join(present, on=["frame", source])
+        .filter(is_other)
+        .select(
+            ROW,
+            "named",
+            wrong_side=ahead <= 0,
+            other_lane=pl.col("lane").ne_missing(pl.col("lane_right")),
+            away_m=ahead.abs(),
+        )
+        .sort(ROW, "wrong_side", "other_lane", "away_m", "named")
+        .unique(ROW, keep="first", maintain_order=True)
+    )
+    spans = several.group_by(pl.col("source_id").alias(source), pl.col("vehicle_id").alias("named")).agg(
+        first=pl.col("frame").min(), last=pl.col("frame").max()
+    )
+    missing = (
+        naming.join(candidates, on=ROW, how="anti")
+        .join(spans, on=source)
+        .filter(is_other, pl.col("frame").is_between("first", "last"))
+        .filter(pl.len().over(ROW) == 1)
+    )
+    return (
+        entries[f"{role}_id"]
+        .scatter(naming[ROW], None)
+        .scatter(candidates[ROW], candidates["named"])
+        .scatter(missing[ROW], missing["named"])
+    )

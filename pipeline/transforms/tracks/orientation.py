@@ -1,0 +1,79 @@
+"""Raw coordinates to the canonical frame: x along the direction of travel, y to the driver's right, front centre.
+
+Formulas: DESIGN section 4, 'Orientation of highD' and 'NGSIM'.
+"""
+
+import polars as pl
+
+from tracklake.schemas.columns import FOOT_M
+
+UPPER, LOWER = 1, 2
+"""highD's drivingDirection: the upper carriageway drives to the left of the image, the lower one to the right."""
+
+EAST, NORTH, WEST, SOUTH = 1, 2, 3, 4
+"""NGSIM's Direction on arterials, where Local_Y runs north and Local_X east."""
+
+DIRECTIONS = {EAST: "east", NORTH: "north", WEST: "west", SOUTH: "south"}
+
+
+def orient_highd(entries: pl.DataFrame, direction: int, upper_m: list[float], lower_m: list[float]) -> pl.DataFrame:
+    """Turn one carriageway's boxes into the canonical frame.
+
+    The box (x, y, width, height) is axis-aligned with y pointing down: on the lower carriageway the front is the right
+    side and the driver's right is down; on the upper one the front is the left side and the driver's right is up.
+
+    Args:
+        entries: highD's names; x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId. One carriageway.
+        direction: UPPER or LOWER.
+        upper_m: y of the upper carriageway's lane markings, from the top.
+        lower_m: y of the lower carriageway's lane markings, from the top.
+
+    Returns:
+        x_m, y_m, lane, speed_mps, accel_mps2, lateral_speed_mps beside the columns given.
+    """
+    upper_lanes = len(upper_m) - 1
+    centre_y = pl.col("y") + pl.col("height") / 2
+    if direction == LOWER:
+        return entries.with_columns(
+            x_m=pl.col("x") + pl.col("width"),
+            y_m=centre_y - lower_m[0],
+            lane=pl.col("laneId") - upper_lanes - 2,
+            speed_mps=pl.col("xVelocity"),
+            accel_mps2=pl.col("xAcceleration"),
+            lateral_speed_mps=pl.col("yVelocity"),
+        )
+    return entries.with_columns(
+        x_m=pl.col("x").max() - pl.col("x"),
+        y_m=upper_m[-1] - centre_y,
+        lane=upper_lanes + 2 - pl.col("laneId"),
+        speed_mps=-pl.col("xVelocity"),
+        accel_mps2=-pl.col("xAcceleration"),
+        lateral_speed_mps=-pl.col("yVelocity"),
+    )
+
+
+def orient_ngsim(entries: pl.DataFrame, direction: int | None) -> pl.DataFrame:
+    """Turn feet into the canonical frame.
+
+    Freeways: Local_X and Local_Y as they are. Arterials: x_m is measured along the direction of travel from the first
+    point recorded in it where that runs against the axis; y_m for north and south from the street's centre line, for
+    the crossing streets from the leftmost point recorded.
+
+    Args:
+        entries: Local_X, Local_Y (feet, front centre), v_Vel, v_Acc. One subset.
+        direction: EAST, NORTH, WEST, SOUTH or, on a freeway, None.
+
+    Returns:
+        x_m, y_m, speed_mps, accel_mps2 beside the columns given.
+    """
+    lateral, along = pl.col("Local_X") * FOOT_M, pl.col("Local_Y") * FOOT_M
+    x_m, y_m = {
+        None: (along, lateral),
+        NORTH: (along, lateral),
+        SOUTH: (along.max() - along, -lateral),
+        EAST: (lateral - lateral.min(), along.max() - along),
+        WEST: (lateral.max() - lateral, along - along.min()),
+    }[direction]
+    return entries.with_columns(
+        x_m=x_m, y_m=y_m, speed_mps=pl.col("v_Vel") * FOOT_M, accel_mps2=pl.col("v_Acc") * FOOT_M
+    )

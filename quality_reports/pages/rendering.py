@@ -1,0 +1,126 @@
+"""How the report's pages are rendered: autoescaped templates, and how single values are put into words."""
+
+import unicodedata
+from importlib.resources import files
+from typing import Any
+
+import jinja2
+
+DASH = "\N{EN DASH}"
+"""What a table shows where a number is unknown or was not computed."""
+
+
+def make_environment() -> jinja2.Environment:
+    """The templates' environment: everything but markup of our own is escaped; a name that is missing is an error."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("tracklake.quality_reports", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        cell=format_cell,
+        visible=visible,
+        integer=_integer,
+        percent=_percent,
+        fixed=_fixed,
+        duration=format_duration,
+        labelled=label_sums,
+        unit=_unit,
+    )
+    return environment
+
+
+def read_style() -> str:
+    """The pages' style sheet."""
+    return (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
+
+
+def label_sums(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with `label`: its subset, or `all` where it sums up the dataset."""
+    return {**row, "label": row["subset"] if row["subset"] is not None else f"all of {row['dataset']}"}
+
+
+def format_cell(value: object, kind: str = "text") -> str:
+    """Put one value of a table into words: a dash for null, thousands separated, shares as percentages.
+
+    Args:
+        value: a plain value.
+        kind: text, int, percent, bool, duration, or f0 to f4 for that many decimals.
+    """
+    if value is None:
+        return DASH
+    if kind == "bool":
+        return "yes" if value else "no"
+    if isinstance(value, int | float) and kind != "text":
+        return _format_number(value, kind)
+    if isinstance(value, list):
+        return visible(", ".join(str(each) for each in value))
+    return visible(str(value))
+
+
+def _format_number(value: float, kind: str) -> str:
+    if kind == "int":
+        return _integer(value)
+    if kind == "percent":
+        return _percent(value)
+    if kind == "duration":
+        return format_duration(value)
+    return _fixed(value, int(kind[1:]))
+
+
+def visible(text: str) -> str:
+    """Show what would not be seen or would rearrange the line: control, format and surrogate characters as escapes."""
+    return "".join(
+        character if unicodedata.category(character) not in {"Cc", "Cf", "Cs"} else ascii(character)[1:-1]
+        for character in text
+    )
+
+
+def format_duration(seconds: float | None) -> str:
+    """Seconds as hours and minutes, minutes, or seconds."""
+    if seconds is None:
+        return DASH
+    if seconds < 120:
+        return f"{seconds:,.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def flatten(value: object, prefix: str = "") -> list[tuple[str, str]]:
+    """A nested mapping as (dotted name, text) pairs, in its own order."""
+    if isinstance(value, dict):
+        return [pair for key, each in value.items() for pair in flatten(each, f"{prefix}.{key}" if prefix else key)]
+    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        return [pair for number, each in enumerate(value) for pair in flatten(each, f"{prefix}[{number}]")]
+    return [(prefix, format_cell(value))]
+
+
+def _unit(symbol: str) -> str:
+    """A unit as it is printed: m/s2 with its exponent raised."""
+    return symbol.replace("s2", "s\N{SUPERSCRIPT TWO}").replace("s3", "s\N{SUPERSCRIPT THREE}")
+
+
+def _integer(value: float | None) -> str:
+    """A whole number with thousands separated."""
+    return DASH if value is None else f"{value:,.0f}"
+
+
+def _fixed(value: float | None, decimals: int) -> str:
+    """A number with fixed decimals and a true minus sign; what rounds to zero carries none."""
+    if value is None:
+        return DASH
+    text = f"{value:,.{decimals}f}"
+    if not any(digit in text for digit in "123456789"):
+        text = text.lstrip("-")
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def _percent(share: float | None) -> str:
+    """A share as a percentage; one too small for two decimals is not shown as nothing."""
+    if share is None:
+        return DASH
+    if 0 < share < 0.00005:
+        return "< 0.01 %"
+    return f"{100 * share:.2f} %"

@@ -1,0 +1,140 @@
+"""One page per subset beside the overview: its facts, findings, time-space diagrams, flow, worst examples, scores."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from tracklake.quality_reports.pages.examples import find_examples
+from tracklake.quality_reports.pages.page_names import name_pages
+from tracklake.quality_reports.pages.rendering import make_environment, read_style
+from tracklake.quality_reports.plots import charts as plots
+from tracklake.quality_reports.plots.flow import draw_flow
+from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
+from tracklake.quality_reports.rules.registry import RULES, Rule
+from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+
+INTERVALS_S = (5.0, 10.0, 30.0, 60.0)
+"""Lengths of the intervals of flow, density and speed: the longest of which a recording has at least FEWEST."""
+FEWEST = 15
+MOST_ROWS = 10
+"""Rows of a table of single vehicles."""
+
+MAIN_KEYS = ("dataset", "subset")
+
+
+def render_pages(
+    connection: Connection,
+    quality: Row,
+    *,
+    rules: Sequence[Rule] = RULES,
+    names: Mapping[tuple[str, str], str] | None = None,
+) -> Iterator[tuple[str, str]]:
+    """Render the subsets' pages one after another, as (file name, html): they are many, and large.
+
+    Args:
+        connection: with the catalog's views and its macros flow_density and lane_changes.
+        quality: the overview's numbers, as `quality_reports.summaries.collect` returns them, of these subsets at least.
+        rules: what validation judged by.
+        names: of the files by (dataset, subset), where there are other subsets besides.
+    """
+    template = make_environment().get_template("subset.html.j2")
+    names = names or name_pages(quality["subsets"])
+    extremes = {rule.name: rule.extreme for rule in rules}
+    declared = [
+        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
+    ]
+    for subset in quality["subsets"]:
+        content = {**_select(quality, subset), **_ask(connection, subset, declared)}
+        yield (
+            names[subset["dataset"], subset["subset"]],
+            template.render(
+                style=Markup(read_style()),
+                subset=subset,
+                provenance=quality["provenance"],
+                **content,
+            ),
+        )
+
+
+def _select(quality: Row, subset: Row) -> Row:
+    """What the overview knows of a subset already."""
+
+    def of_subset(rows: Sequence[Row]) -> list[Row]:
+        return [row for row in rows if all(row[key] == subset[key] for key in MAIN_KEYS)]
+
+    positions = of_subset(quality["starts"]["positions"])
+    starts = of_subset(quality["starts"]["subsets"])
+    return {
+        "rules": [
+            {**{key: rule[key] for key in ("name", "severity", "unit", "meaning")}, **row}
+            for rule in quality["rules"]
+            for row in of_subset(rule["subsets"])
+        ],
+        "starts": starts[0] if starts else None,
+        "start_positions": Markup(plots.draw_start_positions(positions, starts)) if positions and starts else None,
+        "samples": of_subset(quality["samples"]["subsets"]),
+        "parts": of_subset(quality["splits"]["members"]),
+        "subset_scores": next(iter(of_subset(quality["subset_scores"])), None),
+        "per_second": next(iter(of_subset(quality["speeds"]["per_second"])), None),
+        "left_out": [
+            row
+            for row in quality["left_out"]
+            if row["dataset"] == subset["dataset"] and subset["subset"] in row["subsets"]
+        ],
+        "completeness": [
+            row
+            for row in quality["completeness"]
+            if row["dataset"] == subset["dataset"] and row["recording"] == subset["recording"]
+        ],
+    }
+
+
+def _ask(connection: Connection, subset: Row, rules: Sequence[Row]) -> Row:
+    """What only the lake knows, with the plots of it."""
+    where = {key: subset[key] for key in MAIN_KEYS}
+    extent = query(connection, "subset_extent", where)[0]
+    limited = {**where, "most": MOST_ROWS}
+    seconds = choose_interval(subset["seconds"])
+    return {
+        "extent": extent,
+        **_draw(connection, where, extent, seconds),
+        "seconds": seconds,
+        "speeds": query(connection, "subset_speeds", where),
+        "lane_changes": query(connection, "subset_lane_changes", where),
+        "windows": query(connection, "subset_windows", limited),
+        "vehicle_scores": query(connection, "subset_vehicle_scores", limited),
+        "drops": query(connection, "subset_sample_drops", where),
+        "examples": [
+            {**example, "plot": example["plot"] and Markup(example["plot"])}
+            for example in find_examples(connection, where, rules, subset["frame_rate_hz"])
+        ],
+    }
+
+
+def choose_interval(seconds: float) -> float:
+    """The length of the intervals, s, for a recording of so many seconds."""
+    return max((length for length in INTERVALS_S if seconds / length >= FEWEST), default=INTERVALS_S[0])
+
+
+def _draw(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
+    """The subset's plots, as markup; empty or None where it has no entries."""
+    if not extent["entries"]:
+        return {"diagrams": [], "legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
+    grid = lay_grid(extent)
+    cells = query_frame(connection, "subset_time_space", {**where, **grid.parameters()})
+    marks = query_frame(connection, "subset_errors", {**where, **grid.parameters(MARK_COLUMNS, MARK_ROWS)})
+    intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
+    histogram = query(connection, "subset_speed_histogram", where)
+    return {
+        "diagrams": [(lane, Markup(svg)) for lane, svg in draw_lanes(grid, cells, marks)],
+        "legend": Markup(draw_scale(grid)),
+        # Without a section of some length there is neither flow nor density.
+        "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
+        "fundamental": Markup(plots.draw_fundamental(intervals)) if _is_measured(intervals) else None,
+        "speed_histogram": Markup(plots.draw_speed_histogram(histogram, [])),
+    }
+
+
+def _is_measured(intervals: Sequence[Row]) -> bool:
+    return any(row["flow_veh_per_h"] is not None for row in intervals)

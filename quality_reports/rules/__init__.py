@@ -1,0 +1,1 @@
+"""Data-quality rules: declarations, derived columns, evaluation, findings and scores."""

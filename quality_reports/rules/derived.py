@@ -1,0 +1,76 @@
+"""The columns that rules read beside those of `tracks`, each declared once; computed only where a rule reads them."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import polars as pl
+from numpy.typing import NDArray
+
+from tracklake.quality_reports.rules import along_tracks as along
+from tracklake.quality_reports.rules import within_frames as within
+from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
+
+MOTION = ("vehicle_id", "frame", "x_m", "speed_mps", "frame_rate_hz")
+ACCELERATION = ("vehicle_id", "frame", "accel_mps2", "frame_rate_hz")
+PLANE = ("vehicle_id", "frame", "x_m", "y_m", "length_m", "width_m")
+LANE_ORDER = ("vehicle_id", "frame", "x_m", "lane")
+LEADER = ("vehicle_id", "frame", "x_m", "leader_id")
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A column computed from a subset's entries, vehicles and facts.
+
+    Args:
+        build: subset -> one value per entry; NaN becomes null.
+        reads: the columns of `tracks`, `vehicles` and `subsets` that it is made of.
+    """
+
+    build: Callable[[Scene], NDArray[Any] | pl.Series]
+    reads: tuple[str, ...]
+
+
+DERIVED: dict[str, Derived] = {
+    **{name: Derived(partial(along.spread_trait, column=name), ("vehicle_id", name)) for name in VEHICLE_COLUMNS},
+    "jump_m": Derived(along.measure_jumps, MOTION),
+    "frames_skipped": Derived(along.count_skipped_frames, ("vehicle_id", "frame")),
+    "jerk_mps3": Derived(along.measure_jerk, ACCELERATION),
+    "jerk_reversals": Derived(along.count_jerk_reversals, ACCELERATION),
+    "lane_stay_s": Derived(along.measure_lane_stays, ("vehicle_id", "frame", "lane", "frame_rate_hz")),
+    "out_of_lane_m": Derived(along.measure_way_out_of_lane, ("y_m", "lane", "lane_markings_m")),
+    "overlap_m": Derived(within.measure_overlaps, PLANE),
+    "nearest_ahead_m": Derived(within.measure_nearest_ahead, LANE_ORDER),
+    "leader_ahead_m": Derived(within.measure_leader_ahead, LEADER),
+    "leader_in_lane": Derived(within.is_leader_in_lane, ("vehicle_id", "frame", "leader_id", "lane")),
+    "recorded_gap_m": Derived(
+        within.measure_recorded_gaps, ("vehicle_id", "leader_id", "headway_recorded_m", "gap_m", "length_m")
+    ),
+}
+"""By name; what a value is stands with the function that computes it."""
+
+
+def trace(names: Iterable[str]) -> tuple[str, ...]:
+    """The columns of `tracks`, `vehicles` and `subsets` behind these columns, each once, in order of appearance."""
+    found: dict[str, None] = {}
+    for name in names:
+        found.update(dict.fromkeys(DERIVED[name].reads if name in DERIVED else (name,)))
+    return tuple(found)
+
+
+def prepare(scene: Scene, names: Iterable[str]) -> pl.DataFrame:
+    """Add derived columns to a subset's tracks.
+
+    Args:
+        scene: the subset; its tracks have the columns that the wanted ones read.
+        names: columns wanted, of `tracks` or DERIVED; what `tracks` has already is left as it is.
+    """
+    wanted = [name for name in dict.fromkeys(names) if name in DERIVED]
+    return scene.tracks.with_columns(_as_series(name, DERIVED[name].build(scene)) for name in wanted)
+
+
+def _as_series(name: str, values: NDArray[Any] | pl.Series) -> pl.Series:
+    series = values.alias(name) if isinstance(values, pl.Series) else pl.Series(name, values)
+    # A comparison with null is null, which breaks no rule; one with NaN would hold.
+    return series.fill_nan(None) if series.dtype.is_float() else series

@@ -1,0 +1,83 @@
+"""One subset judged: prepared once, checked by every rule that can be, its findings and scores."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import polars as pl
+
+from tracklake.quality_reports.rules.derived import prepare, trace
+from tracklake.quality_reports.rules.findings import find, require_one_sorted_subset
+from tracklake.quality_reports.rules.registry import (
+    RULES,
+    Rule,
+    checkable,
+    columns_needed,
+    columns_read,
+    resolve,
+    select_broken,
+)
+from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene
+from tracklake.quality_reports.rules.scores import COLUMNS_SCORED, score_subset, score_vehicles
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What validation finds out about a subset.
+
+    Args:
+        findings: `findings`.
+        vehicle_scores: `vehicle_scores`.
+        subset_scores: `subset_scores`, one row.
+        unchecked: rules that need a column which the source lacks.
+    """
+
+    findings: pl.DataFrame
+    vehicle_scores: pl.DataFrame
+    subset_scores: pl.DataFrame
+    unchecked: tuple[Rule, ...]
+
+
+def judge(
+    scene: Scene,
+    lacking: Collection[str] = (),
+    thresholds: Mapping[str, float] | None = None,
+    rules: Sequence[Rule] = RULES,
+) -> Judgement:
+    """Judge a subset by the rules.
+
+    Args:
+        scene: its entries, with the columns of `tracks_needed`, vehicles and facts.
+        lacking: columns that its source does not have (see `quality_reports.rules.scene.find_lacking`).
+        thresholds: overrides by name.
+        rules: to judge by.
+
+    Raises:
+        SubsetOrderError: see `quality_reports.rules.findings.find`.
+        ThresholdError: see `quality_reports.rules.registry.resolve`.
+    """
+    limits = resolve(rules, thresholds)
+    require_one_sorted_subset(scene.tracks)
+    checked = checkable(rules, lacking)
+    unchecked = tuple(rule for rule in rules if rule not in checked)
+    scored = [name for name in COLUMNS_SCORED if not set(trace([name])) & set(lacking)]
+    entries = prepare(scene, [*columns_read(checked), *scored])
+    broken = select_broken(entries, checked, _of(checked, limits))
+    vehicle_scores = score_vehicles(entries, broken, _of(broken, limits))
+    return Judgement(
+        findings=find(entries, broken, _of(broken, limits)),
+        vehicle_scores=vehicle_scores,
+        subset_scores=score_subset(entries.drop(set(lacking), strict=False), vehicle_scores, unchecked, limits),
+        unchecked=unchecked,
+    )
+
+
+def tracks_needed(rules: Sequence[Rule] = RULES) -> tuple[str, ...]:
+    """The columns of `tracks` that judging by these rules reads."""
+    elsewhere = {*VEHICLE_COLUMNS, *SUBSET_COLUMNS}
+    names = ["dataset", "subset", "vehicle_id", "frame", *columns_needed(rules), *trace(COLUMNS_SCORED)]
+    return tuple(name for name in dict.fromkeys(names) if name not in elsewhere)
+
+
+def _of(rules: Sequence[Rule], limits: Mapping[str, float]) -> dict[str, float]:
+    """The thresholds of these rules."""
+    return {name: limits[name] for rule in rules for name in rule.defaults}

@@ -1,0 +1,154 @@
+"""Rules about how one vehicle moves: its recorded speed and acceleration, and its positions from entry to entry."""
+
+import polars as pl
+
+from tracklake.quality_reports.rules.rule import Case, Rule, Threshold, recorded
+
+DESIGN = "docs/DESIGN.md, section 5"
+PUNZO = "Punzo, Borzacchiello and Ciuffo (2011)"
+
+
+def differ(first: pl.Expr, second: pl.Expr) -> pl.Expr:
+    """abs(first - second), rounded to 1e-4.
+
+    What differs by the threshold in the source's decimals must not exceed it by the last bit of a Float32.
+    """
+    return (first.cast(pl.Float64) - second.cast(pl.Float64)).abs().round(4)
+
+
+speed_difference = differ(pl.col("speed_mps"), pl.col("speed_10hz_mps"))
+
+HIGH_ACCELERATION = Rule(
+    name="high_acceleration",
+    severity="warning",
+    unit="m/s2",
+    thresholds=(Threshold("high_acceleration_mps2", 3.05, "m/s2"),),
+    meaning="the recorded acceleration exceeds the threshold (10 ft/s²)",
+    source=f"{DESIGN}; implausible accelerations in NGSIM: {PUNZO}",
+    breaks=lambda limits: pl.col("accel_mps2") > recorded(limits["high_acceleration_mps2"]),
+    value=pl.col("accel_mps2"),
+    extreme="max",
+    compared="as recorded, in single precision",
+    case=Case({"accel_mps2": (3.05, 3.06, None)}, breaks=(1,)),
+)
+
+LOW_CONSTANT_SPEED = Rule(
+    name="low_constant_speed",
+    severity="warning",
+    unit="m/s",
+    thresholds=(Threshold("low_constant_speed_mps", 1.52, "m/s"),),
+    meaning="the recorded speed is above zero and at most the threshold (5 ft/s) while the recorded acceleration "
+    "is exactly zero: a frozen measurement rather than a crawling vehicle",
+    source=DESIGN,
+    breaks=lambda limits: (
+        (pl.col("speed_mps") > 0)
+        & (pl.col("speed_mps") <= recorded(limits["low_constant_speed_mps"]))
+        & (pl.col("accel_mps2") == 0)
+    ),
+    value=pl.col("speed_mps"),
+    extreme="min",
+    compared="as recorded, in single precision",
+    case=Case({"speed_mps": (0.0, 1.52, 1.53, 1.0), "accel_mps2": (0.0, 0.0, 0.0, 0.01)}, breaks=(1,)),
+)
+
+BACKWARD = Rule(
+    name="backward",
+    severity="error",
+    unit="m/s",
+    thresholds=(Threshold("backward_mps", 0.0, "m/s"),),
+    meaning="the recorded speed along the direction of travel is below the threshold: the vehicle reverses",
+    source=f"{DESIGN}; known of highD recordings 25, 26 and 36",
+    breaks=lambda limits: pl.col("speed_mps") < recorded(limits["backward_mps"]),
+    value=pl.col("speed_mps"),
+    extreme="min",
+    compared="as recorded, in single precision",
+    case=Case({"speed_mps": (0.0, -0.01)}, breaks=(1,)),
+)
+
+POSITION_JUMP = Rule(
+    name="position_jump",
+    severity="error",
+    unit="m",
+    thresholds=(Threshold("position_jump_m", 2.0, "m"),),
+    meaning="the way driven since the frame before differs by more than the threshold from the mean of the two "
+    "recorded speeds times the time between them; the later entry breaks the rule. Entries behind a frame gap are not "
+    "compared",
+    source=DESIGN,
+    breaks=lambda limits: pl.col("jump_m") > limits["position_jump_m"],
+    value=pl.col("jump_m"),
+    extreme="max",
+    compared="rounded to 1 μm",
+    case=Case(
+        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "x_m": (0.0, 2.8, 0.0, 2.801), "speed_mps": (20.0,) * 4},
+        breaks=(3,),  # 0.8 m are driven in a frame
+    ),
+)
+
+FRAME_GAP = Rule(
+    name="frame_gap",
+    severity="warning",
+    unit="frames",
+    thresholds=(Threshold("frame_gap_frames", 0.0, "frames"),),
+    meaning="more frames than the threshold are missing between the entry and the one before it in the track; the "
+    "entry behind the gap breaks the rule",
+    source=DESIGN,
+    breaks=lambda limits: pl.col("frames_skipped") > limits["frame_gap_frames"],
+    value=pl.col("frames_skipped"),
+    extreme="max",
+    compared="whole numbers",
+    case=Case({"vehicle_id": (1, 1, 1), "frame": (1, 2, 4)}, breaks=(2,)),
+)
+
+SPEED_MISMATCH = Rule(
+    name="speed_mismatch",
+    severity="warning",
+    unit="m/s",
+    thresholds=(Threshold("speed_mismatch_mps", 1.0, "m/s"),),
+    meaning="the recorded speed differs by more than the threshold from the one recomputed from the positions 0.1 s "
+    "before and after. Track ends and entries beside frame gaps have no such positions and are not compared",
+    source=f"{DESIGN}; internal consistency: {PUNZO}",
+    breaks=lambda limits: speed_difference > limits["speed_mismatch_mps"],
+    value=speed_difference,
+    extreme="max",
+    compared="rounded to 0.1 mm/s",
+    case=Case({"speed_mps": (20.01, 20.02, 20.0), "speed_10hz_mps": (19.01, 19.01, None)}, breaks=(1,)),
+)
+
+HIGH_JERK = Rule(
+    name="high_jerk",
+    severity="warning",
+    unit="m/s3",
+    thresholds=(Threshold("high_jerk_mps3", 15.0, "m/s3"),),
+    meaning="the recorded acceleration has changed by more than the threshold times 0.1 s, either way, within the "
+    "0.1 s that end at the entry; at 25 Hz the acceleration 0.1 s before is the mean of those 2 and 3 frames before",
+    source=f"{DESIGN}; the limit of 15 m/s³: {PUNZO}",
+    breaks=lambda limits: pl.col("jerk_mps3").abs() > limits["high_jerk_mps3"],
+    value=pl.col("jerk_mps3").abs(),
+    extreme="max",
+    compared="rounded to 1 mm/s³",
+    case=Case(
+        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "accel_mps2": (0.0, -1.5, 0.0, -1.51)},
+        breaks=(3,),
+        frame_rate_hz=10.0,
+    ),
+)
+
+JERK_FLICKER = Rule(
+    name="jerk_flicker",
+    severity="info",
+    unit="changes",
+    thresholds=(Threshold("jerk_flicker_changes", 1.0, "changes"),),
+    meaning="of the ten jerks, 0.1 s apart, of the second that ends at the entry, the sign changes more often than the "
+    "threshold. A jerk of zero has no sign and is passed over: +, 0, - is one change, +, 0, + none. Behind a track's "
+    "beginning or a frame gap the second is as long as there are entries",
+    source=f"{DESIGN}; drivers reverse jerk at most once in a second: {PUNZO}",
+    breaks=lambda limits: pl.col("jerk_reversals") > limits["jerk_flicker_changes"],
+    value=pl.col("jerk_reversals"),
+    extreme="max",
+    compared="whole numbers; changes of acceleration of less than 0.05 mm/s² are none",
+    case=Case(
+        {"vehicle_id": (1,) * 5, "frame": (1, 2, 3, 4, 5), "accel_mps2": (0.0, 0.1, 0.1, 0.0, 0.1)},
+        breaks=(4,),  # up, level, down, up
+        frame_rate_hz=10.0,
+    ),
+)

@@ -1,0 +1,168 @@
+"""The rules that entries are judged by: the list of them, their thresholds, Pandera checks and documentation."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import pandera.polars as pa
+import polars as pl
+from pandera.errors import SchemaErrors
+
+from tracklake.quality_reports.rules.motion import (
+    BACKWARD,
+    FRAME_GAP,
+    HIGH_ACCELERATION,
+    HIGH_JERK,
+    JERK_FLICKER,
+    LOW_CONSTANT_SPEED,
+    POSITION_JUMP,
+    SPEED_MISMATCH,
+)
+from tracklake.quality_reports.rules.place import (
+    HEADWAY_MISMATCH,
+    IMPLAUSIBLE_SIZE,
+    LANE_FLICKER,
+    LEADER_MISMATCH,
+    NEGATIVE_HEADWAY,
+    NEGATIVE_HEADWAY_RECORDED,
+    OUTSIDE_LANE,
+    OVERLAP,
+)
+from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
+
+__all__ = [
+    "RULES",
+    "Rule",
+    "Severity",
+    "Threshold",
+    "ThresholdError",
+    "as_schema",
+    "checkable",
+    "columns_needed",
+    "columns_read",
+    "describe",
+    "resolve",
+    "select_broken",
+]
+
+RULES: tuple[Rule, ...] = (
+    NEGATIVE_HEADWAY,
+    NEGATIVE_HEADWAY_RECORDED,
+    HIGH_ACCELERATION,
+    LOW_CONSTANT_SPEED,
+    BACKWARD,
+    POSITION_JUMP,
+    FRAME_GAP,
+    OVERLAP,
+    SPEED_MISMATCH,
+    HIGH_JERK,
+    JERK_FLICKER,
+    LANE_FLICKER,
+    LEADER_MISMATCH,
+    HEADWAY_MISMATCH,
+    IMPLAUSIBLE_SIZE,
+    OUTSIDE_LANE,
+)
+"""The rules in use, in the order of the report."""
+
+
+class ThresholdError(ValueError):
+    """A threshold's name is unknown or its value is no number."""
+
+
+def checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
+    """The rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
+    return tuple(rule for rule in rules if not set(rule.columns) & set(lacking))
+
+
+def columns_needed(rules: Sequence[Rule]) -> tuple[str, ...]:
+    """The columns of `tracks`, `vehicles` and `subsets` behind what the rules name."""
+    return tuple(dict.fromkeys(name for rule in rules for name in rule.columns))
+
+
+def columns_read(rules: Sequence[Rule]) -> tuple[str, ...]:
+    """The columns of prepared entries that any of the rules names, derived ones among them."""
+    return tuple(dict.fromkeys(name for rule in rules for name in rule.reads))
+
+
+def resolve(rules: Sequence[Rule], overrides: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Return every threshold of the rules by name: the default unless overridden.
+
+    Raises:
+        ThresholdError: an override's name is no threshold of these rules, or its value is not a finite number.
+    """
+    values = {name: default for rule in rules for name, default in rule.defaults.items()}
+    for name, value in (overrides or {}).items():
+        if name not in values:
+            raise ThresholdError(f"thresholds: unknown name {name!r}; expected one of {', '.join(sorted(values))}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ThresholdError(f"thresholds: {name} must be a finite number, got {value!r}")
+        values[name] = float(value)
+    return values
+
+
+def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> pa.DataFrameSchema:
+    """Return the rules as a Pandera schema over a collected frame of prepared entries: one custom check per rule.
+
+    Validate a DataFrame with `lazy=True` to hear of every rule; a LazyFrame would be checked for dtypes only. The
+    schema says whether entries break a rule; `quality_reports.rules.findings.find` says which, from the same
+    expressions.
+
+    Raises:
+        ThresholdError: see `resolve`.
+    """
+    limits = resolve(rules, thresholds)
+    return pa.DataFrameSchema(
+        checks=[_check(rule, rule.broken(limits)) for rule in rules],
+        name="rules",
+    )
+
+
+def select_broken(
+    entries: pl.DataFrame, rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None
+) -> tuple[Rule, ...]:
+    """The rules that a subset's prepared entries break anywhere, by the Pandera checks.
+
+    Raises:
+        ThresholdError: see `resolve`.
+    """
+    try:
+        as_schema(rules, thresholds).validate(entries, lazy=True)
+    except SchemaErrors as broken:
+        names = {error.check.name for error in broken.schema_errors if error.check is not None}
+        return tuple(rule for rule in rules if rule.name in names)
+    return ()
+
+
+def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
+    """One rule as a Pandera check: true where an entry does not break it."""
+    return pa.Check(
+        lambda data: data.lazyframe.select(~broken),
+        name=rule.name,
+        error=f"{rule.name} ({rule.severity}): {rule.meaning}",
+        n_failure_cases=1,  # Polars counts and writes the entries; Pandera need not collect them
+    )
+
+
+def describe(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
+    """Rows of documentation, one per rule: name, severity, unit, thresholds, meaning, source, columns read.
+
+    Raises:
+        ThresholdError: see `resolve`.
+    """
+    limits = resolve(rules, thresholds)
+    return [
+        {
+            "name": rule.name,
+            "severity": rule.severity,
+            "unit": rule.unit,
+            "thresholds": [
+                {"name": each.name, "value": limits[each.name], "default": each.default, "unit": each.unit}
+                for each in rule.thresholds
+            ],
+            "meaning": rule.meaning,
+            "source": rule.source,
+            "columns": list(rule.columns),
+        }
+        for rule in rules
+    ]

@@ -1,0 +1,118 @@
+"""What a rule is: a declaration from which checks, findings, report rows and documentation follow."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import polars as pl
+
+from tracklake.quality_reports.rules.derived import trace
+
+Severity = Literal["error", "warning", "info"]
+Limits = Mapping[str, float]
+"""Thresholds by name."""
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A number that a rule compares with: a setting.
+
+    Args:
+        name: the setting's name, unit included.
+        default: its value unless set.
+        unit: SI symbol.
+    """
+
+    name: str
+    default: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """A few entries just beyond a rule's thresholds and just within, worked out by hand: its example and its test.
+
+    Args:
+        entries: values by column of `tracks` and `vehicles`, one per entry. What is not said: each entry is of a
+            vehicle of its own (a car, 4 m x 2 m) in frame 1, in lane 1, at x = y = 0, 20 m/s, neither speeding up nor
+            slowing down; anything else is null.
+        breaks: the places of those that break the rule.
+        frame_rate_hz: of the source.
+        lane_markings_m: y_m of the lane markings, leftmost first.
+    """
+
+    entries: Mapping[str, Sequence[Any]]
+    breaks: tuple[int, ...]
+    frame_rate_hz: float = 25.0
+    lane_markings_m: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What is wrong with an entry, declared.
+
+    Args:
+        name: as in `findings.rule`.
+        severity: error = cannot be, warning = hardly can, info = worth knowing.
+        unit: of `value`: an SI symbol, or what is counted.
+        thresholds: the settings it compares with.
+        meaning: when an entry breaks it, in words.
+        source: where the rule or its threshold comes from.
+        breaks: thresholds by name -> boolean expression over prepared entries
+            (`quality_reports.rules.derived.prepare`): the columns of `tracks` and the derived ones. True where an
+            entry breaks the rule; false or null where it does not. A null operand breaks nothing.
+        value: what is reported of a breaking entry, in `unit`; never null where the rule is broken. An expression, or
+            thresholds by name -> expression where it depends on them.
+        extreme: which end of `value` is the worst.
+        compared: how exactly, in words: what equals a threshold in the source's decimals must not exceed it.
+        case: its example.
+    """
+
+    name: str
+    severity: Severity
+    unit: str
+    thresholds: tuple[Threshold, ...]
+    meaning: str
+    source: str
+    breaks: Callable[[Limits], pl.Expr]
+    value: pl.Expr | Callable[[Limits], pl.Expr]
+    extreme: Literal["min", "max"]
+    compared: str
+    case: Case
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Threshold names and defaults."""
+        return {threshold.name: threshold.default for threshold in self.thresholds}
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The columns of prepared entries that its expressions name, derived ones among them."""
+        names = self.breaks(self.defaults).meta.root_names() + self.measure(self.defaults).meta.root_names()
+        return tuple(dict.fromkeys(names))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of `tracks`, `vehicles` and `subsets` that it needs; where one is lacking, it is not checked."""
+        return trace(self.reads)
+
+    def broken(self, thresholds: Limits) -> pl.Expr:
+        """True where an entry breaks the rule, else false, never null.
+
+        Args:
+            thresholds: every threshold of the rule by name (see `quality_reports.rules.registry.resolve`).
+        """
+        return self.breaks(thresholds).fill_null(value=False)
+
+    def measure(self, thresholds: Limits) -> pl.Expr:
+        """The rule's value of an entry, in its unit."""
+        return self.value(thresholds) if callable(self.value) else self.value
+
+
+def recorded(limit: float) -> pl.Expr:
+    """A threshold as Float32, the dtype of recorded speeds, accelerations and sizes.
+
+    They have two decimals at the source, so a value often is the threshold: it must equal it. As Float64 it would not:
+    the Float32 next to 3.05 is less than 3.05 and the one next to 0.1 greater than 0.1.
+    """
+    return pl.lit(limit, dtype=pl.Float32)

@@ -1,0 +1,34 @@
+"""Small highD recordings that go through the whole pipeline in a second or two, and what is counted in them."""
+
+from pathlib import Path
+
+from highd_files import META_HEADER, TRACKS_HEADER, VEHICLES_HEADER, meta_row, track_row
+
+VEHICLES = 8
+"""Of each of the two carriageways."""
+FRAMES = 150
+"""Of each vehicle: 6 s, on its way from the road's one end."""
+ENTRIES = 2 * VEHICLES * FRAMES
+KINDS = ("recordingMeta", "tracksMeta", "tracks")
+
+
+def write_highd(folder: Path, number: str, *, speed_mps: float = 30.0) -> list[Path]:
+    """The three files of one recording: nobody late, nobody near anybody, nobody changing lanes."""
+    vehicles, tracks = [], []
+    for vehicle in range(1, 2 * VEHICLES + 1):
+        upper = vehicle <= VEHICLES
+        first = 1 + 40 * ((vehicle - 1) % VEHICLES)
+        last, direction = first + FRAMES - 1, 1 if upper else 2
+        vehicles.append(f"{vehicle},4,2,{first},{last},{FRAMES},Car,{direction},180.00,30,30,30,-1.00,-1.00,-1.00,0")
+        for frame in range(first, last + 1):
+            driven = speed_mps * (frame - first) / 25
+            x, y, lane, velocity = (400 - driven, 9, 2, -speed_mps) if upper else (driven, 25, 6, speed_mps)
+            tracks.append(track_row(frame, vehicle, (f"{x:.2f}", y, 4, 2), (f"{velocity:.2f}", "0.00"), lane))
+    folder.mkdir(parents=True, exist_ok=True)
+    meta = meta_row(int(number), duration="20.00", vehicles=2 * VEHICLES).replace(",3,1,", f",{2 * VEHICLES},0,")
+    paths = []
+    headers = (META_HEADER, VEHICLES_HEADER, TRACKS_HEADER)
+    for kind, header, rows in zip(KINDS, headers, ([meta], vehicles, tracks), strict=True):
+        paths.append(folder / f"{number}_{kind}.csv")
+        paths[-1].write_text("\n".join([header, *rows]) + "\n")
+    return paths

@@ -1,0 +1,159 @@
+"""`tracklake evaluate` as a user sees it: the table it writes, what it shows, and what it calls a misuse."""
+
+import itertools
+import json
+import re
+from io import StringIO
+from types import SimpleNamespace
+
+import polars as pl
+import pytest
+from rich.console import Console
+
+from tracklake.pipeline.cli.score_tables import _Lines
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.evaluations import EVALUATIONS
+from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.prediction import Prediction
+
+
+@pytest.fixture(scope="module")
+def said(command, lake, tmp_path_factory):
+    """The baseline, by name: nothing is written into the lake."""
+    out = tmp_path_factory.mktemp("scores") / "table.parquet"
+    done = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--out", out, "--json")
+    assert done.code == 0, done.err
+    return json.loads(done.out), pl.read_parquet(out)
+
+
+def test_the_table_holds_measured_rows_and_published_ones_marked_as_such(said):
+    answer, table = said
+    assert answer["rows"] == EVALUATIONS.validate(table, where="here").to_dicts()
+    measured, published = (table.filter(origin=origin) for origin in ("measured", "published"))
+    assert measured["model"].unique().to_list() == ["constant-velocity"]
+    assert set(published["dataset"]) == set(measured["dataset"]) - {"all"}, "of data sets that are evaluated"
+    (headline,) = answer["evaluations"]
+    of_all = measured.filter(dataset="all", group="all", average="samples")
+    assert of_all["seconds"].to_list() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert of_all["rmse_m"].to_list() == [row["rmse_m"] for row in headline["horizons"]]
+    assert of_all["n"].to_list() == [row["n"] for row in headline["horizons"]]
+    assert of_all["latency_ms"].null_count() == 0
+
+
+def test_groups_and_data_sets_add_up(said):
+    measured = said[1].filter(origin="measured", average="samples")
+    everything = measured.filter(dataset="all", group="all").sort("seconds")
+    for groups in (
+        [f"lateral={name}" for name in LATERAL_MANEUVERS],
+        ["longitudinal=normal", "longitudinal=brake"],
+        ["findings=touched", "findings=untouched"],
+        ["findings=error", "findings=no error"],
+    ):
+        rows = measured.filter(pl.col("group").is_in(groups), dataset="all")
+        assert rows.group_by("seconds").agg(pl.col("n").sum()).sort("seconds")["n"].equals(everything["n"])
+    by_dataset = measured.filter(pl.col("dataset") != "all", group="all")
+    assert by_dataset.group_by("seconds").agg(pl.col("n").sum()).sort("seconds")["n"].equals(everything["n"])
+    touched, in_error = (
+        measured.filter(dataset="all", group=f"findings={which}")["n"].to_list() for which in ("touched", "error")
+    )
+    assert min(touched) > 0, "the sample's defects are findings"
+    assert all(of_both <= own for own, of_both in zip(touched, in_error, strict=True))
+
+
+def list_files(lake):
+    """What stands in the lake's folder of evaluations, and when it was written."""
+    return {path: path.stat().st_mtime_ns for path in (lake.root / "evaluations").glob("*")}
+
+
+def test_what_a_person_reads(command, lake):
+    before = list_files(lake)
+    call = ("evaluate", "constant-velocity", "--lake", lake.root)
+    done = command.here(*call)
+    assert done.code == 0, done.err
+    lines = done.out.splitlines()
+    assert re.match(r"eval of flow-balanced, protocol csp \(\w{12}\): [\d,]+ samples of [\d,]+ vehicles$", lines[0])
+    headings = [line.split() for line in lines if "1 s" in line]
+    assert headings == [["1", "s", "2", "s", "3", "s", "4", "s", "5", "s"]] * 3, "of all, and of each data set"
+    counts = [line.split() for line in lines if line.startswith("n ")]
+    assert [len(own) for own in counts] == [6] * 3
+    titles = [lines.index(f"RMSE, m{of}") for of in ("", ", highd", ", ngsim")]
+    assert titles == sorted(titles)
+    pooled, highd, ngsim = (lines[begin:end] for begin, end in itertools.pairwise([*titles, lines.index("at 5 s")]))
+    assert not any("published" in line for line in pooled), "nothing was published of both together"
+    for name, own, other in (("highd", highd, "ngsim"), ("ngsim", ngsim, "highd")):
+        assert any(line.startswith(f"cs-lstm on {name}, published [") for line in own)
+        assert not any(f"on {other}, published" in line for line in own)
+        assert any(line.startswith("[1] ") for line in own), "where it was published"
+    assert list_files(lake) == before, "models that are named are not written into the lake"
+    assert "published" not in command.here(*call, "--no-published").out
+    more = command.here(*call, "--by", "maneuver", "--by", "findings", "--by", "dataset", "--by", "vehicle").out
+    for title in ("lateral=left", "longitudinal=brake", "findings=touched", "highd", "every vehicle counting the same"):
+        assert more.count(f"RMSE, m, {title}\n") == 1
+    assert "findings=error: the vehicle's own findings of severity error or worse" in more
+
+
+def test_every_tick_is_in_the_table_and_the_scored_seconds_on_the_terminal(command, lake, tmp_path):
+    out = tmp_path / "made" / "on the way" / "ticks.csv"
+    call = ("evaluate", "constant-velocity", "constant-velocity", "--lake", lake.root, "--out", out, "--every-tick")
+    done = command.here(*call, "--no-published", COLUMNS="80")
+    assert done.code == 0, done.err
+    of_all = pl.read_csv(out).filter(dataset="all", group="all", average="samples")
+    assert of_all["seconds"].to_list() == [tick / 5 for tick in range(1, 26)], "once, though it was named twice"
+    assert of_all["n"].is_sorted(descending=True)
+    headings = [line.split() for line in done.out.splitlines() if "1 s" in line]
+    assert headings == [["1", "s", "2", "s", "3", "s", "4", "s", "5", "s"]] * 3
+    assert "…" not in done.out
+
+
+@pytest.mark.parametrize("width", [80, 200])
+def test_names_and_figures_are_never_cut_off(width):
+    out = Console(width=width, file=StringIO(), soft_wrap=True)
+    figures = [f"{number}.25" for number in range(10, 18)]
+    names = ["cs-lstm-of-the-first-try", "cs-lstm-of-the-second-try"]
+    lines = _Lines("at 5 s", ["longitudinal RMSE, m", "lateral RMSE, m", *["ADE, m"] * 4, "lateral %", "ms a moment"])
+    for name in names:
+        lines.add(name, figures)
+    lines.print(SimpleNamespace(talks=True, out=out))
+    printed = out.file.getvalue()
+    assert max(map(len, printed.splitlines())) <= width
+    first = printed[printed.index("cs-lstm") :].splitlines()
+    figures_at = [number for number, line in enumerate(first) if "10.25" in line]
+    assert [first[number].split()[-8:] for number in figures_at] == [figures] * 2
+    column = first[0].index("10.25")
+    shown = "".join(line[:column].strip() for line in first)
+    assert shown == "".join(names)
+
+
+@pytest.mark.parametrize("option", ["--nearest=2", "--no-published", "--every-tick", "--part=train"])
+def test_what_the_options_change_is_not_written_into_the_lake(command, lake, option):
+    before = list_files(lake)
+    done = command.here("evaluate", option, "--lake", lake.root)
+    assert done.code == 0, done.err
+    assert "note: the lake keeps the table of the options' defaults; --out writes this one" in done.out
+    assert list_files(lake) == before
+
+
+def test_what_is_not_there_is_named_with_what_is(command, lake):
+    nobody = command.here("evaluate", "nobody", "--lake", lake.root)
+    assert nobody.code == 1
+    assert "no run or model `nobody`: expected one of the runs constant-velocity" in nobody.err
+    other = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--protocol", "grid-2021")
+    assert other.code == 1
+    told = r"another protocol than grid-2021 \(\w{12}\) as it is set now: by csp \(\w{12}\)\. Run `tracklake run`"
+    assert re.search(told, other.err)
+
+
+def test_a_model_that_asks_for_the_future_is_not_scored(command, lake, monkeypatch):
+    monkeypatch.setattr(ConstantVelocity, "predict", lambda _, observed: Prediction(observed.future))
+    done = command.here("evaluate", "constant-velocity", "--lake", lake.root)
+    assert done.code == 1
+    assert "`future` is not known when a model predicts" in done.err
+    assert done.out == ""
+
+
+def test_a_part_without_samples_and_misuses(command, lake, tmp_path):
+    empty = command.here("evaluate", "constant-velocity", "--part", "val", "--lake", lake.root)
+    assert empty.code == 1
+    assert "has no samples in `val`" in empty.err
+    for misuse in (("--out", tmp_path / "table.txt"), ("--by", "weather"), ("--nearest", "-1")):
+        assert command.here("evaluate", *misuse, "--lake", lake.root).code == 2, misuse

@@ -1,0 +1,99 @@
+"""`tracklake train` as a user calls it: what it takes, how it is interrupted, and how one goes on."""
+
+import json
+import shutil
+from contextlib import contextmanager
+
+import pytest
+
+
+@pytest.fixture
+def models(lake):
+    """The lake's folder of runs, as it was, afterwards."""
+    folder = lake.root / "models"
+    before = set(folder.iterdir())
+    yield folder
+    for run in set(folder.iterdir()) - before:
+        shutil.rmtree(run)
+
+
+def test_options_come_to_the_training(command, lake, models):
+    options = ("--epochs", "1", "--samples-per-epoch", "70", "--seed", "3", "--name", "small", "--threads", "1")
+    of_model = ("--set", "hidden=8", "--set", "batch_size=32", "--set", "learning_rate=1", "--set", "optimizer=adam")
+    done = command.here("train", "lstm", "--lake", lake.root, *options, *of_model, "--json")
+    assert done.code == 0, done.err
+    metrics = json.loads(done.out)
+    assert (metrics["steps"], metrics["samples_seen"]) == (3, 70)
+    assert 0 < metrics["data_share"] < 1
+    config = json.loads((models / "small" / "config.json").read_text())
+    assert config["parameters"] == {"hidden": 8}
+    assert config["training"]["seed"] == 3
+    recipe = config["recipe"]
+    assert (recipe["batch_size"], recipe["learning_rate"], recipe["optimizer"]) == (32, 1.0, "adam")
+    said = command.here("train", "lstm", "--lake", lake.root, "--steps", "2", "--name", "small")
+    assert "2 steps in" in said.out
+    assert "samples/s" in said.out
+    assert "reading them took" in said.out
+
+
+def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypatch):
+    steps = ("train", "lstm", "--lake", lake.root, "--name", "half", "--steps", "6", "--set", "hidden=8")
+
+    @contextmanager
+    def interrupting(_terminal, _title):
+        told = []
+
+        def tell(_share, _loss):
+            told.append(1)
+            if len(told) == 2:
+                raise KeyboardInterrupt
+
+        yield tell
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tracklake.pipeline.cli.console.Terminal.measuring", interrupting)
+        stopped = command.here(*steps)
+    assert stopped.code == 1
+    assert "interrupted; the training stands in" in stopped.err
+    assert f"To go on: tracklake train lstm --resume --name half --lake {lake.root}" in stopped.err
+    assert [path.name for path in models.iterdir() if "half" in path.name] == [".half.unfinished"]
+    judged = command.here("evaluate", "half", "--lake", lake.root)
+    assert judged.code == 1
+    assert "was interrupted; finish it first" in judged.err
+    unasked = command.here(*steps)
+    assert unasked.code == 1
+    assert "go on with it (`--resume`), or lose it and begin anew (`--anew`)" in unasked.err
+    other = command.here(*steps, "--resume", "--seed", "9")
+    assert other.code == 1
+    assert "training.seed 0 then, 9 now" in other.err
+    done = command.here("train", "lstm", "--resume", "--name", "half", "--lake", lake.root, "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["steps"] == 6
+    assert command.here(*steps, "--resume").code == 1, "it is done"
+    assert command.here("evaluate", "half", "--lake", lake.root).code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("foo",), "MODEL is one of constant-velocity"),
+        (("constant-velocity",), "constant-velocity does not learn"),
+        (("lstm", "--name", "kalman-cv"), "kalman-cv does not learn"),
+        (("lstm", "--seconds", "1", "--epochs", "2"), "one of seconds, steps, epochs"),
+        (("lstm", "--set", "heads=2"), "lstm has batch_size, learning_rate,"),
+        (("lstm", "--set", "hidden"), "lstm has batch_size"),
+        (("lstm", "--set", "hidden=wide"), "hidden=wide: expected int like 48"),
+        (("lstm", "--set", "hidden=true"), "hidden=true: expected int like 48"),
+        (("lstm", "--set", "batch_size=0"), "expected `batch_size` above 0"),
+    ],
+)
+def test_words_that_mean_nothing_here_are_usage_errors(arguments, told, command, lake):
+    done = command.here("train", *arguments, "--lake", lake.root)
+    assert done.code == 2
+    assert told in " ".join(done.err.replace("│", " ").split())
+
+
+def test_patience_asks_for_a_validation_part(command, lake):
+    done = command.here("train", "lstm", "--patience", "2", "--lake", lake.root)
+    assert done.code == 1
+    assert "patience 2 needs samples in `val`" in done.err

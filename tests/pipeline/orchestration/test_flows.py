@@ -1,0 +1,257 @@
+"""What Prefect adds: tasks that are seen, retries on I/O, results cached by content, deployments."""
+
+import json
+import os
+import shutil
+import sqlite3
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import httpx
+import pytest
+from prefect.client.orchestration import get_client
+from prefect.settings import PREFECT_API_URL
+from prefect.testing.utilities import prefect_test_harness
+
+from tracklake.pipeline.ingest import ingest
+from tracklake.pipeline.lake import connect, load
+from tracklake.pipeline.lake.manifest import Manifest, store
+from tracklake.pipeline.orchestration import flows
+from tracklake.pipeline.sources import SourceError
+
+pytestmark = [
+    pytest.mark.xdist_group("lake"),
+    # Prefect's own, from the server it starts in this process.
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"] = str(tmp_path_factory.mktemp("results"))
+    with prefect_test_harness(server_startup_timeout=120):
+        yield PREFECT_API_URL.value()
+    del os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]
+
+
+@pytest.fixture
+def raw(sample, tmp_path) -> Path:
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    for kind in ("recordingMeta", "tracksMeta", "tracks"):
+        shutil.copy(sample / f"04_{kind}.csv", folder)
+    return folder
+
+
+@pytest.fixture
+def calls(monkeypatch) -> Counter:
+    """How often each recording was really built."""
+    counted: Counter = Counter()
+    real = ingest.build
+
+    def counting(root, job):
+        counted[job.title] += 1
+        return real(root, job)
+
+    monkeypatch.setattr(ingest, "build", counting)
+    return counted
+
+
+def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server, command, raw, tmp_path):
+    done = command("run", raw, "--lake", tmp_path / "lake", "--json", PREFECT_API_URL=server)
+    assert done.code == 0, done.err
+    with get_client(sync_client=True) as client:
+        runs = [run for run in client.read_flow_runs() if run.parameters.get("lake") == str(tmp_path / "lake")]
+        assert [run.state.name for run in runs] == ["Completed"]
+        wanted = {
+            "ingest 04",
+            "validate 04",
+            "repair 04",
+            "assess 04",
+            "samples 04",
+            "split split",
+            "tensors tensors",
+            "pages 04",
+            "report report",
+        }
+        limit = time.monotonic() + 20
+        seen: set[str] = set()
+        while not wanted <= seen and time.monotonic() < limit:  # task runs are recorded by events, a little later
+            seen = {task.name for task in client.read_task_runs(limit=200) if task.flow_run_id == runs[0].id}
+            time.sleep(0.2)
+    assert wanted <= seen
+
+
+@pytest.mark.usefixtures("server")
+def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypatch):
+    tries: Counter = Counter()
+    real = ingest.build
+
+    def flaky(root, job):
+        tries["flaky"] += 1
+        if tries["flaky"] == 1:
+            raise OSError("the share does not answer")
+        return real(root, job)
+
+    monkeypatch.setattr(ingest, "build", flaky)
+    outcome = flows.ingest_files(str(tmp_path / "one"), str(raw))
+    assert outcome["built"] == {"ingest": 1}
+    assert tries["flaky"] == 2
+
+    def hopeless(*_job):
+        tries["hopeless"] += 1
+        raise SourceError("04_tracks.csv, line 7: no good")
+
+    monkeypatch.setattr(ingest, "build", hopeless)
+    outcome = flows.ingest_files(str(tmp_path / "two"), str(raw))
+    assert outcome["refused"] == ["04_tracks.csv, line 7: no good"]
+    assert outcome["built"] == {}
+    assert tries["hopeless"] == 1
+
+
+@pytest.mark.usefixtures("server")
+def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, calls):
+    root = tmp_path / "lake"
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    finished = load(root)
+    # As if the process had died between the task's end and the commit.
+    store(root, Manifest(lake_id=finished.lake_id))
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 1}
+    assert load(root).entries == finished.entries
+    # A cached result whose files are gone is worth nothing.
+    shutil.rmtree(root / "tracks")
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 2}
+    # Another lake is another place, and a changed file another content.
+    assert flows.ingest_files(str(tmp_path / "other"), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 3}
+    with (raw / "04_tracks.csv").open("a") as file:
+        file.write("\n")
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert calls == {"04": 4}
+
+
+def artifacts_of(root: Path) -> dict[str, list]:
+    """The artifacts of a lake's runs by key, without the lake's name and id at its end, oldest first."""
+    ending = f"-lake-{load(root).lake_id[:8]}"
+    with get_client(sync_client=True) as client:
+        found = sorted(client.read_artifacts(), key=lambda artifact: artifact.created)
+    made: dict[str, list] = {}
+    for artifact in found:
+        if artifact.key.endswith(ending):
+            made.setdefault(artifact.key.removesuffix(ending), []).append(artifact)
+    return made
+
+
+@pytest.mark.usefixtures("server")
+def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
+    root = tmp_path / "odd [x](y) \u00e9" / "Lake"
+    outcome = flows.run(str(root), str(raw))
+    assert outcome["failed"] == []
+    assert not any("artifacts" in note for note in outcome["notes"])
+    found = artifacts_of(root)
+    assert {key: len(made) for key, made in found.items()} == dict.fromkeys(
+        [f"tracklake-{what}" for what in ("findings", "subsets", "ingestion", "completeness", "report")], 1
+    )
+    quality = json.loads((root / "reports" / "quality.json").read_text())
+    tables = {key: json.loads(made[0].data) for key, made in found.items() if made[0].type == "table"}
+    rules = {row["rule"]: row for row in tables["tracklake-findings"]}
+    assert list(rules) == [rule["name"] for rule in quality["rules"]]
+    with connect(root) as lake:
+        in_lake = lake.sql("SELECT rule, count(*), sum(entries) FROM findings GROUP BY rule").fetchall()
+        subsets = lake.sql("SELECT subset, vehicles, entries FROM subsets ORDER BY subset").fetchall()
+        files = lake.sql("SELECT file, rows_read, rows_dropped FROM ingest_log ORDER BY file").fetchall()
+        announced = lake.sql("SELECT measure, expected, found FROM completeness ORDER BY authority, measure").fetchall()
+    assert len(in_lake) > 3
+    assert {name: (row["findings"], row["entries"]) for name, row in rules.items() if row["findings"]} == {
+        rule: (runs, entries) for rule, runs, entries in in_lake
+    }
+    shown = tables["tracklake-subsets"]
+    assert [(row["subset"], row["vehicles"], row["entries"]) for row in shown] == subsets
+    per_rule = {rule: sum(row[rule] or 0 for row in shown) for rule in rules}
+    assert {rule: entries for rule, entries in per_rule.items() if entries} == {r: n for r, _, n in in_lake}
+    assert [(row["file"], row["rows_read"], row["rows_dropped"]) for row in tables["tracklake-ingestion"]] == files
+    assert [(row["measure"], row["expected"], row["found"]) for row in tables["tracklake-completeness"]] == announced
+    (link,) = found["tracklake-report"]
+    assert link.data == f"[quality report of Lake]({(root / 'reports' / 'index.html').as_uri()})"
+    assert link.data.count("(") == 1, "what a path's brackets would end is the link"
+    with get_client(sync_client=True) as client:
+        assert client.read_flow_run(link.flow_run_id).state.is_completed()
+    # A run that finds the report up to date shows it again, as that run's; one of another stage does not.
+    flows.quality(str(root))
+    flows.run_stage("validate", str(root))
+    assert {len(made) for made in artifacts_of(root).values()} == {2}
+
+
+@pytest.mark.usefixtures("server")
+@pytest.mark.parametrize(
+    ("failure", "is_ours"),
+    [
+        (httpx.ConnectError("nobody there"), False),
+        (httpx.ReadTimeout(""), False),
+        (503, False),
+        (403, False),
+        (422, True),
+        (TypeError("table is no list"), True),
+    ],
+)
+def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lake, monkeypatch, failure, is_ours):
+    def refuse(**_table):
+        if isinstance(failure, int):
+            request = httpx.Request("POST", "http://prefect/api/artifacts/")
+            raise httpx.HTTPStatusError(f"answered {failure}", request=request, response=httpx.Response(failure))
+        raise failure
+
+    monkeypatch.setattr(flows, "create_table_artifact", refuse)
+    if is_ours:
+        with pytest.raises((httpx.HTTPStatusError, TypeError)):
+            flows._publish(lake.root)
+    else:
+        (note,) = flows._publish(lake.root)
+        says = {503: "answered 503", 403: "answered 403"}.get(failure, str(failure) or "ReadTimeout")
+        assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
+
+
+def test_the_embedded_server_takes_the_artifacts_too(command, raw, tmp_path):
+    home = tmp_path / "prefect"
+    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(home))
+    assert done.code == 0, done.err
+    assert "artifacts" not in done.out
+    with sqlite3.connect(f"file:{home / 'prefect.db'}?mode=ro", uri=True) as database:
+        keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
+    database.close()
+    assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
+
+
+def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):
+    alone = command.alone("serve")
+    assert alone.code == 1
+    assert "PREFECT_API_URL" in alone.err
+    process = replace(command, folder=tmp_path).start("serve", PREFECT_API_URL=server)
+    try:
+        names: set[str] = set()
+        limit = time.monotonic() + 60
+        with get_client(sync_client=True) as client:
+            while len(names) < 3 and process.poll() is None and time.monotonic() < limit:
+                names = {deployment.name for deployment in client.read_deployments()}
+                time.sleep(0.3)
+        assert names == {"run", "ingest", "quality"}
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
+    process = command.alone.start("ingest", raw, "--lake", tmp_path / "lake", "--quiet")
+    limit = time.monotonic() + 60
+    while not (tmp_path / "lake" / "manifest.json").exists() and time.monotonic() < limit:
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    if children.exists():
+        assert children.read_text().split() == []
+    process.kill()
+    process.communicate(timeout=10)  # returns only when nobody holds the pipe any more
+    assert json.loads((tmp_path / "lake" / "manifest.json").read_text())["lake_id"]

@@ -1,0 +1,335 @@
+"""The subsets' pages and the tables beside published figures: from SQL over small lakes, by hand."""
+
+import re
+
+import pytest
+from page_elements import HOSTILE, parse, spoil_texts
+
+from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
+from tracklake.quality_reports.pages.examples import find_examples, write_sql
+from tracklake.quality_reports.pages.page_names import name_pages
+from tracklake.quality_reports.pages.report import build_report
+from tracklake.quality_reports.pages.subsets import choose_interval, render_pages
+from tracklake.quality_reports.published import PUBLISHED
+from tracklake.quality_reports.summaries import query, query_frame
+
+WHERE = {"dataset": "highd", "subset": "01-lower"}
+
+
+def render(lake, provenance=None) -> dict[str, str]:
+    return dict(render_pages(lake, build_report(lake, provenance or {}).quality))
+
+
+def words(html: str) -> str:
+    """What a reader sees, with single blanks."""
+    shown = re.sub(r"<(style|svg)\b.*?</\1>", " ", html, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shown))
+
+
+def driving(vehicle: int, frames: range, lane: int | None, x_m: float, speed: float) -> list[dict]:
+    """A vehicle at constant speed at 25 Hz: at x_m in its first frame."""
+    return [
+        {
+            **WHERE,
+            "vehicle_id": vehicle,
+            "frame": frame,
+            "time_s": (frame - 1) / 25,
+            "x_m": round(x_m + (frame - frames[0]) * speed / 25, 3),
+            "y_m": 0.0,
+            "lane": lane,
+            "speed_mps": speed,
+            "accel_mps2": 0.0,
+        }
+        for frame in frames
+    ]
+
+
+def a_finding(rule: str, vehicle: int, first: int, last: int, worst: float, severity: str = "error") -> dict:
+    about = {"rule": rule, "severity": severity, "vehicle_id": vehicle, "first_frame": first, "last_frame": last}
+    return {**WHERE, **about, "entries": last - first + 1, "worst": worst}
+
+
+@pytest.fixture(scope="module")
+def road(small_lake) -> dict[str, list[dict]]:
+    """The small lake with traffic on 01-lower: vehicle 1 in lane 1 at 20 m/s, 2 from lane 2 to 1 at 10 m/s."""
+    tracks = [
+        *driving(1, range(1, 51), 1, 0.0, 20.0),
+        *driving(2, range(1, 26), 2, 0.0, 10.0),
+        *driving(2, range(26, 51), 1, 10.0, 10.0),
+    ]
+    return {
+        **small_lake,
+        "tracks": tracks + [row for row in small_lake["tracks"] if row["subset"] != "01-lower"],
+        "findings": [
+            a_finding("negative_headway", 1, 3, 7, -2.5),
+            a_finding("negative_headway", 1, 20, 21, -9.0),
+            a_finding("negative_headway", 2, 30, 30, -4.0),
+            a_finding("high_acceleration", 2, 10, 11, 5.0, "warning"),
+        ],
+        "subset_scores": [
+            {
+                **WHERE,
+                "entries": 100,
+                "rules_unchecked": ["outside_lane"],
+                "share_without_error": 0.92,
+                "share_without_warning": 0.9,
+                "vehicles_without_error": 0.0,
+                "vehicles_without_warning": 0.0,
+                "speed_rms_mps": 0.125,
+                "spacings": 0,
+            }
+        ],
+        "vehicle_scores": [
+            {
+                **WHERE,
+                "vehicle_id": 1,
+                "entries": 50,
+                "share_without_error": 0.86,
+                "share_without_warning": 0.86,
+            },
+            {**WHERE, "vehicle_id": 2, "entries": 50, "share_without_error": 1.0, "share_without_warning": 1.0},
+        ],
+    }
+
+
+def test_every_subset_has_a_page_and_the_overview_leads_there(open_lake, small_lake):
+    lake = open_lake(**small_lake)
+    report = build_report(lake, {})
+    pages = dict(render_pages(lake, report.quality))
+    assert list(pages) == ["01-lower.html", "01-upper.html", "peachtree-north.html"]
+    for name, html in pages.items():
+        elements = parse(html).elements
+        assert f'href="subsets/{name}"' in report.html
+        links = {attributes["href"] for tag, attributes in elements if tag == "a"}
+        ids = [attributes["id"] for _, attributes in elements if "id" in attributes]
+        assert len(ids) == len(set(ids))
+        assert {link for link in links if not link.startswith("#")} == {"../index.html", "../index.html#provenance"}
+        assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
+
+
+def test_pages_fetch_nothing(open_lake, road):
+    for html in render(open_lake(**road)).values():
+        for tag, attributes in parse(html).elements:
+            assert tag not in {"script", "link", "img", "iframe"}
+            if tag == "image":
+                assert attributes["href"].startswith("data:image/png;base64,")
+            assert not {"src", "srcset", "xlink:href"} & attributes.keys()
+        assert set(re.findall(r"url\(.", html)) <= {"url(#"}, "but to the legend's gradient, in the page"
+        assert set(re.findall(r"https?://[^\s\"'<>)]+", html)) <= {
+            "http://www.w3.org/2000/svg",
+            "http://www.w3.org/1999/xlink",
+        }
+
+
+def test_no_name_injects_markup_into_a_page(open_lake, road):
+    lake = open_lake(**spoil_texts(road))
+    pages = render(lake, {"lake": HOSTILE, "created": HOSTILE})
+    assert len(pages) == 3
+    for name, html in pages.items():
+        assert re.fullmatch(r"[A-Za-z0-9._~-]+\.html", name)
+        elements = parse(html).elements
+        assert not {tag for tag, _ in elements} & {"script", "img", "iframe", "object", "embed", "link", "form"}
+        assert not [attribute for _, attributes in elements for attribute in attributes if attribute.startswith("on")]
+        assert "&lt;script&gt;alert(1)" in html
+    lower = next(html for name, html in pages.items() if "01-lower" in html and "negative_headway" in html)
+    assert "\u202e" not in re.sub(r"<svg.*?</svg>|<code>.*?</code>", "", lower, flags=re.DOTALL)
+
+
+def test_an_empty_lake_has_no_pages(open_lake):
+    assert render(open_lake()) == {}
+
+
+def test_a_source_without_lanes_has_one_diagram(open_lake, road):
+    unlaned = [{**row, "lane": None} for row in road["tracks"] if row["subset"] == "01-lower"]
+    html = render(open_lake(**{**road, "tracks": unlaned}))["01-lower.html"]
+    assert html.count('aria-label="Time-space diagram"') == 1
+    assert "Entries without a lane" in html
+    assert "None is recorded" in html
+
+
+def test_diagrams_axes_and_units(open_lake, road):
+    html = render(open_lake(**road))["01-lower.html"]
+    assert html.count('aria-label="Time-space diagram"') == 2
+    assert "<strong>Lane 1</strong>" in html
+    for title in (
+        "position (m)",
+        "time since the recording began (s)",
+        "flow (veh/h)",
+        "density (veh/km)",
+        "speed (m/s)",
+        "acceleration (m/s²)",
+        "time (s)",
+        "recorded speed (m/s)",
+        "share of entries (%)",
+        "x of the first entry (m)",
+    ):
+        assert title in html, title
+
+
+def test_only_errors_are_marked(open_lake, road):
+    lake = open_lake(**road)
+    parameters = {**WHERE, "first_s": 0.0, "seconds": 0.4, "first_x_m": 0.0, "metres": 100.0}
+    marks = query_frame(lake, "subset_errors", parameters)
+    # Ten frames a column: vehicle 1 in frames 3-7 and 20-21 (time 0.76 and 0.80), 2 in frame 30 after its change.
+    assert marks.rows() == [(1, 0, 0, 5), (1, 1, 0, 1), (1, 2, 0, 2)]
+
+
+def test_flow_is_edies(open_lake, road):
+    # An interval of 5 s of the 10 s recorded; the section is 0 to 39.2 m. Lane 2: 25 entries at 10 m/s.
+    rows = query(open_lake(**road), "subset_flow", {**WHERE, "seconds": 5.0})
+    lane_2 = next(row for row in rows if row["lane"] == 2 and row["interval"] == 0)
+    assert lane_2["flow_veh_per_h"] == pytest.approx(3600 * (25 * 10 / 25) / (39.2 * 5))
+    assert lane_2["density_veh_per_km"] == pytest.approx(1000 * (25 / 25) / (39.2 * 5))
+    assert lane_2["speed_mps"] == pytest.approx(10.0)
+    assert [choose_interval(seconds) for seconds in (10, 75, 150, 899, 900)] == [5, 5, 10, 30, 60]
+
+
+def test_speeds_and_lane_changes_of_a_subset(open_lake, road):
+    lake = open_lake(**road)
+    whole, lane_1, lane_2 = query(lake, "subset_speeds", WHERE)
+    assert (whole["whole"], whole["entries"], whole["mean_mps"]) == (True, 100, 15.0)
+    assert (lane_1["lane"], lane_1["entries"], lane_1["mean_mps"]) == (1, 75, pytest.approx((50 * 20 + 250) / 75))
+    assert (lane_2["lane"], lane_2["min_mps"], lane_2["max_mps"]) == (2, 10.0, 10.0)
+    (change,) = query(lake, "subset_lane_changes", WHERE)
+    assert (change["from_lane"], change["to_lane"], change["direction"]) == (2, 1, "left")
+    assert (change["changes"], change["vehicles"]) == (1, 1)
+
+
+def test_the_worst_of_each_vehicle_comes_first_and_its_sql_shows_its_entries(open_lake, road):
+    lake = open_lake(**road)
+    rules = [
+        {"name": "high_acceleration", "unit": "m/s2", "extreme": "max"},
+        {"name": "negative_headway", "unit": "m", "extreme": "min"},
+    ]
+    found = find_examples(lake, WHERE, rules, 25.0)
+    assert [(each["rule"], each["vehicle_id"], each["worst"]) for each in found] == [
+        ("high_acceleration", 2, 5.0),
+        ("negative_headway", 1, -9.0),
+        ("negative_headway", 2, -4.0),
+    ]
+    frames = [row["frame"] for row in lake.execute(found[1]["sql"]).pl().to_dicts()]
+    assert frames == [20, 21]
+    assert all("<path" in each["plot"] for each in found)
+
+
+def test_sql_quotes_names(open_lake, road):
+    spoilt = "it's '01'; --"
+    tracks = [{**row, "subset": spoilt} for row in road["tracks"] if row["subset"] == "01-lower"]
+    sql = write_sql({"dataset": "highd", "subset": spoilt}, {"vehicle_id": 2, "first_frame": 25, "last_frame": 27})
+    shown = open_lake(tracks=tracks).execute(sql).pl()
+    assert shown["frame"].to_list() == [25, 26, 27]
+    assert set(shown["vehicle_id"]) == {2}
+
+
+def test_a_page_says_what_is_known_of_its_subset(open_lake, road):
+    pages = {name: words(html) for name, html in render(open_lake(**road)).items()}
+    lower, upper, arterial = pages["01-lower.html"], pages["01-upper.html"], pages["peachtree-north.html"]
+    assert "negative_headway error 2 100.00 % 8 200.00 %" in lower, "8 findings' entries of the 4 that `subsets` tells"
+    assert "Entries without error 92.00 % nor with a warning: 90.00 %" in lower
+    assert "Speed 0.125 m/s" in lower
+    assert "Not checked: outside_lane." in lower
+    assert "The least feasible 1 of 1 vehicles" in lower
+    assert "Cut-off 2 m; 1 of 2 judged starts are late (50.00 %)" in lower
+    assert "The longest 1 of 1" in lower
+    assert "31.00 100 40.00 mean_speed 1 2.00 0.50 25 3.00" in lower, "the repair window of vehicle 2"
+    assert "history csp 4" in lower
+    assert "1 of 1 vehicles reverse" in upper
+    assert "excluded: 1 of 1 vehicles reverse" in upper
+    assert "arterial: these stages are defined for freeways only" in arterial
+    assert "Starts are judged on freeways only." in arterial
+    assert "Not scored" in arterial
+
+
+def test_pages_get_safe_names_of_their_own():
+    names = ["01-upper", "a/b", "..", ".x", "A", "a", "ä b", "x" * 300, "x" * 301, "", "a%2Fb"]
+    found = name_pages([{"dataset": "ngsim", "subset": name} for name in names])
+    files = list(found.values())
+    assert found["ngsim", "01-upper"] == "01-upper.html"
+    assert found["ngsim", "a/b"] == "a~2fb.html"
+    assert found["ngsim", ".."] == "~2e..html"
+    assert len({file.lower() for file in files}) == len(names)
+    for file in files:
+        assert re.fullmatch(r"(?!\.)[A-Za-z0-9._~-]+\.html", file)
+        assert len(file) < 120
+    both = name_pages([{"dataset": dataset, "subset": "01"} for dataset in ("highd", "ngsim")])
+    assert len(set(both.values())) == 2
+
+
+def test_speeds_are_averaged_per_vehicle_and_second(open_lake):
+    def entry(vehicle, frame, speed):
+        return {**WHERE, "vehicle_id": vehicle, "frame": frame, "time_s": frame / 10, "x_m": 0.0, "y_m": 0.0} | {
+            "speed_mps": speed
+        }
+
+    # Vehicle 1: 10 and 20 in second 0, 40 in second 1; vehicle 2: 5 in second 1. 0.3 * 10 / 10 and the like included.
+    tracks = [entry(1, 0, 10.0), entry(1, 9, 20.0), entry(1, 10, 40.0), entry(2, 19, 5.0)]
+    whole, subset = build_report(open_lake(tracks=tracks), {}).quality["speeds"]["per_second"]
+    assert (whole["subset"], subset["subset"]) == (None, "01-lower")
+    for row in (whole, subset):
+        assert (row["seconds"], row["min_mps"], row["median_mps"], row["max_mps"], row["mean_mps"]) == (
+            3,
+            5,
+            15,
+            40,
+            20,
+        )
+
+
+def test_recordings_stand_beside_what_is_announced(report):
+    rows = {row["recording"]: row for row in report.quality["recordings"]}
+    assert list(rows) == ["01", "peachtree"]
+    first = rows["01"]
+    assert (first["subsets"], first["vehicles"], first["entries"], first["seconds"]) == (2, 3, 6, 10.0)
+    assert (first["vehicles_announced"], first["vehicles_announced_by"]) == (3, "recordingMeta")
+    assert (first["entries_announced"], first["entries_found_share"]) == (8, 0.75)
+    assert rows["peachtree"]["entries_announced"] is None
+
+
+def test_the_published_figures_add_up():
+    whole = {figures.dataset: figures for figures in PUBLISHED if figures.recording is None}
+    parts = [figures for figures in PUBLISHED if figures.dataset == "ngsim" and figures.recording is not None]
+    assert len(parts) == 6
+    for name in (
+        "vehicles",
+        "entries",
+        "headway_vehicles",
+        "headway_entries",
+        "acceleration_entries",
+        "slow_vehicles",
+    ):
+        assert sum(getattr(part, name) for part in parts) == getattr(whole["ngsim"], name), name
+    # As the study says of all: 10.51 % of the vehicles with negative headways, 3.30 % at low constant speeds.
+    assert f"{whole['ngsim'].headway_vehicles / whole['ngsim'].vehicles:.2%}" == "10.51%"
+    assert f"{whole['ngsim'].slow_vehicles / whole['ngsim'].vehicles:.2%}" == "3.30%"
+
+
+def test_published_figures_stand_beneath_known_recordings_only(open_lake, small_lake, report):
+    assert not [row for row in compare_speeds(report.quality) if row["is_published"]], "no known recording"
+    known = {"dataset": "ngsim", "subset": "us-101-0750"}
+    arterial = next(row for row in small_lake["subsets"] if row["dataset"] == "ngsim")
+    lake = open_lake(
+        tracks=[{**known, "vehicle_id": 1, "frame": 1, "time_s": 0.0, "x_m": 0.0, "y_m": 0.0, "speed_mps": 5.0}],
+        subsets=[{**arterial, **known, "recording": "us-101-0750", "freeway": True, "columns_missing": []}],
+        subset_status=[{**known, "backward_vehicles": 0, "excluded": False}],
+        findings=[{**a_finding("low_constant_speed", 1, 1, 1, 1.0, "warning"), **known}],
+    )
+    page = build_report(lake, {})
+    speeds = [(row["label"], row["median_mps"]) for row in compare_speeds(page.quality)]
+    assert speeds == [("all of ngsim", 5.0), ("us-101-0750", 5.0), ("published", 11.96)], "of one of six recordings"
+    *_, found, published = count_errors(page.quality)
+    assert (found["slow_vehicles"], found["slow_vehicle_share"]) == (1, 1.0)
+    assert (published["slow_vehicles"], published["slow_vehicle_share"]) == (13, 13 / 2169)
+    assert (published["headway_entries"], published["headway_entry_share"]) == (1912, 1912 / 1180598)
+    assert published["acceleration_vehicles"] is None
+    assert '<th scope="row">published</th>' in page.html
+
+
+def test_every_colour_of_our_own_drawings_follows_the_theme(open_lake, road):
+    html = render(open_lake(**road))["01-lower.html"]
+    style = re.search(r"<style>(.*?)</style>", html, flags=re.DOTALL).group(1)
+    drawings = re.findall(r'<svg role="img" aria-label.*?</svg>', html, flags=re.DOTALL)
+    used = set(re.findall(r"(?:fill|stroke)=\"([^\"]+)\"", "".join(drawings))) - {"none"}
+    # A mark is black with a white rim on a panel that is light in either theme.
+    assert used >= {"#000000", "#ffffff", "#f4f6f8", "#0072b2", "#d55e00"}
+    for colour in used - {"#000000", "#ffffff"}:
+        assert f'[fill="{colour}"]' in style, f"{colour} would be the same on light and dark"

@@ -1,0 +1,194 @@
+"""What is drawn of a moment, held against numbers known by hand; and what models are given before it is looked up."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M, open_moment, sure
+from lane_tracks import open_tracks, track
+
+from tracklake.training.data.observed import FutureInputError, ObservedScene
+from tracklake.training.models.prediction import Prediction
+from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
+from tracklake.training.plots.picture import take_picture
+from tracklake.training.runs.forecasters import Forecaster, open_forecaster
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return open_moment(tmp_path_factory.mktemp("moment"))
+
+
+def places(vehicle, *ticks):
+    return [list(map(float, PLACES[vehicle][tick])) for tick in ticks]
+
+
+def test_a_picture_holds_what_stood_on_the_road(folder):
+    picture = take_picture(folder, OWN_SAMPLE, {})
+    assert (picture.dataset, picture.subset, picture.time_s, picture.rate_hz) == ("highd", "b", 1.0, 2)
+    assert (picture.sample, picture.part, picture.split) == (0, "eval", "mine")
+    assert (picture.lateral, picture.longitudinal) == ("left", "normal")
+    assert (picture.markings_m, picture.marked) == ((0.0, 4.0, 8.0), True)
+    assert [(one.vehicle_id, one.role, one.sample) for one in picture.vehicles] == [
+        (OWN, "own", OWN_SAMPLE),
+        (NEAR, "neighbor", -1),
+        (FAR, "other", FAR_SAMPLE),
+    ]
+    own, near, far = picture.vehicles
+    assert own.history_m.tolist() == places(OWN, 0, 1, 2)
+    assert own.future_m.tolist() == places(OWN, 3, 4, 5, 6)
+    assert near.history_m.tolist() == places(NEAR, 1, 2), "its track began later"
+    assert near.future_m.tolist() == places(NEAR, 3, 4), "its track ended before the horizon"
+    assert far.future_m.tolist() == places(FAR, 3)
+    for one in (own, near):
+        assert (one.length_m, one.width_m) == pytest.approx(SIZES_M[one.vehicle_id])
+    assert np.isnan([far.length_m, far.width_m]).all()
+
+
+def test_the_sample_drawn_comes_first_and_neighbors_are_its_own(folder):
+    picture = take_picture(folder, FAR_SAMPLE, {})
+    assert [(one.vehicle_id, one.role) for one in picture.vehicles] == [(FAR, "own"), (OWN, "other"), (NEAR, "other")]
+    assert picture.longitudinal == "brake"
+
+
+def test_rounded_positions_are_drawn_where_they_were(folder, tmp_path):
+    exact = take_picture(folder, OWN_SAMPLE, {})
+    rounded = take_picture(open_moment(tmp_path, storage="int16-decimetres"), OWN_SAMPLE, {})
+    for one, other in zip(exact.vehicles, rounded.vehicles, strict=True):
+        np.testing.assert_allclose(one.history_m, other.history_m, atol=0.051)
+        np.testing.assert_allclose(one.future_m, other.future_m, atol=0.051)
+
+
+def test_lanes_that_nobody_marked_are_nominal(tmp_path):
+    picture = take_picture(open_moment(tmp_path, markings=None), OWN_SAMPLE, {})
+    assert picture.markings_m == pytest.approx((0.0, 12 * 0.3048, 24 * 0.3048))
+    assert not picture.marked
+
+
+def test_forecasts_stand_on_the_carriageway(folder):
+    """Constant velocity goes on 10 m a tick along lane 2; the other mixes two alternatives, the likelier first."""
+    straight = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
+    found = forecast_samples(folder, [OWN_SAMPLE], [straight, sure()])[OWN_SAMPLE]
+    assert [said.model for said in found] == ["constant-velocity", "sure"]
+    assert found[0].position_m.tolist() == [[30, 6], [40, 6], [50, 6], [60, 6]]
+    assert (found[0].alternatives, found[0].lateral) == ((), None)
+    assert found[1].position_m.tolist() == [[31, 6], [42, 6], [53, 6], [64, 6]]
+    goes, stays = found[1].alternatives
+    assert (goes.probability, stays.probability) == (0.75, 0.25)
+    assert goes.mean_m.tolist() == found[1].position_m.tolist()
+    assert stays.mean_m.tolist() == [[20, 6]] * 4
+    assert goes.sigma_m.tolist() == [[2, 1]] * 4
+    assert goes.correlation == pytest.approx([0.6] * 4)
+    assert found[1].lateral == {"keep": 0.5, "left": 0.375, "right": 0.125}
+    assert found[1].longitudinal == {"normal": 0.75, "brake": 0.25}
+
+
+def test_every_sample_of_the_moment_is_predicted_in_one_batch(folder):
+    model = sure()
+    found = forecast_scene(folder, OWN_SAMPLE, [model])
+    assert {vehicle: said[0].position_m.tolist()[0] for vehicle, said in found.items()} == {OWN: [31, 6], FAR: [111, 2]}
+    assert [len(observed.history) for observed in model.predictor.seen] == [2]
+    picture = take_picture(folder, OWN_SAMPLE, found)
+    assert [len(one.forecasts) for one in picture.vehicles] == [1, 0, 1]
+    assert picture.models == ("sure",)
+
+
+class Everybody:
+    """A model of scenes: whoever is shown moves 7 m a tick; variances 4 and 9 m2, covariance 3 m2."""
+
+    def __init__(self):
+        self.seen = []
+
+    def predict_scene(self, observed):
+        assert type(observed) is ObservedScene
+        self.seen.append(observed)
+        moved = np.zeros((*observed.vehicle_mask.shape, 4, 2), np.float32)
+        moved[..., 0] = 7 * np.arange(1, 5)
+        covariance = np.broadcast_to(np.float32([[4, 3], [3, 9]]), (*moved.shape, 2))
+        return SceneForecast(observed.history[:, :, -1:] + moved, covariance, observed.vehicle_mask)
+
+
+@dataclass
+class SceneForecast:
+    mean_m: np.ndarray
+    covariance_m2: np.ndarray
+    vehicle_mask: np.ndarray
+
+
+def test_a_model_of_scenes_is_asked_once_about_everybody_it_is_shown(folder):
+    model = Everybody()
+    found = forecast_scene(folder, OWN_SAMPLE, [Forecaster("everybody", model, "scene"), sure()])
+    assert len(model.seen) == 1
+    assert {vehicle: [one.model for one in said] for vehicle, said in found.items()} == {
+        OWN: ["everybody", "sure"],
+        NEAR: ["everybody"],
+        FAR: ["everybody", "sure"],
+    }
+    for vehicle, (x_m, y_m) in ((OWN, (20, 6)), (NEAR, (25, 2)), (FAR, (100, 2))):
+        said = found[vehicle][0]
+        assert said.position_m.tolist() == [[x_m + 7 * tick, y_m] for tick in range(1, 5)]
+        [only] = said.alternatives
+        assert only.sigma_m.tolist() == [[2, 3]] * 4
+        assert only.correlation == pytest.approx([0.5] * 4)
+
+
+@pytest.mark.parametrize(("nearest", "told"), [(1, 2), (10, 11), (11, 12), (None, 14)])
+def test_a_model_of_scenes_is_shown_as_many_as_asked_for_or_everyone(tmp_path, nearest, told):
+    """Vehicles 0 to 13, each 7 m behind the one before; they are asked about the first, by the sample of tick 2."""
+    rows = [row for number in range(14) for row in track(number, [2.0] * 8, x_m=[90 - 7 * number] * 8)]
+    crowd, model = open_tracks(tmp_path / "t", {"a": rows}), Everybody()
+    found = forecast_scene(crowd, 0, [Forecaster("everybody", model, "scene")], nearest=nearest)
+    assert {vehicle: said[0].position_m[0].tolist() for vehicle, said in found.items()} == {
+        number: [90 - 7 * number + 7, 2] for number in range(told)
+    }
+    assert model.seen[0].vehicle_mask.tolist() == [[True] * told]
+
+
+class Curious:
+    def predict(self, observed):
+        return Prediction(observed.future)
+
+
+class Nowhere:
+    def predict(self, observed):
+        return Prediction(np.full((len(observed.history), 4, 2), np.nan, np.float32))
+
+
+def test_models_are_not_shown_what_came(folder):
+    with pytest.raises(FutureInputError, match="`future` is not known when a model predicts"):
+        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("curious", Curious(), "grid")])
+
+
+def test_places_that_are_no_numbers_are_refused(folder):
+    with pytest.raises(ValueError, match="`nan` predicts positions that are not finite numbers"):
+        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("nan", Nowhere(), "grid")])
+
+
+def test_the_numbers_drawn_are_plain(folder):
+    said = forecast_samples(folder, [OWN_SAMPLE], [sure()])
+    told = json.loads(json.dumps(take_picture(folder, OWN_SAMPLE, {OWN: said[OWN_SAMPLE]}).to_dict(), allow_nan=False))
+    own, near, far = told["vehicles"]
+    assert (told["sample"], told["time_s"], told["markings_m"]) == (OWN_SAMPLE, 1.0, [0, 4, 8])
+    assert own["truth_m"] == places(OWN, 3, 4, 5, 6)
+    assert own["predictions"][0]["alternatives"][1]["mean_m"] == [[20, 6]] * 4
+    assert own["predictions"][0]["alternatives"][0]["sigma_m"] == [[2, 1]] * 4
+    assert (near["sample"], near["predictions"]) == (None, [])
+    assert (far["length_m"], far["width_m"]) == (None, None)
+
+
+@pytest.mark.parametrize("number", [-1, 2])
+def test_numbers_of_no_sample_are_refused(folder, number):
+    with pytest.raises(IndexError, match=f"samples are numbered 0 to 1, got {number}"):
+        take_picture(folder, number, {})
+
+
+def test_names_of_no_model_or_run_are_told_what_there_is(folder, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "config.json").touch()
+    with pytest.raises(
+        ValueError, match=r"no run or model `cv`: expected one of the runs mine, or of .*constant-velocity"
+    ):
+        open_forecaster("cv", folder, tmp_path, frozenset({"eval"}))
+    with pytest.raises(FileNotFoundError, match="run `tracklake train lstm` first"):
+        open_forecaster("lstm", folder, tmp_path, frozenset({"eval"}))

@@ -1,0 +1,32 @@
+"""Freed memory is kept by the process that asked for it."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+REPEATED = """
+import resource
+from tracklake.training.runs.memory import keep_freed_memory
+
+done = keep_freed_memory()
+
+def step():
+    return [b"x" * 20_000_000 for _ in range(3)]  # 60 MB, all freed together
+
+for _ in range(3):
+    step()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(5):
+    step()
+print(done, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc is told anything")
+def test_repeated_steps_are_given_no_new_pages():
+    run = subprocess.run([sys.executable, "-c", REPEATED], capture_output=True, text=True, check=True)
+    done, faults = run.stdout.split()
+    assert done == "True"
+    assert int(faults) < 1000  # some 50,000 where nothing is kept

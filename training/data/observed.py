@@ -1,0 +1,122 @@
+"""What a model may see of samples, and what it is to predict, kept apart: a prediction is never given the truth."""
+
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, Self, TypeVar
+
+from tracklake.training.data.batches import Batch
+
+if TYPE_CHECKING:
+    from tracklake.training.data.torch_batches import TorchBatch
+
+Array = TypeVar("Array")
+"""NumPy's arrays or torch's tensors; shapes, units and order are the same."""
+
+
+class FutureInputError(AttributeError):
+    """A model asked for what is known only after the moment at which it predicts."""
+
+
+class _Arrays:
+    """Arrays of one kind, by name; every heir is a dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def each(self, change: Callable[[Any], Any]) -> Self:
+        """The same with every array changed, for instance to a tensor on a device."""
+        return type(self)(**{own.name: change(getattr(self, own.name)) for own in fields(self)})
+
+
+class _Blind(_Arrays):
+    """Arrays known at the moment of prediction; asking for any other is refused."""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        """Called for what is not there.
+
+        Raises:
+            FutureInputError: always, but for Python's own names.
+        """
+        if name.startswith("__"):
+            raise AttributeError(name)
+        known = ", ".join(own.name for own in fields(self))
+        raise FutureInputError(
+            f"`{name}` is not known when a model predicts: it sees {known}. Futures and maneuvers are for `loss` alone"
+        )
+
+
+@dataclass(frozen=True)
+class Observed(_Blind, Generic[Array]):
+    """Samples with the neighbors in their grids. B samples, K neighbors of all of them, H ticks of history.
+
+    Positions in m, relative to the sample's last one: along the direction of travel, and across, positive to the right.
+
+    Args:
+        history: (B, H, 2) the last one is (0, 0).
+        neighbor_history: (K, H, 2) where masked, the earliest known position again.
+        neighbor_mask: (K, H) True where the position is known.
+        neighbor_sample: (K,) position in the batch, increasing.
+        neighbor_cell: (K,) cell 0 to 38 of the 13 x 3 grid, increasing within a sample.
+    """
+
+    history: Array
+    neighbor_history: Array
+    neighbor_mask: Array
+    neighbor_sample: Array
+    neighbor_cell: Array
+
+
+@dataclass(frozen=True)
+class ObservedScene(_Blind, Generic[Array]):
+    """Samples (egos) with the vehicles nearest to them, whatever their lanes. B egos, V vehicles of each, H ticks.
+
+    Positions in m, all of a scene relative to its ego's last one, axes as in `Observed`. Vehicle 0 is the ego; the
+    others stand in order of distance; where there are fewer, rows are masked and hold zeros.
+
+    Args:
+        history: (B, V, H, 2) where a tick is masked, the vehicle's earliest known position again.
+        history_mask: (B, V, H) True where the position is known; the last one is, of every vehicle that is there.
+        vehicle_mask: (B, V) True where there is a vehicle; the first always is.
+        size_m: (B, V, 2) length and width; 0 where unknown.
+        lanes: (B, 3, 3) lanes left of, under and right of the ego: the centre's offset from the ego's last position
+            (m, positive to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is
+            knowledge of the map, not of the moment: where no markings are known, the rightmost lane is the highest that
+            anybody drives in during the whole recording (`last_lane` of `schemas.tensors`), so that a lane may exist
+            here because somebody is in it later.
+    """
+
+    history: Array
+    history_mask: Array
+    vehicle_mask: Array
+    size_m: Array
+    lanes: Array
+
+
+@dataclass(frozen=True)
+class Truth(_Arrays, Generic[Array]):
+    """What came: for `loss` and for scores, never for a prediction.
+
+    Args:
+        future: (B, F, 2) in m, axes and origin as the history's; of scenes (B, V, F, 2).
+        future_mask: (B, F) True where it is known; of scenes (B, V, F).
+        lateral: (B,) position in `schemas.columns.LATERAL_MANEUVERS`.
+        longitudinal: (B,) position in `LONGITUDINAL_MANEUVERS`.
+    """
+
+    future: Array
+    future_mask: Array
+    lateral: Array
+    longitudinal: Array
+
+
+def part_batch(batch: "Batch | TorchBatch") -> tuple[Observed[Any], Truth[Any]]:
+    """A batch as what may be seen of it and what is to be predicted; nothing is copied.
+
+    Raises:
+        ValueError: an absolute batch.
+    """
+    if batch.absolute:
+        raise ValueError("models see positions relative to the sample's last one: gather without `absolute`")
+    return (
+        Observed(**{own.name: getattr(batch, own.name) for own in fields(Observed)}),
+        Truth(**{own.name: getattr(batch, own.name) for own in fields(Truth)}),
+    )

@@ -1,0 +1,146 @@
+"""Figures that others published, to stand beside measured ones and never among them.
+
+They are of other data, other splits and other ways to count, and are copied here as printed. What a publication does
+not say (how many samples, likelihoods in our unit) stays null.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import polars as pl
+
+from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
+
+DEO_2018 = (
+    "Deo and Trivedi 2018, Convolutional Social Pooling for Vehicle Trajectory Prediction, IEEE/CVF CVPR Workshops, "
+    "1468-1476, doi 10.1109/CVPRW.2018.00196"
+)
+VALIDATION_2020 = "the study that validates convolutional social pooling on NGSIM and highD (2020)"
+MESSAOUD_2021 = (
+    "Messaoud, Yahiaoui, Verroust-Blondet and Nashashibi 2021, Attention Based Vehicle Trajectory Prediction, IEEE "
+    "Transactions on Intelligent Vehicles 6(1), 175-185, doi 10.1109/TIV.2020.2991952"
+)
+CHEN_2022 = (
+    "Chen, Zhang, Zhao, Hu, Tan and Yang 2022, Intention-Aware Vehicle Trajectory Prediction Based on Spatial-Temporal "
+    "Dynamic Attention Network for Internet of Vehicles, IEEE Transactions on Intelligent Transportation Systems "
+    "23(10), 19471-19483, doi 10.1109/TITS.2022.3170551"
+)
+QUOTED_ON_HIGHD = "convolutional social pooling on highD, as later comparisons quote it"
+KIM_2020 = (
+    "Kim, Kim, Kim, Cho and Huh 2020, Multi-Head Attention based Probabilistic Vehicle Trajectory Prediction, IEEE "
+    "Intelligent Vehicles Symposium, arXiv 2004.03842; its split is unpublished"
+)
+CHOI_2021 = (
+    "Choi, Yim, Baek and Lee 2021, Machine Learning-Based Vehicle Trajectory Prediction Using V2V Communications and "
+    "On-Board Sensors, Electronics 10(4), 420, doi 10.3390/electronics10040420; 932 trajectories of the authors' own "
+    "vehicles"
+)
+
+OWN_DATA = "own"
+"""The dataset of figures on recordings that only their authors have."""
+
+_SECONDS = (1.0, 2.0, 3.0, 4.0, 5.0)
+_HALVES = (0.5, 1.0, 1.5, 2.0)
+
+
+@dataclass(frozen=True)
+class Published:
+    """One line of a published table.
+
+    Args:
+        model: the registry's name of it; the publication's where the registry has none.
+        reference: where it stands.
+        dataset: ngsim, highd, or own (the authors').
+        protocols: that it is put beside.
+        seconds: horizons.
+        figures: by column of `schemas.evaluations.FIGURES`, a value for each horizon.
+    """
+
+    model: str
+    reference: str
+    dataset: str
+    protocols: tuple[str, ...]
+    seconds: tuple[float, ...]
+    figures: dict[str, tuple[float, ...]]
+
+
+def _rmse(model: str, reference: str, dataset: str, *rmse_m: float) -> Published:
+    """Radial errors at 1 to 5 s; on NGSIM by the ids' split, on highD by flow."""
+    protocol = "csp-2018" if dataset == "ngsim" else "highd-flow-balanced"
+    return Published(model, reference, dataset, ("csp", protocol), _SECONDS, {"rmse_m": rmse_m})
+
+
+def _both_axes(model: str, longitudinal: tuple[float, ...], lateral: tuple[float, ...]) -> Published:
+    """Errors along and across the road at 1 to 3 s."""
+    figures = {"rmse_longitudinal_m": longitudinal, "rmse_lateral_m": lateral}
+    return Published(model, KIM_2020, "highd", ("mha-2020",), _SECONDS[:3], figures)
+
+
+def _mae(model: str, *mae_m: float) -> Published:
+    """Mean errors every half second."""
+    return Published(model, CHOI_2021, OWN_DATA, ("grid-2021",), _HALVES, {"mae_m": mae_m})
+
+
+PUBLISHED = (
+    _rmse("constant-velocity", DEO_2018, "ngsim", 0.73, 1.78, 3.13, 4.78, 6.68),
+    _rmse("v-lstm", DEO_2018, "ngsim", 0.68, 1.65, 2.91, 4.46, 6.27),
+    _rmse("cs-lstm", DEO_2018, "ngsim", 0.61, 1.27, 2.09, 3.10, 4.37),
+    _rmse("cs-lstm-m", DEO_2018, "ngsim", 0.62, 1.29, 2.13, 3.20, 4.52),
+    _rmse("cs-lstm-m", VALIDATION_2020, "ngsim", 0.59, 1.29, 2.14, 3.18, 4.48),
+    _rmse("MHA-LSTM", MESSAOUD_2021, "ngsim", 0.41, 1.01, 1.74, 2.67, 3.83),
+    _rmse("STDAN", CHEN_2022, "ngsim", 0.42, 1.01, 1.69, 2.56, 3.67),
+    _rmse("cs-lstm", QUOTED_ON_HIGHD, "highd", 0.22, 0.61, 1.24, 2.10, 3.27),
+    _rmse("cs-lstm-m", VALIDATION_2020, "highd", 0.26, 0.78, 1.54, 2.69, 7.85),
+    _both_axes("kalman-cv", (0.71, 1.67, 3.41), (0.17, 0.55, 1.31)),
+    _both_axes("v-lstm", (0.72, 1.94, 3.81), (0.13, 0.31, 0.65)),
+    _both_axes("lstm-encoder-decoder", (0.69, 1.77, 3.21), (0.14, 0.32, 0.58)),
+    _both_axes("attention-h2", (0.59, 0.77, 1.31), (0.08, 0.14, 0.30)),
+    _both_axes("attention-h4", (0.43, 0.47, 0.89), (0.04, 0.06, 0.11)),
+    _both_axes("attention-h8", (0.54, 0.58, 1.09), (0.07, 0.11, 0.18)),
+    _mae("ctrv", 0.21, 0.52, 1.84, 2.11),
+    _mae("stacked-lstm", 0.62, 1.19, 1.42, 1.81),
+    _mae("lstm-encoder-decoder", 0.58, 0.82, 1.23, 1.47),
+)
+"""Line by line. The validating study's own line is of the model with maneuvers: it gives braking accuracies as well."""
+
+BRAKING_ACCURACY = {"ngsim": 0.8929, "highd": 0.9994}
+"""Of the validating study (longitudinal maneuvers), by dataset: put into its lines, the same at every horizon."""
+
+CELL_ACCURACY_S = _HALVES
+CELL_ACCURACY: dict[str, tuple[float, ...]] = {
+    "ctrv": (0.8721, 0.8832, 0.8224, 0.8093),
+    "stacked-lstm": (0.8674, 0.8881, 0.8701, 0.8684),
+    "lstm-encoder-decoder + forest": (0.8718, 0.8946, 0.9183, 0.9087),
+}
+"""Share of instances put into the right one of nine cells, at CELL_ACCURACY_S (Choi et al. 2021)."""
+
+
+def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
+    """What was published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
+
+    Args:
+        protocol: its name; one that nothing was published for has no rows.
+        datasets: those of the part that is evaluated: figures of other public recordings are left out. None: all.
+    """
+    rows: list[dict[str, Any]] = []
+    for line in PUBLISHED:
+        if protocol not in line.protocols or (datasets is not None and line.dataset not in (*datasets, OWN_DATA)):
+            continue
+        braking = BRAKING_ACCURACY[line.dataset] if line.reference == VALIDATION_2020 else None
+        for at, seconds in enumerate(line.seconds):
+            rows.append(
+                {
+                    "protocol": protocol,
+                    "origin": "published",
+                    "model": line.model,
+                    "reference": line.reference,
+                    "dataset": line.dataset,
+                    "group": EVERYTHING,
+                    "average": "samples",
+                    "seconds": seconds,
+                    "longitudinal_accuracy": braking,
+                }
+                | {name: values[at] for name, values in line.figures.items()}
+            )
+    found = pl.DataFrame(rows, schema=EVALUATIONS.dtypes) if rows else EVALUATIONS.empty()
+    return found.sort(EVALUATIONS.key)

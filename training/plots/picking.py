@@ -1,0 +1,142 @@
+"""Which samples are drawn: by vehicle and time, at random among those of a kind, or where a model is furthest off."""
+
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from tracklake.training.data.batches import Flags, Integers
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models.inputs import read_samples, truth_of_ego
+from tracklake.training.runs.forecasters import Forecaster
+
+Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
+PICKS: tuple[Pick, ...] = get_args(Pick)
+
+MOST_LOOKED_AT = 20_000
+"""Samples that the worst is looked for among; of more, so many are drawn."""
+BATCH_SIZE = 2048
+
+
+class NoSampleError(ValueError):
+    """There is no sample of the kind, vehicle or time asked for."""
+
+
+def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
+    """The number of a vehicle's sample at a time, or less than half a tick from it.
+
+    Args:
+        folder: where.
+        vehicle: `SUBSET:ID` or `DATASET/SUBSET:ID`.
+        time_s: since the recording began.
+
+    Raises:
+        NoSampleError: no such subset, vehicle or time; the nearest are named.
+        ValueError: the vehicle is not written so.
+    """
+    name, colon, number = vehicle.rpartition(":")
+    if not colon or not name or not number.isascii() or not number.isdigit():
+        raise ValueError(f"expected a vehicle as SUBSET:ID, for instance 02-lower:21, got `{vehicle}`")
+    full = [f"{subset['dataset']}/{subset['subset']}" for subset in folder.index["subsets"]]
+    subsets = [at for at, known in enumerate(full) if name in (known, known.partition("/")[2])]
+    if not subsets:
+        raise NoSampleError(f"{folder.path}: no subset `{name}`: expected one of {', '.join(sorted(full))}")
+    if len(subsets) > 1:
+        raise NoSampleError(
+            f"{folder.path}: several subsets `{name}`: name one of {', '.join(full[at] for at in subsets)}"
+        )
+    run = folder.runs_of(folder.sample_row)
+    inside = np.flatnonzero(folder.run_subset[run] == subsets[0])
+    ids = folder.run_vehicle_id[run[inside]]
+    own = inside[ids == int(number)]
+    if len(own) == 0:
+        known = np.unique(ids)
+        near = np.sort(known[np.argsort(np.abs(known - float(number)), kind="stable")[:5]])
+        nearest = ", ".join(map(str, near)) or "none"
+        raise NoSampleError(
+            f"{folder.path}: no sample of vehicle {number} in {name}; the nearest ids with any: {nearest}"
+        )
+    rate_hz = folder.protocol.rate_hz
+    rows = folder.sample_row[own].astype(np.int64)
+    times_s = (folder.run_first_tick[run[own]] + rows - folder.run_first_row[run[own]]) / rate_hz
+    best = int(np.argmin(np.abs(times_s - time_s)))
+    if not abs(times_s[best] - time_s) < 0.5 / rate_hz:
+        raise NoSampleError(
+            f"{folder.path}: no sample of vehicle {number} in {name} at {time_s:g} s: it has {len(own):,} from "
+            f"{times_s.min():g} to {times_s.max():g} s; the nearest is at {times_s[best]:g} s"
+        )
+    return int(own[best])
+
+
+def pick_samples(
+    folder: TensorFolder, part: str, pick: Pick, *, count: int = 1, seed: int = 0, judge: Forecaster | None = None
+) -> Integers:
+    """Numbers (count,) of samples of a kind; fewer where there are fewer.
+
+    Where some of the kind have a whole future, they are drawn from these; of lane changes, where possible, those that
+    are still to come.
+
+    Args:
+        folder: where from.
+        part: train, val or eval.
+        pick: the kind; `worst`: those with the greatest distance at the last position known, the worst first.
+        count: how many at most.
+        seed: of the draw.
+        judge: of `worst`: whose distance.
+
+    Raises:
+        NoSampleError: there is none.
+    """
+    samples = folder.samples_of(part)
+    found = samples[_is_kind(folder, samples, pick)]
+    found = _prefer(found, folder.sample_future[found] == folder.protocol.horizon_ticks)
+    if pick == "lane-change":
+        found = _prefer(found, _changes_lane(folder, found))
+    if len(found) == 0:
+        raise NoSampleError(
+            f"{folder.path}: no sample to pick by `{pick}` among the {len(samples):,} of part `{part}` of the split "
+            f"`{folder.split}`; pick another kind (--pick) or part (--part)"
+        )
+    random = np.random.default_rng(seed)
+    if pick != "worst":
+        return random.permutation(found)[:count]
+    if judge is None:
+        raise ValueError("the worst of what model: `worst` needs one to judge by")
+    if len(found) > MOST_LOOKED_AT:
+        found = np.sort(random.choice(found, MOST_LOOKED_AT, replace=False))
+    distance = measure_last_distance(folder, found, judge)
+    return found[np.argsort(-distance, kind="stable")[:count]]
+
+
+def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Forecaster) -> npt.NDArray[np.float64]:
+    """(B,) distances in m between predicted and true position at the last tick known of each sample."""
+    distances = []
+    for start in range(0, len(samples), BATCH_SIZE):
+        observed, everything = read_samples(folder, samples[start : start + BATCH_SIZE], judge.reads)
+        truth = truth_of_ego(everything)
+        said = judge.predictor.predict(observed).position_m.astype(np.float64)
+        last = truth.future_mask.sum(axis=1) - 1
+        apart = (said - truth.future)[np.arange(len(last)), last]
+        distances.append(np.hypot(apart[:, 0], apart[:, 1]))
+    return np.concatenate(distances)
+
+
+def _is_kind(folder: TensorFolder, samples: Integers, pick: Pick) -> Flags:
+    """(B,) which samples are candidates."""
+    keep = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
+    normal = folder.sample_longitudinal[samples] == LONGITUDINAL_MANEUVERS.index("normal")
+    kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
+    return kinds.get(pick, np.ones(len(samples), dtype=np.bool_))
+
+
+def _changes_lane(folder: TensorFolder, samples: Integers) -> Flags:
+    """(B,) whether the last lane known of the future is another than that of the sample."""
+    row = folder.sample_row[samples].astype(np.intp)
+    changes: Flags = folder.lane[row + folder.sample_future[samples]] != folder.lane[row]
+    return changes
+
+
+def _prefer(samples: Integers, whole: Flags) -> Integers:
+    """Those of the samples that are flagged, if any is; else all."""
+    return samples[whole] if whole.any() else samples

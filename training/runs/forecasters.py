@@ -1,0 +1,60 @@
+"""Models and runs by name, opened to be asked about samples of a tensor folder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models import MODELS, Predictor, Reads, find_model
+from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
+
+
+@dataclass(frozen=True)
+class Forecaster:
+    """A model that is asked.
+
+    Args:
+        name: the run's or model's.
+        predictor: the model, ready.
+        reads: what it is given.
+    """
+
+    name: str
+    predictor: Predictor
+    reads: Reads
+
+
+def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
+    """Open a trained run, or a model that needs no training: that one as it is, whether or not it was written as a run.
+
+    Args:
+        name: a run's folder in `models`, or the name of a model that does not learn.
+        folder: the tensors that it will be asked about.
+        models: the folder of the runs.
+        parts: of the split, that it will be asked about.
+
+    Raises:
+        StaleRunError: the run was trained for another protocol, or on subsets that stand in these parts now (but for
+            `train`); or it is unfinished or damaged.
+        ValueError: neither a run nor a model of that name.
+        FileNotFoundError: a model that learns, and no run of that name.
+        ImportError: torch is needed and missing.
+    """
+    if name in MODELS and not MODELS[name].learns:
+        return Forecaster(name, MODELS[name].build(folder.protocol), MODELS[name].reads)
+    if Path(name).name == name and (models / name / "config.json").is_file():
+        run = load_run(models / name, folder.protocol)
+        model = find_model(run.config["model"])
+        for part in sorted(parts - {"train"}) if model.learns else ():
+            refuse_leak(run.config, folder, part)
+        return Forecaster(name, run.predictor, model.reads)
+    refuse_unfinished(models / name)
+    if Path(name).name == name and (models / name / "metrics.json").is_file():
+        raise StaleRunError(f"{models / name}: a run without its config.json; train it again")
+    if name in MODELS:
+        raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
+    runs = sorted(path.parent.name for path in models.glob("[!.]*/config.json"))
+    known = [own for own, model in MODELS.items() if not model.learns]
+    raise ValueError(
+        f"no run or model `{name}`: expected one of the runs {', '.join(runs) or '(none yet)'}, or of the models that "
+        f"need no training, {', '.join(known)}; `tracklake train MODEL --name {name}` trains one"
+    )
