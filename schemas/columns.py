@@ -14,6 +14,8 @@ import pandera.polars as pa
 import polars as pl
 from pandera.errors import SchemaErrors
 
+from tracklake.schemas.errors import TracklakeError
+
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
 
@@ -227,7 +229,7 @@ class Table:
         ]
 
 
-class StructureError(ValueError):
+class StructureError(TracklakeError):
     """A frame breaks the structural rules of its table; the recording it came from cannot enter the lake."""
 
     def __init__(self, table: Table, where: str, broken: SchemaErrors) -> None:

@@ -1,11 +1,11 @@
 """Protocols: named, hashed recipes of sampling, split and metrics."""
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Literal
+
+from tracklake.schemas.hashing import hash_values
 
 Headline = Literal["rmse", "rmse-by-axis", "mae"]
 
@@ -82,7 +82,7 @@ class Protocol:
 
 
 def _digest(values: dict[str, object]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+    return hash_values(values, 12)
 
 
 CSP = Protocol(name="csp")

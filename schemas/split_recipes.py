@@ -1,11 +1,12 @@
 """Recipes of splits: what each is made by, the parameters that apply, and a hash of them."""
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args
+
+from tracklake.schemas.hashing import hash_text
 
 SplitName = Literal["flow-balanced", "time-blocks", "csp-2018", "by-recording-random"]
 SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)
@@ -108,4 +109,4 @@ class SplitRecipe:
     @property
     def digest(self) -> str:
         """First 12 hex digits of the sha256 of `parameters`."""
-        return hashlib.sha256(self.parameters.encode()).hexdigest()[:12]
+        return hash_text(self.parameters, 12)

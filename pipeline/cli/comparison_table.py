@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.lake import Manifest, connect, load, write_aside
+from tracklake.pipeline.lake import Manifest, connect, load
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 from tracklake.pipeline.stages.score import collect_scores
 from tracklake.quality_reports.pages.comparison import format_difference, format_value, render_comparison
 from tracklake.quality_reports.pages.lake_differences import COUNTED, Side, compare
+from tracklake.schemas.files import write_file
 
 COMPARISON = "compare.html"
 SHOWN_ROWS = 20
@@ -70,7 +71,7 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
         compared = compare(then, now)
     page = root / REPORTS / COMPARISON
     page.parent.mkdir(exist_ok=True)
-    write_aside(page, render_comparison(compared, report=PAGE).encode())
+    write_file(page, render_comparison(compared, report=PAGE).encode())
     terminal.say(f"\nnow:  {root.resolve()}\nthen: {other.resolve()}\n")
     show_comparison(terminal, compared)
     terminal.say(f"comparison  {page.resolve()}", style="bold green")

@@ -144,7 +144,7 @@ def _write(target: Path, table: "pl.DataFrame") -> None:
     """Write the table whole or not at all, in the form that the file's name says."""
     from io import BytesIO
 
-    from tracklake.pipeline.lake import write_aside
+    from tracklake.schemas.files import write_file
 
     content = BytesIO()
     if target.suffix == ".csv":
@@ -153,4 +153,4 @@ def _write(target: Path, table: "pl.DataFrame") -> None:
         table.write_json(content)
     else:
         table.write_parquet(content)
-    write_aside(target, content.getvalue())
+    write_file(target, content.getvalue())

@@ -157,9 +157,9 @@ def _open_forest(file: Path, folder: "TensorFolder") -> "LaneForest":
 def _write(file: Path, record: dict[str, Any]) -> None:
     import json
 
-    from tracklake.pipeline.lake import write_aside
+    from tracklake.schemas.files import write_file
 
-    write_aside(file, json.dumps(record, indent=1, allow_nan=False).encode())
+    write_file(file, json.dumps(record, indent=1, allow_nan=False).encode())
 
 
 def _find_predictors(

@@ -77,9 +77,10 @@ def predict(
 ) -> None:
     """Draw samples: history, neighbors, truth, predictions and their uncertainty, on the road with its lanes."""
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.lake import load, write_aside
+        from tracklake.pipeline.lake import load
         from tracklake.pipeline.lake.files import MODELS
         from tracklake.pipeline.stages.tensors import tensor_folder
+        from tracklake.schemas.files import write_file
         from tracklake.training.data.tensor_folder import TensorFolder
         from tracklake.training.plots.drawing import draw_picture
 
@@ -100,7 +101,7 @@ def predict(
             picture = _ask(folder, number, asked, all_vehicles=all_vehicles)
             file = _name_file(out, root / FOLDER, picture, all_vehicles=all_vehicles)
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_aside(file, draw_picture(picture).render(file.suffix))
+            write_file(file, draw_picture(picture).render(file.suffix))
             _tell(terminal, picture, file)
             drawn.append({"file": file, **picture.to_dict()})
         maps = _draw_attention(folder, asked, samples, file.parent) if attention else []

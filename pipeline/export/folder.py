@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tracklake.pipeline.lake.manifest import sync
+from tracklake.schemas.files import sync
 
 
 class ExportError(ValueError):

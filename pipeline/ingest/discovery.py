@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path, PurePosixPath
 
-from tracklake.pipeline.lake import write_aside
 from tracklake.pipeline.lake.manifest import MANIFEST
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.csv.archives import ENDING, Contents, is_archive, list_members
 from tracklake.pipeline.sources.csv.raw_files import hash_raw, read_head
 from tracklake.pipeline.sources.source import Unit
+from tracklake.schemas.files import write_file
 
 SUFFIXES = (".csv", ".txt", ".dat", ".gz", ENDING, "")
 """Endings under which trajectory files circulate; others (pictures, Parquet, documents) are passed by."""
@@ -264,4 +264,4 @@ class Digests:
     def save(self) -> None:
         """Keep what was computed beside the lake's manifest, where there is a lake."""
         if self._changed and self._path.with_name(MANIFEST).exists():
-            write_aside(self._path, json.dumps(self._known).encode())
+            write_file(self._path, json.dumps(self._known).encode())

@@ -2,7 +2,7 @@
 
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
 from tracklake.pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
-from tracklake.pipeline.lake.manifest import Entry, LakeFile, Manifest, load, write_aside
+from tracklake.pipeline.lake.manifest import Entry, LakeFile, Manifest, load
 from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested
 from tracklake.pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
@@ -29,7 +29,6 @@ __all__ = [
     "refuse_foreign",
     "refuse_if_busy",
     "scan",
-    "write_aside",
     "write_folder",
     "write_table",
 ]

@@ -12,8 +12,9 @@ from polars.datatypes import DataTypeClass
 from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import partition_values
 from tracklake.pipeline.lake.macros import MACROS
-from tracklake.pipeline.lake.manifest import Manifest, write_aside
+from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
+from tracklake.schemas.files import write_file
 
 if TYPE_CHECKING:
     import duckdb
@@ -161,4 +162,4 @@ def rebuild(root: Path, manifest: Manifest) -> None:
         content = made.read_bytes()
     # What a client that wrote to the old catalog left would be replayed into the new one.
     (root / f"{CATALOG}.wal").unlink(missing_ok=True)
-    write_aside(root / CATALOG, content)
+    write_file(root / CATALOG, content)

@@ -12,8 +12,9 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from tracklake.pipeline.lake.errors import LakeMissingError
-from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load, sync
+from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.schemas import TABLES, Table
+from tracklake.schemas.files import sync
 
 STAGING = ".staging"
 TENSORS = "tensors"

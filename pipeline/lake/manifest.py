@@ -1,8 +1,6 @@
 """manifest.json: the live files of every table, and what each was built from."""
 
 import json
-import os
-import re
 import shlex
 import uuid
 from collections.abc import Collection, Iterable
@@ -12,9 +10,9 @@ from typing import Any
 
 from tracklake.pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
 from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas.files import write_file
 
 MANIFEST = "manifest.json"
-_ASIDE = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 
 
 @dataclass(frozen=True)
@@ -224,35 +222,4 @@ def _parse(document: dict[str, Any]) -> Manifest:
 def store(root: Path, manifest: Manifest) -> None:
     """Replace a lake's manifest: the moment at which a commit happens."""
     document = {"schema_version": SCHEMA_VERSION, **asdict(manifest)}
-    write_aside(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())
-
-
-def write_aside(target: Path, content: bytes) -> None:
-    """Write a whole file beside its target, sync it, and rename it into place; what stood there stays on an error."""
-    aside = target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        with aside.open("wb") as handle:
-            handle.write(content)
-            handle.flush()
-            os.fsync(handle.fileno())
-        aside.replace(target)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
-    sync(target.parent)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete what killed processes left under such names."""
-    for file in folder.glob(".*.tmp*"):
-        if _ASIDE.fullmatch(file.name) and file.is_file():
-            file.unlink()
-
-
-def sync(path: Path) -> None:
-    """Make a file's bytes, or the renames in a folder, survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    write_file(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())

@@ -12,8 +12,9 @@ from typing import Any
 
 from tracklake.pipeline.lake import catalog, files
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from tracklake.pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, remove_leftovers, store
+from tracklake.pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, store
 from tracklake.pipeline.lake.rebuild import begin_anew
+from tracklake.schemas.files import remove_unfinished
 
 LOCK = ".lock"
 KEPT_GENERATIONS = 2
@@ -179,8 +180,8 @@ def _begin(root: Path, *, broken_off: bool, rebuild: bool) -> Writer:
         manifest = Manifest()
         store(root, manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
-    remove_leftovers(root)
-    remove_leftovers(root / files.REPORTS)
+    remove_unfinished(root)
+    remove_unfinished(root / files.REPORTS)
     if broken_off and not rebuild:
         # Readers of the catalog must not fall behind by more generations than files are kept for.
         with suppress(LakeError):  # files are missing: this session may be the one that makes them again

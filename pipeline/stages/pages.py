@@ -6,12 +6,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, connect, is_intact, scan, write_aside
+from tracklake.pipeline.lake import Entry, LakeFile, Manifest, connect, is_intact, scan
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
 from tracklake.schemas import SPLITS
+from tracklake.schemas.files import write_file
 
 VERSION = 1
 
@@ -80,5 +81,5 @@ def write_report_file(root: Path, name: str, content: str) -> LakeFile:
     """Put one file of the report into its place."""
     target = root / REPORTS / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    write_aside(target, content.encode("utf-8", "backslashreplace"))
+    write_file(target, content.encode("utf-8", "backslashreplace"))
     return LakeFile(f"{REPORTS}/{name}", None, target.stat().st_size)

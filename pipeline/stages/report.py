@@ -1,6 +1,5 @@
 """Report: the lake's quality as one page for people and one document for programs."""
 
-import hashlib
 import platform
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -9,7 +8,6 @@ from typing import Any
 
 from tracklake.pipeline.lake import Entry, Manifest, connect, load
 from tracklake.pipeline.lake.files import REPORTS, remove
-from tracklake.pipeline.lake.manifest import remove_leftovers
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.pages import find_pages, write_report_file
@@ -18,6 +16,8 @@ from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recording
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE
 from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.schemas.files import remove_unfinished
+from tracklake.schemas.hashing import hash_chunks
 
 VERSION = 4
 PAGE, DOCUMENT = "index.html", "quality.json"
@@ -27,7 +27,7 @@ SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job over everything that is in the lake, the subsets' pages among it."""
     entries = {key: entry.fingerprint for key, entry in manifest.entries.items() if entry.stage != "report"}
-    runs = {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in finished_runs(root)}
+    runs = {path.parent.name: hash_chunks([path.read_bytes()], 16) for path in finished_runs(root)}
     made_of = {"entries": entries, "runs": runs, "settings": _shown(settings), **_find_thresholds(manifest, settings)}
     return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
 
@@ -102,5 +102,5 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     live = {root / file.path for entry in made for file in entry.files[REPORTS]}
     remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
-        remove_leftovers(folder)
+        remove_unfinished(folder)
     return make_entry(job, {REPORTS: files}, {"notes": notes})

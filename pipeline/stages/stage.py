@@ -1,7 +1,5 @@
 """What a stage is: jobs planned from the manifest, each built into files and one entry to commit."""
 
-import hashlib
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -11,6 +9,7 @@ from typing import Any
 from tracklake.pipeline.lake import Entry, LakeFile, Manifest, is_intact
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas.hashing import hash_values
 
 
 class StageError(Exception):
@@ -68,8 +67,7 @@ def make_job(key: str, *, version_of_stage: int, made_of: dict[str, Any], inputs
         "schema_version": SCHEMA_VERSION,
         **made_of,
     }
-    hashed = json.dumps([key, version_of_stage, SCHEMA_VERSION, made_of], sort_keys=True)
-    return Job(key, hashlib.sha256(hashed.encode()).hexdigest()[:16], built_from, inputs)
+    return Job(key, hash_values([key, version_of_stage, SCHEMA_VERSION, made_of], 16), built_from, inputs)
 
 
 def make_entry(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any]) -> Entry:

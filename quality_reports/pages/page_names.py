@@ -1,9 +1,10 @@
 """What the subsets' pages are called."""
 
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+from tracklake.schemas.hashing import hash_text
 
 FOLDER = "subsets"
 """Of the pages, beside the overview."""
@@ -37,4 +38,4 @@ def _name_file(subset: str) -> str:
 
 
 def _hash(*texts: str) -> str:
-    return hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    return hash_text("\0".join(texts), 8)

@@ -1,7 +1,6 @@
 """Raw files as bytes and lines: compressed or not, chunks of whole lines, the text of single lines."""
 
 import gzip
-import hashlib
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,6 +14,7 @@ import pyarrow as pa
 
 from tracklake.pipeline.sources.csv.archives import member_bytes, open_member
 from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.schemas.hashing import hash_chunks
 
 CHUNK_BYTES = 12 << 20
 HASH_BYTES = 1 << 20
@@ -56,11 +56,8 @@ def hash_raw(file: RawFile) -> str:
     Raises:
         SourceError: a zip archive is damaged, or its member cannot be read.
     """
-    digest = hashlib.sha256()
     with _open_packed(file) as handle:
-        while block := _read_block(handle, HASH_BYTES, file):
-            digest.update(block)
-    return digest.hexdigest()
+        return hash_chunks(iter(lambda: _read_block(handle, HASH_BYTES, file), b""))
 
 
 def unpacked_bytes(file: RawFile) -> int:

@@ -1,0 +1,25 @@
+"""Type aliases of NumPy arrays, and ragged ranges."""
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int64]
+Bytes = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.bool_]
+
+
+def expand_ranges(first: Integers, count: Integers) -> tuple[Integers, Integers]:
+    """Write ranges of consecutive numbers out, one after the other.
+
+    Args:
+        first: first number of each range, (R,).
+        count: length of each range, (R,); may be 0.
+
+    Returns:
+        The numbers, (N,), and for each of them which range it belongs to, (N,).
+    """
+    owner = np.repeat(np.arange(len(count)), count)
+    before = np.cumsum(count) - count
+    return np.arange(len(owner)) + np.repeat(first - before, count), owner

@@ -1,0 +1,58 @@
+"""Files that appear whole under their name or not at all."""
+
+import os
+import re
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+_UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
+"""Names of files that are not whole yet; DuckDB writes its log beside a database."""
+
+
+def name_unfinished(target: Path) -> Path:
+    """Return the hidden path beside a target under which it is written until it is whole."""
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}.tmp")
+
+
+def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
+    """Write a file beside its target, sync it and rename it; on an error what stood there before stays.
+
+    Args:
+        target: path of the file; its folder exists.
+        content: bytes, or a function that writes them to an open binary stream.
+
+    Raises:
+        OSError: the folder is missing or full, or may not be written to.
+    """
+    unfinished = name_unfinished(target)
+    try:
+        with unfinished.open("wb") as stream:
+            if isinstance(content, bytes):
+                stream.write(content)
+            else:
+                content(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished.replace(target)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    sync(target.parent)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Delete the unfinished files that killed processes left in a folder."""
+    for file in folder.glob(".*.tmp*"):
+        if _UNFINISHED.fullmatch(file.name) and file.is_file():
+            file.unlink()
+
+
+def sync(path: Path) -> None:
+    """Make the bytes of a file, or the renames in a folder, survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
