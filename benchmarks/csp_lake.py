@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, load, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.assemble import assemble_subset
 from tracklake.pipeline.sources.source import RawFile, Subset
@@ -88,7 +88,7 @@ def make_lake(root: Path, scale: float) -> None:
                 table.name: write_table(root, table, frame, values, FINGERPRINT, where=name) for table, frame in tables
             }
             info = {"dataset": "ngsim", "recording": name, "subsets": [{"subset": name, "freeway": True}]}
-            writer.commit(Entry(f"ingest/ngsim/{name}", FINGERPRINT, files, {"sources": []}, info))
+            writer.commit(Commit(f"ingest/ngsim/{name}", FINGERPRINT, files, {"sources": []}, info))
 
 
 def make_subset(number: int, name: str, entries: int) -> Subset:

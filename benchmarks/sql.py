@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, connect, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, connect, open_for_writing, write_table
 from tracklake.schemas import (
     FINDINGS,
     MISSING_STARTS,
@@ -106,7 +106,7 @@ def build(root: Path, scale: float) -> None:
                     )
                     for table, frame in tables
                 }
-                writer.commit(Entry(f"made/{subset}", FINGERPRINT, files))
+                writer.commit(Commit(f"made/{subset}", FINGERPRINT, files))
         parts = [("eval" if number % 5 == 0 else "train", f"{number:02}") for number in range(1, RECORDINGS + 1)]
         splits = [
             {"split": "flow-balanced", "dataset": "highd", "subset": f"{recording}-{direction}", "block": 0,
@@ -124,7 +124,7 @@ def build(root: Path, scale: float) -> None:
             (REJECTS, pl.DataFrame(rejects, schema=REJECTS.dtypes), {"dataset": "highd"}),
         ):
             files = {table.name: write_table(root, table, frame, values, FINGERPRINT, where=table.name)}
-            writer.commit(Entry(f"made/{table.name}", FINGERPRINT, files))
+            writer.commit(Commit(f"made/{table.name}", FINGERPRINT, files))
     print(f"written in {time.perf_counter() - began:.0f} s")
 
 

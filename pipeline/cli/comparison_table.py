@@ -95,7 +95,7 @@ def _side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> It
 def _made_with(manifest: Manifest) -> dict[str, Any]:
     """Settings and versions by stage, as the tables remember them."""
     found: dict[str, dict[str, list[Any]]] = {}
-    for entry in sorted(manifest.entries.values(), key=lambda entry: entry.key):
+    for entry in sorted(manifest.commits.values(), key=lambda entry: entry.key):
         if entry.stage in ("pages", "report"):
             continue  # no table
         for name in (name for name in MADE_WITH if name in entry.built_from):

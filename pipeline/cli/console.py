@@ -18,7 +18,7 @@ from tracklake.pipeline.orchestration.progress import Silent, reporting_to
 
 if TYPE_CHECKING:
     from tracklake.pipeline.lake import LakeResult
-    from tracklake.pipeline.orchestration.run_plan import Outcome
+    from tracklake.pipeline.orchestration.run_plan import RunResult
 
 SHOWN_ROWS = 40
 """Rows of a query's result that are shown to a person; csv, json and parquet give all."""
@@ -103,13 +103,13 @@ class _Bars:
         self._progress.update(self._bars[stage], advance=1, title=escape(title))
 
 
-def show_outcome(terminal: Terminal, outcome: "Outcome") -> None:
+def show_outcome(terminal: Terminal, outcome: "RunResult") -> None:
     """Print what came of an order: notes, refusals, failures."""
     for note in dict.fromkeys(outcome.notes):
         terminal.say(f"note: {note}", style="dim")
-    if outcome.passed_by and terminal.talks:
-        shown = ", ".join(outcome.passed_by[:5]) + (", ..." if len(outcome.passed_by) > 5 else "")
-        terminal.say(f"note: passed by, no raw data: {shown}", style="dim")
+    if outcome.skipped and terminal.talks:
+        shown = ", ".join(outcome.skipped[:5]) + (", ..." if len(outcome.skipped) > 5 else "")
+        terminal.say(f"note: skipped, no raw data: {shown}", style="dim")
     for message in outcome.refused:
         terminal.complain(message, label="refused")
     for message in outcome.failed:

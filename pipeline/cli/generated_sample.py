@@ -32,13 +32,13 @@ def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal
 def refuse_mixing(lake: Path, sample: str) -> None:
     """Keep simulated recordings out of a lake of real ones, which they might even replace."""
     from tracklake.pipeline.lake import LakeError, LakeMissingError, load
-    from tracklake.pipeline.orchestration.run_plan import INGEST, Order, survey
+    from tracklake.pipeline.orchestration.run_plan import INGEST, RunRequest, survey
 
     try:
         entries = load(lake).of_stage(INGEST)
     except LakeMissingError:
         return
-    order = Order(str(lake.absolute()), (INGEST,), sample)
+    order = RunRequest(str(lake.absolute()), (INGEST,), sample)
     ours = {file.name for _, unit in survey(order).units for file in unit.files}
     hashes = {file.sha256 for _, unit in survey(order).units for file in unit.files}
     for source in (source for entry in entries for source in entry.built_from["sources"]):

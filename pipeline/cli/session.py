@@ -15,7 +15,7 @@ import typer
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
     from tracklake.pipeline.ingest.discovery import Discovery
-    from tracklake.pipeline.orchestration.run_plan import Order, Outcome
+    from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult
     from tracklake.pipeline.settings import Settings
 
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
@@ -84,10 +84,10 @@ def carry_out(
     replace: bool = False,
     prune: bool = False,
     rebuild: bool = False,
-) -> "Outcome":
+) -> "RunResult":
     """Do what is not done; Prefect is imported only where something is."""
     from tracklake.pipeline.lake import load, refuse_foreign, refuse_if_busy
-    from tracklake.pipeline.orchestration.run_plan import Order, conclude_idle, is_idle
+    from tracklake.pipeline.orchestration.run_plan import RunRequest, conclude_idle, is_idle
     from tracklake.pipeline.sources import SourceError
     from tracklake.schemas.columns import DATASETS
 
@@ -96,7 +96,7 @@ def carry_out(
     plain = settings.model_dump(mode="json", exclude_unset=True)
     # Absolute, so that a worker in another folder finds the same places.
     where = None if source is None else str(Path(source).absolute())
-    order = Order(str(settings.lake.absolute()), steps, where, dataset, plain, replace, prune, rebuild)
+    order = RunRequest(str(settings.lake.absolute()), steps, where, dataset, plain, replace, prune, rebuild)
     order.check()
     refuse_foreign(order.root, rebuild=rebuild)
     if prune and source is not None and Path(source).is_file():
@@ -128,7 +128,7 @@ def carry_out(
 SOON_S = 0.3
 
 
-def _survey_while_importing(order: "Order") -> "Discovery":
+def _survey_while_importing(order: "RunRequest") -> "Discovery":
     """Find the raw files; Prefect is imported meanwhile where that takes longer than looking up known hashes.
 
     Files that must be hashed are new, so there will be work for it.
@@ -160,7 +160,7 @@ def _prune_nothing(lake: Path) -> str:
 def conclude(
     terminal: "Terminal",
     settings: "Settings",
-    outcome: "Outcome",
+    outcome: "RunResult",
     *,
     headline: bool = True,
     assess: bool = False,

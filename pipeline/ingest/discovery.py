@@ -32,13 +32,13 @@ class Discovery:
     Args:
         units: files to be read together, by source.
         refusals: messages about files that look like raw data but cannot be used.
-        passed_by: names of files that are no raw data.
+        skipped: names of files that are no raw data.
         recognised: every file of a known format, whether or not it could be grouped with its others.
     """
 
     units: tuple[tuple[Source, Unit], ...]
     refusals: tuple[str, ...]
-    passed_by: tuple[str, ...]
+    skipped: tuple[str, ...]
     recognised: tuple[RawFile, ...] = ()
 
 
@@ -66,7 +66,7 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawF
         refusals += grouping.refusals
     if not units and not refusals:
         raise SourceError(_nothing(source, candidates, search.sources))
-    return Discovery(tuple(units), tuple(refusals), tuple(search.passed_by), tuple(chain(*search.recognised.values())))
+    return Discovery(tuple(units), tuple(refusals), tuple(search.skipped), tuple(chain(*search.recognised.values())))
 
 
 def recognise(source: Path, dataset: str) -> list[RawFile]:
@@ -92,7 +92,7 @@ class _Search:
         self.sources = sources
         self.recognised: dict[str, list[RawFile]] = {item.name: [] for item in sources}
         self.refusals: list[str] = []
-        self.passed_by: list[str] = []
+        self.skipped: list[str] = []
         self._single = source if source.is_file() else None
         self._digest = digest
         self._found: list[tuple[Source, RawFile]] = []
@@ -105,7 +105,7 @@ class _Search:
     def look_at(self, file: RawFile) -> None:
         """Sort a file of the source, or the members of an archive, into recognised, refused and passed by."""
         if file.path.suffix.lower() not in SUFFIXES:
-            self.passed_by.append(file.name)
+            self.skipped.append(file.name)
             return
         with self._refusing(file):
             if is_archive(file.path):
@@ -120,7 +120,7 @@ class _Search:
         for member in contents.files:
             with self._refusing(member):
                 self._take(member)
-        self.passed_by += contents.others
+        self.skipped += contents.others
         if self._outcome() == before:
             self._pass_by(archive, _no_raw_files(archive, contents, self.sources))
 
@@ -167,7 +167,7 @@ class _Search:
         """Pass an unrecognised file by where its ending promises no data and the user did not name it; else refuse."""
         named_by_user = file.member is None and file.path == self._single
         if PurePosixPath(file.filename).suffix.lower() in PROSE and not named_by_user:
-            self.passed_by.append(file.name)
+            self.skipped.append(file.name)
         else:
             self.refusals.append(refusal)
 

@@ -8,14 +8,14 @@ from typing import Any
 import polars as pl
 
 from tracklake.pipeline.ingest.discovery import Discovery
-from tracklake.pipeline.ingest.memory_budget import Room
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, write_table
+from tracklake.pipeline.ingest.memory_budget import MemoryBudget
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_table
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import count_reasons, to_rejects
 from tracklake.pipeline.sources.csv.raw_files import unpacked_bytes
 from tracklake.pipeline.sources.source import Canonical, Part
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
 VERSION = 2
@@ -23,7 +23,7 @@ SPREADSHEET_ROWS = 1_048_575
 REJECTS_FILE = "rejects.parquet"
 REASONS_SHOWN = 3
 """Of those for which all rows of a recording were dropped."""
-ROOM = Room(256 << 20)
+MEMORY_BUDGET = MemoryBudget(256 << 20)
 """Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
 
 _PLANNING_FACTS = ("subset", "freeway")
@@ -124,7 +124,7 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
     """
     messages = {}
     for job in jobs:
-        entry = manifest.entries.get(job.key)
+        entry = manifest.commits.get(job.key)
         if entry is None:
             continue
         if lost := find_lost(job, entry):
@@ -137,7 +137,7 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
     return messages
 
 
-def find_lost(job: Job, entry: Entry) -> list[dict[str, Any]]:
+def find_lost(job: Job, entry: Commit) -> list[dict[str, Any]]:
     """The sources of a recording's entry that a job for it does not hold, neither by name nor by content."""
     names, hashes = ({source[part] for source in job.built_from["sources"]} for part in ("file", "sha256"))
     return [s for s in entry.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
@@ -173,7 +173,7 @@ def needs_spill(job: Job) -> bool:
     return SOURCE_BY_NAME[job.inputs["dataset"]].spill is not None
 
 
-def build(root: Path, job: Job) -> Entry:
+def build(root: Path, job: Job) -> Commit:
     """Make one recording's tables and account for the rows of its files.
 
     Raises:
@@ -184,11 +184,11 @@ def build(root: Path, job: Job) -> Entry:
         return _build_unassigned(root, job, files[0])
     if needs_spill(job):
         return _build_recording(root, job, [_spilled_part(root, file, recording) for file in files])
-    with ROOM.taken(sum(map(unpacked_bytes, files))):
+    with MEMORY_BUDGET.reserve(sum(map(unpacked_bytes, files))):
         return _build_recording(root, job, [Part(file) for file in files])
 
 
-def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
+def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Commit:
     dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
     canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
     if not canonical.subsets:
@@ -202,7 +202,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Entry:
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }
-    return make_entry(job, written, info)
+    return make_commit(job, written, info)
 
 
 def _nothing_left(recording: str, canonical: Canonical) -> str:
@@ -263,7 +263,7 @@ def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFil
     return files
 
 
-def _build_unassigned(root: Path, job: Job, file: RawFile) -> Entry:
+def _build_unassigned(root: Path, job: Job, file: RawFile) -> Commit:
     dataset = job.inputs["dataset"]
     lines = pl.read_parquet(spill_folder(root, file) / REJECTS_FILE)
     log = {
@@ -291,4 +291,4 @@ def _build_unassigned(root: Path, job: Job, file: RawFile) -> Entry:
         "rows_read": lines.height,
         "rows_dropped": lines.height,
     }
-    return make_entry(job, files, info)
+    return make_commit(job, files, info)

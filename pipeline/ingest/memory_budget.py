@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class Room:
+class MemoryBudget:
     """So many bytes, of which threads take some and give them back.
 
     Args:
@@ -18,10 +18,10 @@ class Room:
         self._given_back = threading.Condition()
 
     @contextmanager
-    def taken(self, size: int) -> Iterator[None]:
+    def reserve(self, size: int) -> Iterator[None]:
         """Wait until so many bytes are free, and take them for the length of a block.
 
-        What is larger than the whole room takes all of it, and so is worked on alone.
+        What is larger than the whole budget takes all of it, and so is worked on alone.
 
         Args:
             size: in bytes.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.ingest.discovery import Discovery
-from tracklake.pipeline.lake import Entry, LakeError, Manifest, load, open_for_writing
+from tracklake.pipeline.lake import Commit, LakeError, Manifest, load, open_for_writing
 from tracklake.pipeline.stages.stage import Job
 from tracklake.schemas import TRACKS
 
@@ -64,7 +64,7 @@ class Folder:
         return stood["sha256"] not in self._hashes and (known or not os.path.lexists(path))
 
 
-def find_gone(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Entry]:
+def find_gone(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:
     """Entries of ingestion all of whose files stood in a folder and are gone.
 
     Args:
@@ -83,7 +83,7 @@ def find_gone(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: 
     ]
 
 
-def find_superseded(discovery: Discovery, manifest: Manifest) -> list[Entry]:
+def find_superseded(discovery: Discovery, manifest: Manifest) -> list[Commit]:
     """Entries for lines without a recording whose file was since replaced by a new version of it, which was read."""
     now = {(str(file.path), file.name): file.sha256 for file in discovery.recognised}
     found = []
@@ -95,9 +95,9 @@ def find_superseded(discovery: Discovery, manifest: Manifest) -> list[Entry]:
     return found
 
 
-def find_moved(jobs: Iterable[Job], manifest: Manifest) -> list[tuple[Job, Entry]]:
+def find_moved(jobs: Iterable[Job], manifest: Manifest) -> list[tuple[Job, Commit]]:
     """Jobs whose work is done and whose files are not where the lake remembers them, with what is remembered."""
-    done = [(job, manifest.entries[job.key]) for job in jobs if job.key in manifest.entries]
+    done = [(job, manifest.commits[job.key]) for job in jobs if job.key in manifest.commits]
     return [
         (job, entry)
         for job, entry in done
@@ -107,24 +107,24 @@ def find_moved(jobs: Iterable[Job], manifest: Manifest) -> list[tuple[Job, Entry
     ]
 
 
-def keys_made_of(entries: Iterable[Entry], manifest: Manifest) -> set[str]:
+def keys_made_of(entries: Iterable[Commit], manifest: Manifest) -> set[str]:
     """Keys of all that goes with entries of ingestion: every stage's of the same recordings, and what builds on those.
 
     Stages over the whole lake name in `built_from` the keys that they were made of.
     """
     tails = {entry.key.partition("/")[2] for entry in entries}
-    gone = {key for key in manifest.entries if key.partition("/")[2] in tails}
-    while more := {key for key, entry in manifest.entries.items() if key not in gone and gone & _named_in(entry)}:
+    gone = {key for key in manifest.commits if key.partition("/")[2] in tails}
+    while more := {key for key, entry in manifest.commits.items() if key not in gone and gone & _named_in(entry)}:
         gone |= more
     return gone
 
 
-def _named_in(entry: Entry) -> set[str]:
+def _named_in(entry: Commit) -> set[str]:
     inner = [value.keys() for value in entry.built_from.values() if isinstance(value, dict)]
     return set(entry.built_from).union(*inner)
 
 
-def describe(entries: Iterable[Entry], manifest: Manifest) -> list[Removed]:
+def describe(entries: Iterable[Commit], manifest: Manifest) -> list[Removed]:
     """The recordings among entries of ingestion, with the rows that go with each."""
     found = []
     for entry in entries:
@@ -132,7 +132,7 @@ def describe(entries: Iterable[Entry], manifest: Manifest) -> list[Removed]:
         if recording is None:
             continue
         tail = entry.key.partition("/")[2]
-        own = [other for key, other in manifest.entries.items() if key.partition("/")[2] == tail]
+        own = [other for key, other in manifest.commits.items() if key.partition("/")[2] == tail]
         files = [file for other in own for group in other.files.values() for file in group]
         entries_kept = sum(file.rows or 0 for file in entry.files.get(TRACKS.name, []))
         subsets = sorted(subset["subset"] for subset in entry.info["subsets"])
@@ -142,7 +142,7 @@ def describe(entries: Iterable[Entry], manifest: Manifest) -> list[Removed]:
     return found
 
 
-def name_all(entries: Sequence[Entry]) -> str:
+def name_all(entries: Sequence[Commit]) -> str:
     """Entries of ingestion for a sentence: `recordings 03, 04`, or the files whose lines have no recording."""
     names = sorted({entry.info["recording"] for entry in entries if entry.info["recording"] is not None})
     if names:
@@ -174,9 +174,9 @@ def remove_recordings(root: Path, names: Sequence[str]) -> tuple[list[Removed], 
     return removed, sorted(key for key in keys if "/" not in key)
 
 
-def _find_named(root: Path, names: Collection[str], manifest: Manifest) -> list[Entry]:
+def _find_named(root: Path, names: Collection[str], manifest: Manifest) -> list[Commit]:
     known = [entry for entry in manifest.of_stage("ingest") if entry.info["recording"] is not None]
-    found: dict[str, Entry] = {}
+    found: dict[str, Commit] = {}
     for name in names:
         full = {entry.key: f"{entry.info['dataset']}/{entry.info['recording']}" for entry in known}
         fitting = [entry for entry in known if name in (entry.info["recording"], full[entry.key])]
@@ -190,7 +190,7 @@ def _find_named(root: Path, names: Collection[str], manifest: Manifest) -> list[
     return list(found.values())
 
 
-def _their_lines(entries: Sequence[Entry], manifest: Manifest) -> list[Entry]:
+def _their_lines(entries: Sequence[Commit], manifest: Manifest) -> list[Commit]:
     """Lines without a recording, of files of which nothing else stays in the lake."""
     keys = {entry.key for entry in entries}
     others = [entry for entry in manifest.of_stage("ingest") if entry.key not in keys]

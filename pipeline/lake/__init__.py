@@ -2,13 +2,13 @@
 
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
 from tracklake.pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
-from tracklake.pipeline.lake.manifest import Entry, LakeFile, Manifest, load
+from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest, load
 from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested
 from tracklake.pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
 
 __all__ = [
-    "Entry",
+    "Commit",
     "LakeError",
     "LakeFile",
     "LakeLockedError",

@@ -31,7 +31,7 @@ class LakeFile:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Commit:
     """What one stage made of one recording (or of the whole lake), as committed.
 
     Args:
@@ -50,8 +50,18 @@ class Entry:
 
     @property
     def stage(self) -> str:
-        """The stage that made it."""
+        """Name of the stage that made it."""
         return self.key.split("/", 1)[0]
+
+    @property
+    def tail(self) -> str:
+        """The key without the stage: `dataset/recording`, or nothing for a stage over the whole lake."""
+        return self.key.partition("/")[2]
+
+    @property
+    def all_files(self) -> list[LakeFile]:
+        """The files of all its tables."""
+        return [file for group in self.files.values() for file in group]
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,7 @@ class Manifest:
     Args:
         lake_id: made with the lake; results cached elsewhere are bound to it.
         generation: counts the writing sessions that changed something.
-        entries: by key.
+        commits: by key; `entries` in the file.
         sources: by sha256: which dataset, dialect and recordings a raw file holds.
         retired: files to delete two generations after they were replaced.
         ingested_from: the SOURCEs it was made from, the last one last.
@@ -84,43 +94,45 @@ class Manifest:
 
     lake_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     generation: int = 0
-    entries: dict[str, Entry] = field(default_factory=dict)
+    commits: dict[str, Commit] = field(default_factory=dict)
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     retired: tuple[Retired, ...] = ()
     ingested_from: tuple[str, ...] = ()
 
     def live(self, table: str) -> list[LakeFile]:
         """The live files of a table, sorted by path."""
-        files = [file for entry in self.entries.values() for file in entry.files.get(table, [])]
+        files = [file for commit in self.commits.values() for file in commit.files.get(table, [])]
         return sorted(files, key=lambda file: file.path)
 
     def live_paths(self) -> set[str]:
         """Paths of all live files."""
-        return {file.path for entry in self.entries.values() for files in entry.files.values() for file in files}
+        return {file.path for commit in self.commits.values() for file in commit.all_files}
 
-    def of_stage(self, stage: str) -> list[Entry]:
-        """The entries of a stage, sorted by key."""
-        return sorted((entry for entry in self.entries.values() if entry.stage == stage), key=lambda entry: entry.key)
+    def of_stage(self, stage: str) -> list[Commit]:
+        """The commits of a stage, sorted by key."""
+        return sorted(
+            (commit for commit in self.commits.values() if commit.stage == stage), key=lambda commit: commit.key
+        )
 
     def of_recording(self, recording: str) -> "Manifest":
         """The manifest without what was made of other recordings than this one (`dataset/recording`)."""
-        entries = {key: entry for key, entry in self.entries.items() if key.partition("/")[2] in ("", recording)}
-        return replace(self, entries=entries)
+        commits = {key: commit for key, commit in self.commits.items() if key.partition("/")[2] in ("", recording)}
+        return replace(self, commits=commits)
 
-    def committing(self, entry: Entry, generation: int) -> "Manifest":
-        """The manifest with an entry added or replaced; what it replaces is retired."""
-        replaced = [self.entries[entry.key]] if entry.key in self.entries else []
-        return self._becoming({**self.entries, entry.key: entry}, replaced, generation)
+    def committing(self, commit: Commit, generation: int) -> "Manifest":
+        """The manifest with a commit added or replaced; what it replaces is retired."""
+        replaced = [self.commits[commit.key]] if commit.key in self.commits else []
+        return self._becoming({**self.commits, commit.key: commit}, replaced, generation)
 
     def removing(self, keys: Collection[str], generation: int) -> "Manifest":
-        """The manifest without some entries; their files are retired."""
-        removed = [entry for key, entry in self.entries.items() if key in keys]
-        return self._becoming({k: e for k, e in self.entries.items() if k not in keys}, removed, generation)
+        """The manifest without some commits; their files are retired."""
+        removed = [commit for key, commit in self.commits.items() if key in keys]
+        return self._becoming({k: e for k, e in self.commits.items() if k not in keys}, removed, generation)
 
-    def _becoming(self, entries: dict[str, Entry], replaced: Iterable[Entry], generation: int) -> "Manifest":
-        changed = replace(self, entries=entries, generation=generation)
+    def _becoming(self, commits: dict[str, Commit], replaced: Iterable[Commit], generation: int) -> "Manifest":
+        changed = replace(self, commits=commits, generation=generation)
         live = changed.live_paths()
-        gone = {file.path for entry in replaced for files in entry.files.values() for file in files} - live
+        gone = {file.path for commit in replaced for file in commit.all_files} - live
         kept = tuple(item for item in self.retired if item.path not in live)
         return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(gone)))
 
@@ -199,8 +211,8 @@ def not_ours(path: Path, broken: Exception) -> LakeError:
 
 
 def _parse(document: dict[str, Any]) -> Manifest:
-    entries = {
-        key: Entry(
+    commits = {
+        key: Commit(
             key=key,
             fingerprint=entry["fingerprint"],
             files={table: [LakeFile(**file) for file in files] for table, files in entry["files"].items()},
@@ -212,7 +224,7 @@ def _parse(document: dict[str, Any]) -> Manifest:
     return Manifest(
         lake_id=document["lake_id"],
         generation=document["generation"],
-        entries=entries,
+        commits=commits,
         sources=document["sources"],
         retired=tuple(Retired(**item) for item in document["retired"]),
         ingested_from=remembered_sources(document),
@@ -222,4 +234,5 @@ def _parse(document: dict[str, Any]) -> Manifest:
 def store(root: Path, manifest: Manifest) -> None:
     """Replace a lake's manifest: the moment at which a commit happens."""
     document = {"schema_version": SCHEMA_VERSION, **asdict(manifest)}
+    document["entries"] = document.pop("commits")
     write_file(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())

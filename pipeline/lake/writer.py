@@ -12,7 +12,7 @@ from typing import Any
 
 from tracklake.pipeline.lake import catalog, files
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from tracklake.pipeline.lake.manifest import MANIFEST, Entry, Manifest, load, store
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store
 from tracklake.pipeline.lake.rebuild import begin_anew
 from tracklake.schemas.files import remove_unfinished
 
@@ -43,13 +43,13 @@ class Writer:
         self._guard = threading.Lock()
         self._process = os.getpid()
 
-    def commit(self, entry: Entry) -> None:
-        """Make an entry's files live and those it replaces retired, by replacing manifest.json."""
+    def commit(self, commit: Commit) -> None:
+        """Make a commit's files live and those it replaces retired, by replacing manifest.json."""
         with self._guard:
-            if not files.is_intact(self.root, (file for group in entry.files.values() for file in group)):
-                raise LakeError(f"{self.root}: files of {entry.key} vanished before they were committed. Run again.")
-            if self.manifest.entries.get(entry.key) != entry:
-                self._store(self.manifest.committing(entry, self._generation))
+            if not files.is_intact(self.root, commit.all_files):
+                raise LakeError(f"{self.root}: files of {commit.key} vanished before they were committed. Run again.")
+            if self.manifest.commits.get(commit.key) != commit:
+                self._store(self.manifest.committing(commit, self._generation))
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -59,9 +59,9 @@ class Writer:
                 self._store(replace(self.manifest, sources=merged, generation=self._generation))
 
     def remove(self, keys: Collection[str]) -> None:
-        """Take entries out of the lake; their files are retired like replaced ones."""
+        """Take commits out of the lake; their files are retired like replaced ones."""
         with self._guard:
-            if not self.manifest.entries.keys().isdisjoint(keys):
+            if not self.manifest.commits.keys().isdisjoint(keys):
                 self._store(self.manifest.removing(keys, self._generation))
 
     def remember_origin(self, source: str) -> None:

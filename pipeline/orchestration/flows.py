@@ -29,15 +29,15 @@ from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import Entry, LakeFile, Writer, is_intact, list_ingested, open_for_writing
+from tracklake.pipeline.lake import Commit, LakeFile, Writer, is_intact, list_ingested, open_for_writing
 from tracklake.pipeline.orchestration.artifacts import summarise_report
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
     INGEST,
     QUALITY_STEPS,
-    Order,
-    Outcome,
+    RunRequest,
+    RunResult,
     explain_left_out,
     explain_not_rebuilt,
     outstanding,
@@ -102,9 +102,9 @@ def build(
     return asdict(STAGE_BY_NAME[stage].build(Path(lake), record, Settings(**settings)))
 
 
-def _entry(record: dict[str, Any]) -> Entry:
+def _entry(record: dict[str, Any]) -> Commit:
     files = {table: [LakeFile(**file) for file in group] for table, group in record["files"].items()}
-    return Entry(**{**record, "files": files})
+    return Commit(**{**record, "files": files})
 
 
 def _settle(futures: dict[PrefectFuture[Any], str]) -> Results:
@@ -114,26 +114,26 @@ def _settle(futures: dict[PrefectFuture[Any], str]) -> Results:
         yield futures[future], future.state.result(raise_on_failure=False)
 
 
-def _blame(title: str, error: BaseException, outcome: Outcome) -> None:
+def _blame(title: str, error: BaseException, result: RunResult) -> None:
     """Sort an error: bad input is refused and the others go on; anything else is a failure."""
     if isinstance(error, SourceError | StructureError):
-        outcome.refused.append(str(error))
+        result.refused.append(str(error))
     else:
-        outcome.failed.append(f"{title}: {type(error).__name__}: {error}")
+        result.failed.append(f"{title}: {type(error).__name__}: {error}")
 
 
-def _build_all(writer: Writer, stage: str, jobs: list[Job], order: Order, outcome: Outcome) -> None:
+def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult) -> None:
     """Run a stage's jobs and commit each as it ends."""
     if not jobs:
         return
     show = reporter()
     show.begin(stage, len(jobs))
 
-    settings = order.get_settings().model_dump(mode="json")
+    settings = request.get_settings().model_dump(mode="json")
 
     def submit(job: Job, *, refresh: bool = False) -> PrefectFuture[Any]:
         chosen = build.with_options(refresh_cache=True) if refresh or stage in IN_PLACE else build
-        return chosen.submit(stage, job.title, order.lake, writer.manifest.lake_id, asdict(job), settings)
+        return chosen.submit(stage, job.title, request.lake, writer.manifest.lake_id, asdict(job), settings)
 
     by_key = {job.key: job for job in jobs}
     for title, record in _settle({submit(job): job.title for job in jobs}):
@@ -146,28 +146,28 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], order: Order, outcom
             entry = _entry(record)
             # A cached record tells where the raw files stood when it was made.
             writer.commit(replace(entry, built_from=by_key[entry.key].built_from))
-            outcome.built[stage] = outcome.built.get(stage, 0) + 1
-            outcome.notes += entry.info.get("notes", [])
+            result.built[stage] = result.built.get(stage, 0) + 1
+            result.notes += entry.info.get("notes", [])
         else:
-            _blame(title, record, outcome)
+            _blame(title, record, result)
         show.advance(stage, title)
 
 
-def _files(entry: Entry) -> list[LakeFile]:
+def _files(entry: Commit) -> list[LakeFile]:
     return [file for group in entry.files.values() for file in group]
 
 
-def _ingest(writer: Writer, order: Order, outcome: Outcome) -> None:
+def _ingest(writer: Writer, request: RunRequest, result: RunResult) -> None:
     """Read what must be read to know its recordings, then make each recording that is not in the lake."""
-    discovery = survey(order)
-    outcome.refused += discovery.refusals
-    outcome.passed_by += discovery.passed_by
+    discovery = survey(request)
+    result.refused += discovery.refusals
+    result.skipped += discovery.skipped
     unknown = ingest.files_to_read(discovery, writer.manifest)
-    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, order, outcome)
-    plan = plan_ingest(order, discovery, writer.manifest)
-    outcome.refused += plan.conflicts
-    remember_places(writer, order, plan)
-    prune(writer, order, plan, outcome)
+    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
+    plan = plan_ingest(request, discovery, writer.manifest)
+    result.refused += plan.conflicts
+    remember_places(writer, request, plan)
+    prune(writer, request, plan, result)
     needed = {
         file.sha256: (job.inputs["dataset"], file)
         for job in plan.jobs
@@ -175,17 +175,17 @@ def _ingest(writer: Writer, order: Order, outcome: Outcome) -> None:
         for file in ingest.files_of(job)
         if not ingest.spill_folder(writer.root, file).exists()
     }
-    _read_all(writer, needed, order, outcome)
-    _build_all(writer, INGEST, plan.jobs, order, outcome)
+    _read_all(writer, needed, request, result)
+    _build_all(writer, INGEST, plan.jobs, request, result)
 
 
-def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Order, outcome: Outcome) -> None:
+def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: RunRequest, result: RunResult) -> None:
     if not files:
         return
     show = reporter()
     show.begin("read", len(files))
     futures = {
-        read_file.submit(file.name, order.lake, dataset, file.to_dict()): sha256
+        read_file.submit(file.name, request.lake, dataset, file.to_dict()): sha256
         for sha256, (dataset, file) in files.items()
     }
     contents = {}
@@ -193,34 +193,37 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], order: Orde
         if isinstance(record, dict):
             contents[sha256] = record
         else:
-            _blame(files[sha256][1].name, record, outcome)
+            _blame(files[sha256][1].name, record, result)
         show.advance("read", files[sha256][1].name)
     writer.remember_sources(contents)
 
 
-def _work(order: Order) -> dict[str, Any]:
-    outcome = Outcome()
-    before = list_ingested(order.root) if order.rebuild else set()
-    if order.rebuild and not survey(order).units:
-        raise SourceError(f"{order.source}: nothing in it can be used, so the lake was not begun anew.")
-    with open_for_writing(order.root, rebuild=order.rebuild) as writer:
-        if INGEST in order.steps:
-            _ingest(writer, order, outcome)
-        for stage in order.stages():
-            if outcome.failed and stage.name not in IN_PLACE:
+def _work(request: RunRequest) -> dict[str, Any]:
+    result = RunResult()
+    before = list_ingested(request.root) if request.rebuild else set()
+    if request.rebuild and not survey(request).units:
+        raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not begun anew.")
+    with open_for_writing(request.root, rebuild=request.rebuild) as writer:
+        if INGEST in request.steps:
+            _ingest(writer, request, result)
+        for stage in request.stages():
+            if result.failed and stage.name not in IN_PLACE:
                 continue  # what comes later builds on what failed; the report shows what there is
-            if INGEST in order.steps and not writer.manifest.of_stage(INGEST):
+            if INGEST in request.steps and not writer.manifest.of_stage(INGEST):
                 continue  # everything was refused
-            jobs, stale = outstanding(stage, writer.root, writer.manifest, order.get_settings())
+            jobs, stale = outstanding(stage, writer.root, writer.manifest, request.get_settings())
             writer.remove(stale)
-            _build_all(writer, stage.name, jobs, order, outcome)
-        if set(order.steps) & {"repair", "samples", "split", "tensors"}:
-            outcome.notes += explain_left_out(writer.manifest)
-        outcome.notes += explain_not_rebuilt(before, writer.manifest)
+            _build_all(writer, stage.name, jobs, request, result)
+        if set(request.steps) & {"repair", "samples", "split", "tensors"}:
+            result.notes += explain_left_out(writer.manifest)
+        result.notes += explain_not_rebuilt(before, writer.manifest)
         made = writer.manifest
-    if REPORT in order.steps and not outstanding(STAGE_BY_NAME[REPORT], order.root, made, order.get_settings())[0]:
-        outcome.notes += _publish(order.root)
-    return asdict(outcome)
+    if (
+        REPORT in request.steps
+        and not outstanding(STAGE_BY_NAME[REPORT], request.root, made, request.get_settings())[0]
+    ):
+        result.notes += _publish(request.root)
+    return asdict(result)
 
 
 def _publish(root: Path) -> list[str]:
@@ -253,7 +256,7 @@ def run(
     rebuild: bool = False,
 ) -> dict[str, Any]:
     """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
-    return _work(Order(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild))
+    return _work(RunRequest(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild))
 
 
 @flow(name="tracklake-ingest", validate_parameters=False, task_runner=FEW_THREADS)
@@ -267,37 +270,37 @@ def ingest_files(
     rebuild: bool = False,
 ) -> dict[str, Any]:
     """Raw files to tracks, vehicles and subsets."""
-    return _work(Order(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild))
+    return _work(RunRequest(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild))
 
 
 @flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
 def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
     """Findings, late starts and the report over what is in the lake."""
-    return _work(Order(lake, QUALITY_STEPS, settings=settings or {}))
+    return _work(RunRequest(lake, QUALITY_STEPS, settings=settings or {}))
 
 
 @flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False, task_runner=FEW_THREADS)
 def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
     """One stage over what is in the lake, or several (`repair+assess`)."""
-    return _work(Order(lake, tuple(stage.split("+")), settings=settings or {}))
+    return _work(RunRequest(lake, tuple(stage.split("+")), settings=settings or {}))
 
 
-def execute(order: Order) -> Outcome:
+def execute(request: RunRequest) -> RunResult:
     """Run an order as the flow that fits it, on threads, with nothing of Prefect's on the terminal."""
-    parameters: dict[str, Any] = {"lake": order.lake, "settings": order.settings}
+    parameters: dict[str, Any] = {"lake": request.lake, "settings": request.settings}
     chosen: Any = run_stage
-    if INGEST in order.steps:
-        chosen = run if tuple(order.steps) == ALL_STEPS else ingest_files
-        parameters |= {"source": order.source, "dataset": order.dataset}
-        parameters |= {"replace": order.replace, "prune": order.prune, "rebuild": order.rebuild}
+    if INGEST in request.steps:
+        chosen = run if tuple(request.steps) == ALL_STEPS else ingest_files
+        parameters |= {"source": request.source, "dataset": request.dataset}
+        parameters |= {"replace": request.replace, "prune": request.prune, "rebuild": request.rebuild}
     else:
-        parameters["stage"] = "+".join(order.steps)
+        parameters["stage"] = "+".join(request.steps)
     changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it
     if PREFECT_API_URL.value() is None:
         changed[PREFECT_API_URL] = _embed_server()
     with temporary_settings(changed):
         _mute_console()  # after all that sets logging up
-        return Outcome(**chosen.with_options(task_runner=_choose_runner(order.get_settings()))(**parameters))
+        return RunResult(**chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters))
 
 
 def _choose_runner(settings: Settings) -> TaskRunner[Any]:

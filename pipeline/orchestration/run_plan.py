@@ -8,7 +8,7 @@ from typing import Any
 
 from tracklake.pipeline.ingest import ingest, removal
 from tracklake.pipeline.ingest.discovery import Digests, Discovery, discover
-from tracklake.pipeline.lake import Entry, LakeError, LakeMissingError, Manifest, Writer, load, open_for_writing
+from tracklake.pipeline.lake import Commit, LakeError, LakeMissingError, Manifest, Writer, load, open_for_writing
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import Job, Stage, pending
@@ -20,7 +20,7 @@ QUALITY_STEPS = ("validate", "repair", "assess", "report")
 
 
 @dataclass(frozen=True)
-class Order:
+class RunRequest:
     """What a user asked for: plain values, fit to be a flow's parameters.
 
     Args:
@@ -76,15 +76,15 @@ class Order:
 
 
 @dataclass
-class Outcome:
-    """What came of an order.
+class RunResult:
+    """What a run did with a request.
 
     Args:
         built: recordings (or 1 for a stage over the whole lake) made, by step.
         refused: messages about files and recordings that could not be used.
         failed: messages about work that broke off unexpectedly.
         notes: what the user should know about what was made.
-        passed_by: files of the source that are no raw data.
+        skipped: files of the source that are no raw data.
         removed: recordings (`dataset/recording`) whose tables were removed.
     """
 
@@ -92,7 +92,7 @@ class Outcome:
     refused: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    passed_by: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
 
 
@@ -110,66 +110,68 @@ class IngestPlan:
 
     jobs: list[Job]
     conflicts: list[str]
-    gone: list[Entry]
-    superseded: list[Entry]
-    moved: list[Entry]
+    gone: list[Commit]
+    superseded: list[Commit]
+    moved: list[Commit]
 
 
-def survey(order: Order) -> Discovery:
+def survey(request: RunRequest) -> Discovery:
     """Find the raw files of an order; their hashes are remembered in the lake.
 
     Raises:
         tracklake.pipeline.sources.SourceError: nothing there.
     """
-    if order.source is None:
+    if request.source is None:
         raise ValueError("an order to ingest needs a source")
-    digests = Digests(order.root)
-    discovery = discover(order.origin, dataset=order.dataset, digest=digests)
+    digests = Digests(request.root)
+    discovery = discover(request.origin, dataset=request.dataset, digest=digests)
     digests.save()
     return discovery
 
 
-def is_idle(order: Order, discovery: Discovery | None) -> bool:
+def is_idle(request: RunRequest, discovery: Discovery | None) -> bool:
     """Whether everything that was asked for is in the lake already, and nothing else that was asked to go."""
-    if order.rebuild:
+    if request.rebuild:
         return False
     try:
-        manifest = load(order.root)
+        manifest = load(request.root)
     except LakeMissingError:
         return False
     if discovery is not None:
         if ingest.files_to_read(discovery, manifest):
             return False
-        plan = plan_ingest(order, discovery, manifest)
-        if plan.jobs or plan.superseded or (order.prune and plan.gone):
+        plan = plan_ingest(request, discovery, manifest)
+        if plan.jobs or plan.superseded or (request.prune and plan.gone):
             return False
-    return not any(any(outstanding(stage, order.root, manifest, order.get_settings())) for stage in order.stages())
+    return not any(
+        any(outstanding(stage, request.root, manifest, request.get_settings())) for stage in request.stages()
+    )
 
 
-def conclude_idle(order: Order, discovery: Discovery | None) -> Outcome:
+def conclude_idle(request: RunRequest, discovery: Discovery | None) -> RunResult:
     """What there is to say where nothing is to do; the lake learns where files stand that were moved."""
     if discovery is None:
-        return Outcome()
-    plan = plan_ingest(order, discovery, load(order.root))
+        return RunResult()
+    plan = plan_ingest(request, discovery, load(request.root))
     if plan.moved:
-        with suppress(LakeError), open_for_writing(order.root) as writer:  # where it is busy, the next run will do
-            remember_places(writer, order, plan)
-    return Outcome(refused=[*discovery.refusals, *plan.conflicts], notes=explain_gone(plan))
+        with suppress(LakeError), open_for_writing(request.root) as writer:  # where it is busy, the next run will do
+            remember_places(writer, request, plan)
+    return RunResult(refused=[*discovery.refusals, *plan.conflicts], notes=explain_gone(plan))
 
 
-def plan_ingest(order: Order, discovery: Discovery, manifest: Manifest) -> IngestPlan:
+def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -> IngestPlan:
     """Compare a source with the lake."""
     planned = ingest.plan(discovery, manifest)
-    jobs = pending(order.root, manifest, planned)
-    folder = removal.Folder(order.origin, discovery)
-    conflicts = {} if order.replace else ingest.find_replaced(jobs, manifest)
+    jobs = pending(request.root, manifest, planned)
+    folder = removal.Folder(request.origin, discovery)
+    conflicts = {} if request.replace else ingest.find_replaced(jobs, manifest)
     for job in jobs:
-        if job.key in conflicts and all(map(folder.lost, ingest.find_lost(job, manifest.entries[job.key]))):
+        if job.key in conflicts and all(map(folder.lost, ingest.find_lost(job, manifest.commits[job.key]))):
             conflicts[job.key] += " So does --prune, where files are gone from SOURCE, as here."
-            if order.prune:
+            if request.prune:
                 del conflicts[job.key]
     superseded = removal.find_superseded(discovery, manifest)
-    gone = removal.find_gone(folder, planned, manifest, order.dataset)
+    gone = removal.find_gone(folder, planned, manifest, request.dataset)
     return IngestPlan(
         jobs=[job for job in jobs if job.key not in conflicts],
         conflicts=sorted(conflicts.values()),
@@ -183,26 +185,26 @@ def plan_ingest(order: Order, discovery: Discovery, manifest: Manifest) -> Inges
     )
 
 
-def remember_places(writer: Writer, order: Order, plan: IngestPlan) -> None:
+def remember_places(writer: Writer, request: RunRequest, plan: IngestPlan) -> None:
     """Let the lake know where the raw files of its recordings are."""
-    writer.remember_origin(str(order.origin))
+    writer.remember_origin(str(request.origin))
     for entry in plan.moved:
         writer.commit(entry)
 
 
-def prune(writer: Writer, order: Order, plan: IngestPlan, outcome: Outcome) -> None:
+def prune(writer: Writer, request: RunRequest, plan: IngestPlan, result: RunResult) -> None:
     """Remove what a new version of its file makes void, and what was made of files that are gone, where asked to."""
-    gone = plan.gone if order.prune else []
+    gone = plan.gone if request.prune else []
     removed = removal.describe(gone, writer.manifest)
     writer.remove(removal.keys_made_of([*plan.superseded, *gone], writer.manifest))
-    outcome.removed += [recording.name for recording in removed]
+    result.removed += [recording.name for recording in removed]
     if gone:
         rows = sum(recording.entries for recording in removed)
-        outcome.notes.append(
+        result.notes.append(
             f"{removal.name_all(gone)}: no longer in SOURCE, and removed from the lake ({rows:,} rows of tracks)"
         )
     else:
-        outcome.notes += explain_gone(plan)
+        result.notes += explain_gone(plan)
 
 
 def explain_gone(plan: IngestPlan) -> list[str]:

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import repair
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings, upstream
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings, upstream
 from tracklake.pipeline.transforms.starts.assessment import assess_starts
 from tracklake.schemas import START_ASSESSMENTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS
 
@@ -26,7 +26,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     ]
 
 
-def build(root: Path, job: Job, _settings: Settings) -> Entry:
+def build(root: Path, job: Job, _settings: Settings) -> Commit:
     """Cut the fully tracked vehicles' tracks and hold the estimates against what was cut off."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
@@ -44,4 +44,4 @@ def build(root: Path, job: Job, _settings: Settings) -> Entry:
         )
         written = write_table(root, START_ASSESSMENTS, table, values, job.fingerprint, where=subset)
         files.setdefault(START_ASSESSMENTS.name, []).extend(written)
-    return make_entry(job, files, {})
+    return make_commit(job, files, {})

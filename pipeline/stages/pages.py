@@ -6,10 +6,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, connect, is_intact, scan
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, connect, is_intact, scan
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
 from tracklake.schemas import SPLITS
 from tracklake.schemas.files import write_file
@@ -28,7 +28,7 @@ def plan(root: Path, manifest: Manifest, _settings: Settings) -> list[Job]:
     for each in held:
         tail = f"{each['dataset']}/{each['recording']}"
         subsets = [(each["dataset"], subset["subset"]) for subset in each["subsets"]]
-        own = manifest.of_recording(tail).entries.values()
+        own = manifest.of_recording(tail).commits.values()
         made_of = {
             "entries": {entry.key: entry.fingerprint for entry in own if "/" in entry.key and entry.stage != "pages"},
             "parts": [parts.get(key, []) for key in subsets],
@@ -50,7 +50,7 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
     }
 
 
-def build(root: Path, job: Job, _settings: Settings) -> Entry:
+def build(root: Path, job: Job, _settings: Settings) -> Commit:
     """Query what the lake holds of one recording and write its subsets' pages into reports/subsets/."""
     from tracklake.quality_reports.pages.subsets import render_pages
     from tracklake.quality_reports.summaries import collect
@@ -64,10 +64,10 @@ def build(root: Path, job: Job, _settings: Settings) -> Entry:
     with connect(root, recording=job.inputs["recording"]) as connection:
         pages = render_pages(connection, collect(connection, provenance), names=names)
         files = [write_report_file(root, f"{FOLDER}/{name}", content) for name, content in pages]
-    return make_entry(job, {REPORTS: files}, {"pages": job.inputs["pages"]})
+    return make_commit(job, {REPORTS: files}, {"pages": job.inputs["pages"]})
 
 
-def find_pages(root: Path, entries: Iterable[Entry]) -> dict[tuple[str, str], str]:
+def find_pages(root: Path, entries: Iterable[Commit]) -> dict[tuple[str, str], str]:
     """File names of the pages that are there, by (dataset, subset), of this stage's entries."""
     return {
         (dataset, subset): name

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
 from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
 from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
 
@@ -24,7 +24,7 @@ def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     ]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Judge every vehicle's start and estimate what is missing of the late ones."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
@@ -56,4 +56,4 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
             written = write_table(root, table, frame, values, job.fingerprint, where=subset)
             files.setdefault(table.name, []).extend(written)
         late += missing.height
-    return make_entry(job, files, {"late": late})
+    return make_commit(job, files, {"late": late})

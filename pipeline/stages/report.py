@@ -6,13 +6,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, Manifest, connect, load
+from tracklake.pipeline.lake import Commit, Manifest, connect, load
 from tracklake.pipeline.lake.files import REPORTS, remove
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.pages import find_pages, write_report_file
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE
 from tracklake.quality_reports.rules.registry import RULES, resolve
@@ -26,7 +26,7 @@ SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job over everything that is in the lake, the subsets' pages among it."""
-    entries = {key: entry.fingerprint for key, entry in manifest.entries.items() if entry.stage != "report"}
+    entries = {key: entry.fingerprint for key, entry in manifest.commits.items() if entry.stage != "report"}
     runs = {path.parent.name: hash_chunks([path.read_bytes()], 16) for path in finished_runs(root)}
     made_of = {"entries": entries, "runs": runs, "settings": _shown(settings), **_find_thresholds(manifest, settings)}
     return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
@@ -67,7 +67,7 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
     }
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Query the lake and write reports/index.html and reports/quality.json; the subsets' pages are there by then."""
     from tracklake.quality_reports.pages.report import build_report
 
@@ -103,4 +103,4 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
         remove_unfinished(folder)
-    return make_entry(job, {REPORTS: files}, {"notes": notes})
+    return make_commit(job, {REPORTS: files}, {"notes": notes})

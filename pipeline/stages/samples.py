@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import repair, validate
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings, upstream
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings, upstream
 from tracklake.pipeline.transforms.samples.selection import TRACK_COLUMNS, draw_samples
 from tracklake.schemas import (
     FINDINGS,
@@ -45,7 +45,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     ]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Draw the samples of a recording's subsets."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
@@ -77,4 +77,4 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         if drawn.samples.is_empty():
             reasons = drawn.sample_drops.sort("entries", descending=True)["reason"].to_list()
             info["notes"].append(f"{subset}: no samples ({', '.join(reasons) or 'no entries'})")
-    return make_entry(job, files, info)
+    return make_commit(job, files, info)

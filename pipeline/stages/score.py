@@ -5,11 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load
 from tracklake.pipeline.lake.files import MODELS, TENSORS
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, upstream
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, upstream
 from tracklake.pipeline.stages.tensors import tensor_folder
 
 VERSION = 2
@@ -19,13 +19,13 @@ BASELINE = "constant-velocity"
 def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     """One job where there are tensors."""
     made = upstream(tensors.plan, root, manifest, settings)
-    if not made or manifest.entries[TENSORS].info["path"] is None:
+    if not made or manifest.commits[TENSORS].info["path"] is None:
         return []
     made_of = {**made, "model": BASELINE}
     return [make_job("score", version_of_stage=VERSION, made_of=made_of, inputs={})]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Evaluate the baseline and write it as a run like any other."""
     from tracklake.training.train import train
 
@@ -37,7 +37,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         if file.is_file()
     ]
     unscored = [] if metrics["evaluation"] else ["no score: the split's evaluation part has no samples"]
-    return make_entry(job, {MODELS: files}, {"notes": unscored})
+    return make_commit(job, {MODELS: files}, {"notes": unscored})
 
 
 def finished_runs(root: Path) -> list[Path]:
@@ -58,15 +58,15 @@ def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None
     """
     from tracklake.training.runs.run_folder import StaleRunError, read_config
 
-    if TENSORS not in manifest.entries or manifest.entries[TENSORS].info["path"] is None:
+    if TENSORS not in manifest.commits or manifest.commits[TENSORS].info["path"] is None:
         return []
-    index = json.loads((root / manifest.entries[TENSORS].info["path"] / "index.json").read_text(encoding="utf-8"))
+    index = json.loads((root / manifest.commits[TENSORS].info["path"] / "index.json").read_text(encoding="utf-8"))
     scores = []
     for path in finished_runs(root):
         try:
             config, scored = read_config(path.parent), _read_score(path)
         except (StaleRunError, FileNotFoundError) as stale:
-            pass_by(f"a run is passed by: {stale}")
+            pass_by(f"skipped a run: {stale}")
             continue
         if scored is not None and (config["protocol"], config["blocks"]) == (index["protocol"], index["blocks"]):
             scores.append({"model": path.parent.name, **scored})

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, Manifest, load, scan, write_table
+from tracklake.pipeline.lake import Commit, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import samples
 from tracklake.pipeline.stages.split_leakage import Leakage, measure, open_tables, refuse_leaks
-from tracklake.pipeline.stages.split_makers import Made, Material, make_split
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, upstream
+from tracklake.pipeline.stages.split_makers import SplitInputs, SplitResult, make_split
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, upstream
 from tracklake.schemas import (
     SAMPLES,
     SPLIT_BALANCE,
@@ -50,7 +50,7 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     ]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Divide the subsets that are not excluded by every recipe, and measure what the parts share.
 
     Raises:
@@ -58,7 +58,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     """
     manifest, protocol = load(root), settings.get_protocol()
     subsets = gather_subsets(root, manifest, protocol)
-    material = Material(root, manifest, subsets, protocol)
+    material = SplitInputs(root, manifest, subsets, protocol)
     made = {recipe: make_split(recipe, material) for recipe in settings.get_split_recipes()}
     measured = _measure_all(material, made)
     refuse_leaks(measured)
@@ -76,7 +76,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         for table, parts in frames
     }
     notes = [note for recipe, split in made.items() for note in _tell(recipe, split, measured[recipe])]
-    return make_entry(job, files, {"notes": notes, "subsets": subsets.height})
+    return make_commit(job, files, {"notes": notes, "subsets": subsets.height})
 
 
 def gather_subsets(root: Path, manifest: Manifest, protocol: Protocol) -> pl.DataFrame:
@@ -104,7 +104,7 @@ def gather_subsets(root: Path, manifest: Manifest, protocol: Protocol) -> pl.Dat
     )
 
 
-def _measure_all(material: Material, made: dict[SplitRecipe, Made]) -> dict[SplitRecipe, Leakage]:
+def _measure_all(material: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> dict[SplitRecipe, Leakage]:
     places = material.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
     with open_tables(material.root, material.manifest) as connection:
         return {
@@ -121,7 +121,7 @@ def _measure_all(material: Material, made: dict[SplitRecipe, Made]) -> dict[Spli
         }
 
 
-def _describe(made: dict[SplitRecipe, Made], protocol: Protocol) -> pl.DataFrame:
+def _describe(made: dict[SplitRecipe, SplitResult], protocol: Protocol) -> pl.DataFrame:
     """Rows of `split_recipes`."""
     rows = [
         {
@@ -138,7 +138,7 @@ def _describe(made: dict[SplitRecipe, Made], protocol: Protocol) -> pl.DataFrame
     return pl.DataFrame(rows, schema=SPLIT_RECIPES.dtypes)
 
 
-def _tell(recipe: SplitRecipe, made: Made, measured: Leakage) -> list[str]:
+def _tell(recipe: SplitRecipe, made: SplitResult, measured: Leakage) -> list[str]:
     """What the user should know of a split: constraints that were relaxed, vehicles left out, leakage."""
     notes = [
         f"split {recipe.name} of {dataset} is relaxed: {reason}"

@@ -26,7 +26,7 @@ from tracklake.schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCE
 
 
 @dataclass(frozen=True)
-class Material:
+class SplitInputs:
     """What splits are made from.
 
     Args:
@@ -44,7 +44,7 @@ class Material:
 
 
 @dataclass(frozen=True)
-class Made:
+class SplitResult:
     """A split.
 
     Args:
@@ -58,12 +58,12 @@ class Made:
     flows: pl.DataFrame | None = None
 
 
-def make_split(recipe: SplitRecipe, material: Material) -> Made:
+def make_split(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
     """Make one split of the lake's subsets."""
     return _MAKERS[recipe.name](recipe, material)
 
 
-def _make_flow_balanced(recipe: SplitRecipe, material: Material) -> Made:
+def _make_flow_balanced(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
     allocation = allocate_flow_balanced(
         material.subsets,
         split=recipe.name,
@@ -72,10 +72,10 @@ def _make_flow_balanced(recipe: SplitRecipe, material: Material) -> Made:
         seed=recipe.seed,
         restarts=recipe.restarts,
     )
-    return Made(allocation, SPLIT_LEFT_OUT.empty())
+    return SplitResult(allocation, SPLIT_LEFT_OUT.empty())
 
 
-def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
+def _make_time_blocks(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
     blocks = cut_blocks(material.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
     visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema=WEIGHTS)]
     for facts in material.subsets.sort("dataset", "subset").iter_rows(named=True):
@@ -109,10 +109,10 @@ def _make_time_blocks(recipe: SplitRecipe, material: Material) -> Made:
     # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
     written = write_up(recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation)
-    return Made(written, left_out, units.select("dataset", "subset", "block", "flow"))
+    return SplitResult(written, left_out, units.select("dataset", "subset", "block", "flow"))
 
 
-def _make_csp(recipe: SplitRecipe, material: Material) -> Made:
+def _make_csp(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
     kept = (
         scan(material.root, material.manifest, SAMPLES)
         .filter(pl.col("protocol") == material.protocol.name)
@@ -128,10 +128,10 @@ def _make_csp(recipe: SplitRecipe, material: Material) -> Made:
         .collect()
         .sort("dataset", "subset", "vehicle_id")
     )
-    return Made(divide_by_id(material.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
+    return SplitResult(divide_by_id(material.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
 
 
-def _make_by_recording(recipe: SplitRecipe, material: Material) -> Made:
+def _make_by_recording(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
     allocation = divide_by_recording(
         material.subsets,
         split=recipe.name,
@@ -139,10 +139,10 @@ def _make_by_recording(recipe: SplitRecipe, material: Material) -> Made:
         validation=recipe.validation,
         seed=recipe.seed,
     )
-    return Made(allocation, SPLIT_LEFT_OUT.empty())
+    return SplitResult(allocation, SPLIT_LEFT_OUT.empty())
 
 
-_MAKERS: dict[str, Callable[[SplitRecipe, Material], Made]] = {
+_MAKERS: dict[str, Callable[[SplitRecipe, SplitInputs], SplitResult]] = {
     FLOW_BALANCED: _make_flow_balanced,
     TIME_BLOCKS: _make_time_blocks,
     CSP_2018: _make_csp,

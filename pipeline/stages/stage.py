@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, is_intact
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.hashing import hash_values
@@ -56,7 +56,7 @@ class Stage:
     name: str
     meaning: str
     plan: Plan
-    build: Callable[[Path, Job, Settings], Entry]
+    build: Callable[[Path, Job, Settings], Commit]
 
 
 def make_job(key: str, *, version_of_stage: int, made_of: dict[str, Any], inputs: dict[str, Any]) -> Job:
@@ -70,9 +70,9 @@ def make_job(key: str, *, version_of_stage: int, made_of: dict[str, Any], inputs
     return Job(key, hash_values([key, version_of_stage, SCHEMA_VERSION, made_of], 16), built_from, inputs)
 
 
-def make_entry(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any]) -> Entry:
+def make_commit(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any]) -> Commit:
     """The entry a job's files make."""
-    return Entry(key=job.key, fingerprint=job.fingerprint, files=files, built_from=job.built_from, info=info)
+    return Commit(key=job.key, fingerprint=job.fingerprint, files=files, built_from=job.built_from, info=info)
 
 
 def pending(root: Path, manifest: Manifest, jobs: Iterable[Job]) -> list[Job]:
@@ -81,7 +81,7 @@ def pending(root: Path, manifest: Manifest, jobs: Iterable[Job]) -> list[Job]:
 
 
 def _is_done(root: Path, manifest: Manifest, job: Job) -> bool:
-    entry = manifest.entries.get(job.key)
+    entry = manifest.commits.get(job.key)
     if entry is None or entry.fingerprint != job.fingerprint:
         return False
     return is_intact(root, (file for group in entry.files.values() for file in group))
@@ -106,7 +106,7 @@ def upstream(plan: Plan, root: Path, manifest: Manifest, settings: Settings) -> 
     """
     found = {}
     for job in plan(root, manifest, settings):
-        entry = manifest.entries.get(job.key)
+        entry = manifest.commits.get(job.key)
         if entry is None or entry.fingerprint != job.fingerprint:
             stage = job.key.split("/", 1)[0]
             what = f"{stage} of {job.title}" if job.title != stage else stage

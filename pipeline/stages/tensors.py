@@ -7,12 +7,12 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, Manifest, free_path, load, scan, write_folder
+from tracklake.pipeline.lake import Commit, Manifest, free_path, load, scan, write_folder
 from tracklake.pipeline.lake.files import TENSORS
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import split, validate
-from tracklake.pipeline.stages.stage import Job, StageError, make_entry, make_job, upstream
+from tracklake.pipeline.stages.stage import Job, StageError, make_commit, make_job, upstream
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
 from tracklake.schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, SUBSETS, TRACKS, VEHICLES
@@ -45,13 +45,13 @@ def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     return [make_job(TENSORS, version_of_stage=VERSION, made_of=made_of, inputs={"split": protocol.split})]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Build the arrays subset by subset, in the split's order, and put the folder into the lake at once."""
     manifest, protocol, storage = load(root), settings.get_protocol(), settings.tensor_positions
     splits, left_out = read_split(root, manifest, protocol)
     included = list(_sampled_subsets(root, manifest, splits, protocol))
     if not included:
-        return make_entry(job, {}, {"notes": ["no subset gives samples: no tensors"], "path": None, "samples": 0})
+        return make_commit(job, {}, {"notes": ["no subset gives samples: no tensors"], "path": None, "samples": 0})
 
     def tensors_of() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
         for facts in included:
@@ -67,7 +67,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
     files = write_folder(root, path, write)
     index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}
-    return make_entry(job, {TENSORS: files}, info)
+    return make_commit(job, {TENSORS: files}, info)
 
 
 def describe_recipe(settings: Settings) -> dict[str, Any]:
@@ -140,7 +140,7 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
     Raises:
         StageError: there are none, or they are of another protocol or split than the settings name.
     """
-    entry = manifest.entries.get(TENSORS)
+    entry = manifest.commits.get(TENSORS)
     if entry is None or entry.info["path"] is None:
         raise StageError(
             f"{root}: the lake has no tensors. Run `tracklake tensors`; it needs freeway recordings with lanes."

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
+from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
 from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
 from tracklake.quality_reports.rules.findings import judge_subset
 from tracklake.quality_reports.rules.registry import RULES, resolve
@@ -35,7 +35,7 @@ def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
     ]
 
 
-def build(root: Path, job: Job, settings: Settings) -> Entry:
+def build(root: Path, job: Job, settings: Settings) -> Commit:
     """Find what breaks rules in each subset of a recording, score it, and judge the subset."""
     manifest, dataset = load(root), job.inputs["dataset"]
     files: dict[str, list[LakeFile]] = {}
@@ -69,4 +69,4 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
             notes.append(f"{subset}: rules not checked, since the files lack what they read: {', '.join(lacking)}")
         reasons = status.filter(pl.col("excluded"))["excluded_reason"].to_list()
         notes += [f"{subset} is excluded from samples and splits: {reason}" for reason in reasons]
-    return make_entry(job, files, {"notes": notes})
+    return make_commit(job, files, {"notes": notes})

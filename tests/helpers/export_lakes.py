@@ -5,7 +5,7 @@ from pathlib import Path
 from raw_texts import as_text, ngsim_row, read_highd, read_ngsim, write
 from small_recordings import write_highd
 
-from tracklake.pipeline.lake import Entry, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
@@ -52,7 +52,7 @@ def ingest(root, folder, recordings, highd=()):
                     files.setdefault(table.name, []).extend(written)
             subsets = [{"subset": s.name, "freeway": s.facts["freeway"][0]} for s in made.subsets]
             info = {"dataset": dataset, "recording": recording, "subsets": subsets}
-            writer.commit(Entry(f"ingest/{dataset}/{recording}", FINGERPRINT, files, {"sources": []}, info))
+            writer.commit(Commit(f"ingest/{dataset}/{recording}", FINGERPRINT, files, {"sources": []}, info))
     return root
 
 

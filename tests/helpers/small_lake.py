@@ -12,7 +12,7 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.lake import Entry, LakeFile, Writer, connect, load, open_for_writing, write_folder, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Writer, connect, load, open_for_writing, write_folder, write_table
 from tracklake.schemas import SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, Table
 
 SUBSETS = ("01-upper", "01-lower")
@@ -35,13 +35,13 @@ def make_starts(subset: str, rows: int, dataset: str = "highd") -> pl.DataFrame:
     return pl.DataFrame(found, schema=VEHICLE_STARTS.dtypes)
 
 
-def put(root: Path, key: str, number: int, frame: pl.DataFrame, table: Table = SUBSET_STATUS, **values: str) -> Entry:
+def put(root: Path, key: str, number: int, frame: pl.DataFrame, table: Table = SUBSET_STATUS, **values: str) -> Commit:
     """Write one table and make its entry, not yet committed."""
     fingerprint = f"{number:016x}"
-    return Entry(key, fingerprint, {table.name: write_table(root, table, frame, values, fingerprint, where=key)})
+    return Commit(key, fingerprint, {table.name: write_table(root, table, frame, values, fingerprint, where=key)})
 
 
-def put_round(root: Path, subset: str, number: int) -> Entry:
+def put_round(root: Path, subset: str, number: int) -> Commit:
     """Two tables and a folder with a folder in it."""
     values = {"dataset": "highd", "subset": subset}
     fingerprint = f"{number:016x}"
@@ -60,7 +60,7 @@ def put_round(root: Path, subset: str, number: int) -> Entry:
         ),
         "tensors": write_folder(root, f"tensors/{subset}/{fingerprint}", fill),
     }
-    return Entry(f"validate/highd/{subset}", fingerprint, files, info={"number": number})
+    return Commit(f"validate/highd/{subset}", fingerprint, files, info={"number": number})
 
 
 def write_round(root: Path, number: int) -> None:
@@ -79,7 +79,7 @@ def check_lake(root: Path) -> None:
     import duckdb
 
     manifest = load(root)
-    for entry in manifest.entries.values():
+    for entry in manifest.commits.values():
         for file in (file for group in entry.files.values() for file in group):
             assert (root / file.path).stat().st_size == file.bytes, file
         status = pl.read_parquet(root / entry.files["subset_status"][0].path, hive_partitioning=False, glob=False)

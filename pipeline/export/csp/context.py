@@ -10,7 +10,7 @@ from tracklake.pipeline.export.folder import ExportError
 from tracklake.pipeline.lake import Manifest, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import split
-from tracklake.pipeline.stages.split_makers import Material, make_split
+from tracklake.pipeline.stages.split_makers import SplitInputs, make_split
 from tracklake.pipeline.stages.stage import upstream
 from tracklake.pipeline.transforms.csp.subset import Context
 from tracklake.schemas import MISSING_STARTS, SPLITS, SUBSET_STATUS, VEHICLE_STARTS
@@ -50,7 +50,7 @@ def read_context(
     parts = splits.select("dataset", "part").unique().rows()
     if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
         recipe = settings.get_split_recipe()
-        material = Material(root, manifest, split.gather_subsets(root, manifest, protocol), protocol)
+        material = SplitInputs(root, manifest, split.gather_subsets(root, manifest, protocol), protocol)
         allocation = make_split(replace(recipe, validation=True), material).allocation
         splits = allocation.splits
         notes.append(

@@ -11,7 +11,7 @@ from tracklake.pipeline.cli import app as cli
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.lake import connect, load, open_for_writing
-from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, Order, Outcome
+from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, RunRequest, RunResult
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.csv.raw_files import hash_raw
 from tracklake.pipeline.stages import assess, repair
@@ -97,7 +97,7 @@ def test_repair_assesses_where_asked(monkeypatch, flags, steps):
 
     def carry_out(_terminal, _settings, given):
         asked.append(given)
-        return Outcome()
+        return RunResult()
 
     monkeypatch.setattr(cli, "carry_out", carry_out)
     monkeypatch.setattr(cli, "conclude", lambda *_, headline, assess: asked.append((headline, assess)))
@@ -120,7 +120,7 @@ def test_the_stage_works_on_what_repair_made(tmp_path):
             writer.commit(stage.build(root, job, settings))
     manifest = load(root)
     (job,) = assess.plan(root, manifest, settings)
-    assert manifest.entries["assess/highd/01"].fingerprint == job.fingerprint
+    assert manifest.commits["assess/highd/01"].fingerprint == job.fingerprint
     with connect(root) as connection:
         table = connection.sql("SELECT subset, estimator, beyond_m, starts, coverage FROM start_assessments").pl()
     reached = [position for position in POSITIONS_M if position < 150 * 30 / 25]
@@ -147,5 +147,5 @@ def test_several_stages_are_one_flow(monkeypatch):
     monkeypatch.setattr(flows, "_embed_server", lambda: "http://127.0.0.1:9/api")
     monkeypatch.setattr(flows, "_work", lambda order: orders.append(order) or {})
     for steps in (("repair",), ("repair", "assess", "report")):
-        flows.execute(Order("somewhere", steps))
-        assert orders.pop() == Order("somewhere", steps, settings={})
+        flows.execute(RunRequest("somewhere", steps))
+        assert orders.pop() == RunRequest("somewhere", steps, settings={})

@@ -44,7 +44,7 @@ def test_a_folder_of_mixed_datasets(tmp_path):
         ("ngsim", ["ngsim/trajectories-0750am-0805am.txt"]),
     ]
     assert not discovery.refusals
-    assert sorted(discovery.passed_by) == ["README.txt", "map.png"]
+    assert sorted(discovery.skipped) == ["README.txt", "map.png"]
     only = find(tmp_path / "highd", dataset="highd")
     assert [name for name, _ in names(only)] == ["highd"]
 

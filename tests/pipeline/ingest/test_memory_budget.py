@@ -10,20 +10,20 @@ from small_recordings import write_highd
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
-from tracklake.pipeline.ingest.memory_budget import Room
+from tracklake.pipeline.ingest.memory_budget import MemoryBudget
 from tracklake.pipeline.lake import open_for_writing
 from tracklake.pipeline.sources import RawFile
 from tracklake.pipeline.sources.csv.raw_files import GZIP_RATIO, hash_raw, unpacked_bytes
 
 
 def test_no_more_is_taken_at_once_than_there_is_and_all_have_a_turn():
-    room, guard = Room(10), threading.Lock()
+    budget, guard = MemoryBudget(10), threading.Lock()
     taken, done = [], []
     most = 0
 
     def work(size):
         nonlocal most
-        with room.taken(size):
+        with budget.reserve(size):
             with guard:
                 taken.append(size)
                 most = max(most, sum(taken))
@@ -43,13 +43,13 @@ def test_no_more_is_taken_at_once_than_there_is_and_all_have_a_turn():
 
 
 def test_what_is_larger_than_the_room_is_alone_in_it():
-    room, inside, entered = Room(10), threading.Event(), threading.Event()
+    budget, inside, entered = MemoryBudget(10), threading.Event(), threading.Event()
 
     def small():
-        with room.taken(1):
+        with budget.reserve(1):
             entered.set()
 
-    with room.taken(99):
+    with budget.reserve(99):
         inside.set()
         other = threading.Thread(target=small)
         other.start()
@@ -59,22 +59,22 @@ def test_what_is_larger_than_the_room_is_alone_in_it():
 
 
 def test_an_error_gives_back_what_was_taken():
-    room = Room(10)
-    with pytest.raises(ValueError, match="broken"), room.taken(10):
+    budget = MemoryBudget(10)
+    with pytest.raises(ValueError, match="broken"), budget.reserve(10):
         raise ValueError("broken")
-    with room.taken(10):
+    with budget.reserve(10):
         pass
 
 
 def test_a_recording_waits_for_room_of_the_length_of_its_text(tmp_path, monkeypatch):
     text_bytes = sum(path.stat().st_size for path in write_highd(tmp_path / "raw", "01"))
-    room = Room(text_bytes + 1)
-    monkeypatch.setattr(ingest, "ROOM", room)
+    budget = MemoryBudget(text_bytes + 1)
+    monkeypatch.setattr(ingest, "MEMORY_BUDGET", budget)
     with open_for_writing(tmp_path / "lake") as writer:
         (job,) = ingest.plan(discover(tmp_path / "raw", digest=hash_raw), writer.manifest)
         built = []
         builder = threading.Thread(target=lambda: built.append(ingest.build(writer.root, job)))
-        with room.taken(2):
+        with budget.reserve(2):
             builder.start()
             builder.join(timeout=0.5)
             assert builder.is_alive(), "one byte too few"

@@ -120,10 +120,10 @@ def test_a_rebuild_killed_in_the_middle_goes_on(command, made, old):
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     begun = load(old)
-    assert begun.entries
+    assert begun.commits
     done = command(*command_line, "--json")
     assert done.code == 0, done.err
-    assert json.loads(done.out)["built"].get("ingest", 0) == 3 - len(begun.entries)
+    assert json.loads(done.out)["built"].get("ingest", 0) == 3 - len(begun.commits)
     assert load(old).lake_id == begun.lake_id
     assert counted(old) == dict.fromkeys(("01", "02", "03"), ENTRIES)
 
@@ -195,7 +195,7 @@ def test_manifests_of_any_shape_are_begun_anew(tmp_path, rest):
     with pytest.raises(LakeError, match=r"`tracklake run SOURCE --lake .* --rebuild`"):
         load(tmp_path)
     with open_for_writing(tmp_path, rebuild=True) as writer:
-        assert (writer.manifest.entries, writer.manifest.retired) == ({}, ())
+        assert (writer.manifest.commits, writer.manifest.retired) == ({}, ())
     assert load(tmp_path).generation == 0
 
 

@@ -9,7 +9,7 @@ import pytest
 from small_recordings import ENTRIES, KINDS, write_highd
 
 from tracklake.pipeline.ingest.removal import remove_recordings
-from tracklake.pipeline.lake import Entry, LakeError, connect, load, open_for_writing
+from tracklake.pipeline.lake import Commit, LakeError, connect, load, open_for_writing
 from tracklake.pipeline.orchestration import flows
 
 pytestmark = pytest.mark.xdist_group("removal")
@@ -55,9 +55,9 @@ def ingest(prefect_here):
     del prefect_here
 
     def call(source: Path, root: Path, **flags) -> dict:
-        outcome = flows.ingest_files(str(root), str(source), **flags)
-        assert outcome["failed"] == []
-        return outcome
+        result = flows.ingest_files(str(root), str(source), **flags)
+        assert result["failed"] == []
+        return result
 
     return call
 
@@ -70,7 +70,7 @@ def made(command, tmp_path_factory) -> Path:
         write_highd(folder / "raw", number, speed_mps=28.0 + int(number))
     done = command("run", folder / "raw", "--lake", folder / "lake", "--json")
     assert done.code == 0, done.err
-    assert {*WHOLE_LAKE, "ingest/highd/03", "tensors"} <= load(folder / "lake").entries.keys()
+    assert {*WHOLE_LAKE, "ingest/highd/03", "tensors"} <= load(folder / "lake").commits.keys()
     return folder
 
 
@@ -129,7 +129,7 @@ def test_prune_removes_every_stages_tables_and_the_whole_lakes_are_made_anew(com
     assert any(f"recording 03: no longer in SOURCE, and removed from the lake ({ENTRIES:,} rows" in n
                for n in said["notes"])  # fmt: skip
     manifest = load(root)
-    assert [key for key in manifest.entries if key.endswith("/03")] == []
+    assert [key for key in manifest.commits if key.endswith("/03")] == []
     assert not any("subset=03" in path for path in manifest.live_paths())
     for table in ("tracks", "vehicles", "subsets", "samples", "neighbors", "splits", "findings", "sample_drops"):
         assert ask(root, f"SELECT count(*) FROM {table} WHERE subset LIKE '03-%'") == [(0,)], table
@@ -364,9 +364,9 @@ def test_a_lake_of_no_recordings_works(command, copy):
 
 
 def test_a_name_that_two_datasets_have_must_be_qualified(tmp_path):
-    def entry(dataset: str) -> Entry:
+    def entry(dataset: str) -> Commit:
         info = {"dataset": dataset, "recording": "01", "subsets": []}
-        return Entry(f"ingest/{dataset}/01", "f", {}, {"sources": [{"file": "a", "sha256": dataset}]}, info)
+        return Commit(f"ingest/{dataset}/01", "f", {}, {"sources": [{"file": "a", "sha256": dataset}]}, info)
 
     with open_for_writing(tmp_path) as writer:
         writer.commit(entry("highd"))
@@ -375,4 +375,4 @@ def test_a_name_that_two_datasets_have_must_be_qualified(tmp_path):
         remove_recordings(tmp_path, ["01"])
     removed, _ = remove_recordings(tmp_path, ["ngsim/01"])
     assert [item.name for item in removed] == ["ngsim/01"]
-    assert set(load(tmp_path).entries) == {"ingest/highd/01"}
+    assert set(load(tmp_path).commits) == {"ingest/highd/01"}

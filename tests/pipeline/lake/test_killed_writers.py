@@ -41,7 +41,7 @@ def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nurser
     check_lake(root)
     # Two subsets of two tables and a folder, the manifest, the catalog and the sweep are this many steps at least.
     assert 60 < step < 400
-    assert load(root).entries["validate/highd/01-upper"].info["number"] == number
+    assert load(root).commits["validate/highd/01-upper"].info["number"] == number
 
 
 def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nursery: Nursery):
@@ -52,7 +52,7 @@ def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nurser
         check_lake(root)
     write_round(root, 2)
     check_lake(root)
-    entry = load(root).entries["validate/highd/01-lower"]
+    entry = load(root).commits["validate/highd/01-lower"]
     assert [Path(file.path).name for file in entry.files["tensors"]] == ["files.json", "y.bin", "x.bin"]
 
 

@@ -3,20 +3,20 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracklake.pipeline.lake import Entry, LakeFile, Manifest
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest
 
 KEYS = st.sampled_from(["ingest/highd/01", "ingest/highd/02", "validate/highd/01", "split"])
 COMMITS = st.tuples(KEYS, st.lists(st.integers(0, 2), max_size=3, unique=True))
 STEPS = st.lists(st.one_of(COMMITS, st.sets(KEYS)), max_size=15)
 
 
-def make_entry(key: str, numbers: list[int]) -> Entry:
+def make_commit(key: str, numbers: list[int]) -> Commit:
     """Files of one's own, as their names carry the key and a fingerprint; some in one table, some in another."""
     files: dict[str, list[LakeFile]] = {"tracks": [], "vehicles": []}
     for number in numbers:
         table = "tracks" if number % 2 else "vehicles"
         files[table].append(LakeFile(f"{table}/{key}/{number}", rows=1, bytes=1))
-    return Entry(key, f"{numbers}", files)
+    return Commit(key, f"{numbers}", files)
 
 
 @given(STEPS)
@@ -28,7 +28,7 @@ def test_every_file_ever_committed_is_live_or_retired_with_the_step_that_let_go_
         before = manifest
         if isinstance(step, tuple):
             key, numbers = step
-            manifest = manifest.committing(make_entry(key, numbers), generation)
+            manifest = manifest.committing(make_commit(key, numbers), generation)
             now = {**held, key: {f"{'tracks' if n % 2 else 'vehicles'}/{key}/{n}" for n in numbers}}
         else:
             manifest = manifest.removing(step, generation)
@@ -42,7 +42,7 @@ def test_every_file_ever_committed_is_live_or_retired_with_the_step_that_let_go_
         assert {item.path: item.generation for item in manifest.retired} == since
         assert len(manifest.retired) == len(since), "each once"
         assert not live & since.keys()
-        assert manifest.entries.keys() == held.keys()
+        assert manifest.commits.keys() == held.keys()
         assert manifest.generation == generation
         assert (manifest.lake_id, before.generation) == (before.lake_id, generation - 1), "the one before is untouched"
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from small_lake import check_lake, commit_round, find_files, make_status, put, put_round, write_round
 
 from tracklake.pipeline.lake import (
-    Entry,
+    Commit,
     LakeError,
     LakeFile,
     LakeLockedError,
@@ -92,7 +92,7 @@ def test_a_file_that_is_live_again_is_not_deleted(tmp_path: Path):
 
 def check_files(root: Path) -> None:
     manifest = load(root)
-    assert is_intact(root, (f for entry in manifest.entries.values() for group in entry.files.values() for f in group))
+    assert is_intact(root, (f for entry in manifest.commits.values() for group in entry.files.values() for f in group))
     retired = {item.path for item in manifest.retired}
     assert find_files(root) == manifest.live_paths() | retired
     assert not retired & manifest.live_paths()
@@ -161,7 +161,7 @@ def test_two_threads_commit_at_once(tmp_path: Path):
         for worker in workers:
             worker.join()
     check_lake(tmp_path)
-    assert {key: entry.info for key, entry in load(tmp_path).entries.items()} == {
+    assert {key: entry.info for key, entry in load(tmp_path).commits.items()} == {
         "validate/highd/00-upper": {"number": 4},
         "validate/highd/01-upper": {"number": 4},
     }
@@ -201,7 +201,7 @@ def test_a_session_that_raises_keeps_its_commits_and_lets_go_of_the_lock(tmp_pat
     with pytest.raises(KeyboardInterrupt):
         fail()
     check_lake(tmp_path)
-    assert load(tmp_path).entries.keys() == {KEY, "validate/highd/01-lower"}
+    assert load(tmp_path).commits.keys() == {KEY, "validate/highd/01-lower"}
     commit_status(tmp_path, None)
     check_files(tmp_path)
 
@@ -213,7 +213,7 @@ def test_files_that_vanished_are_not_committed(tmp_path: Path):
         with pytest.raises(LakeError, match="vanished"):
             writer.commit(entry)
         with pytest.raises(LakeError, match="vanished"):
-            writer.commit(Entry("x", "1", {"t": [LakeFile("manifest.json/inside", 1, 1)]}))
+            writer.commit(Commit("x", "1", {"t": [LakeFile("manifest.json/inside", 1, 1)]}))
 
 
 def test_a_damaged_file_is_made_again_under_its_name(tmp_path: Path):
@@ -267,7 +267,7 @@ def test_the_second_writer_is_told_the_first_one_and_gets_the_lock_with_its_deat
         holder.kill()
         holder.wait()
         with open_for_writing(root) as writer:
-            assert writer.manifest.entries == {}
+            assert writer.manifest.commits == {}
     finally:
         holder.kill()
         holder.wait()

@@ -96,8 +96,8 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
         return real(root, job)
 
     monkeypatch.setattr(ingest, "build", flaky)
-    outcome = flows.ingest_files(str(tmp_path / "one"), str(raw))
-    assert outcome["built"] == {"ingest": 1}
+    result = flows.ingest_files(str(tmp_path / "one"), str(raw))
+    assert result["built"] == {"ingest": 1}
     assert tries["flaky"] == 2
 
     def hopeless(*_job):
@@ -105,9 +105,9 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
         raise SourceError("04_tracks.csv, line 7: no good")
 
     monkeypatch.setattr(ingest, "build", hopeless)
-    outcome = flows.ingest_files(str(tmp_path / "two"), str(raw))
-    assert outcome["refused"] == ["04_tracks.csv, line 7: no good"]
-    assert outcome["built"] == {}
+    result = flows.ingest_files(str(tmp_path / "two"), str(raw))
+    assert result["refused"] == ["04_tracks.csv, line 7: no good"]
+    assert result["built"] == {}
     assert tries["hopeless"] == 1
 
 
@@ -120,7 +120,7 @@ def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, c
     store(root, Manifest(lake_id=finished.lake_id))
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 1}
-    assert load(root).entries == finished.entries
+    assert load(root).commits == finished.commits
     # A cached result whose files are gone is worth nothing.
     shutil.rmtree(root / "tracks")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
@@ -149,9 +149,9 @@ def artifacts_of(root: Path) -> dict[str, list]:
 @pytest.mark.usefixtures("server")
 def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
     root = tmp_path / "odd [x](y) \u00e9" / "Lake"
-    outcome = flows.run(str(root), str(raw))
-    assert outcome["failed"] == []
-    assert not any("artifacts" in note for note in outcome["notes"])
+    result = flows.run(str(root), str(raw))
+    assert result["failed"] == []
+    assert not any("artifacts" in note for note in result["notes"])
     found = artifacts_of(root)
     assert {key: len(made) for key, made in found.items()} == dict.fromkeys(
         [f"tracklake-{what}" for what in ("findings", "subsets", "ingestion", "completeness", "report")], 1

@@ -48,11 +48,11 @@ def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(command, 
         process.communicate()
         # Nothing that was committed is lost, and every file of it is whole.
         manifest = load(root)
-        now = {key: entry.fingerprint for key, entry in manifest.entries.items()}
+        now = {key: entry.fingerprint for key, entry in manifest.commits.items()}
         assert committed.items() <= now.items()
         assert len(now) >= wanted
         committed = now
-        for entry in manifest.entries.values():
+        for entry in manifest.commits.values():
             assert is_intact(root, (file for group in entry.files.values() for file in group)), entry.key
         tables = read_all(root)
         for table in TABLES:
@@ -61,7 +61,7 @@ def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(command, 
     done = command.alone("run", sample, "--lake", root, "--json")
     assert done.code == 0, done.err
     built = json.loads(done.out)["built"]
-    assert sum(built.values()) == len(load(root).entries) - len(committed), "only what was missing was made"
+    assert sum(built.values()) == len(load(root).commits) - len(committed), "only what was missing was made"
     after = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
     assert before.items() <= after.items()
     left = [path for path in root.rglob("*") if ".tmp" in path.name or path.name == ".staging"]

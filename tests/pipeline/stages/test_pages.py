@@ -12,7 +12,7 @@ from small_recordings import write_highd
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.ingest.removal import remove_recordings
-from tracklake.pipeline.lake import Entry, load, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
 from tracklake.pipeline.orchestration.run_plan import outstanding
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
@@ -50,7 +50,7 @@ def put_split(root: Path, part_of_02: str) -> None:
     frame = pl.DataFrame([{name: row.get(name) for name in SPLITS.dtypes} for row in rows], schema=SPLITS.dtypes)
     with open_for_writing(root) as writer:
         files = {SPLITS.name: write_table(root, SPLITS, frame, {}, part_of_02, where="here")}
-        writer.commit(Entry(key="split", fingerprint=part_of_02, files=files))
+        writer.commit(Commit(key="split", fingerprint=part_of_02, files=files))
 
 
 @pytest.fixture(scope="module")

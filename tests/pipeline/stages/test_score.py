@@ -11,7 +11,7 @@ from tracklake.training.runs.run_folder import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
 INDEX = {"protocol": {"name": "tiny", "digest": "0"}, "blocks": [{"part": "eval"}]}
-MANIFEST = SimpleNamespace(entries={TENSORS: SimpleNamespace(info={"path": "tensors"})})
+MANIFEST = SimpleNamespace(commits={TENSORS: SimpleNamespace(info={"path": "tensors"})})
 
 
 def write_run(root, name, **config):
@@ -34,9 +34,9 @@ def root(tmp_path):
 
 def test_runs_of_other_tensors_are_none(root):
     write_run(root, "other", protocol={"name": "other", "digest": "1"})
-    passed_by = []
-    assert collect_scores(root, MANIFEST, passed_by.append) == [{"model": "whole", "part": "eval", "rows": [ROW]}]
-    assert passed_by == []
+    skipped = []
+    assert collect_scores(root, MANIFEST, skipped.append) == [{"model": "whole", "part": "eval", "rows": [ROW]}]
+    assert skipped == []
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def test_runs_of_other_tensors_are_none(root):
 def test_a_damaged_run_is_passed_by_and_named(root, file, content, told):
     damaged = write_run(root, "damaged") / file
     damaged.unlink() if content is None else damaged.write_text(content)
-    passed_by = []
-    scores = collect_scores(root, MANIFEST, passed_by.append)
+    skipped = []
+    scores = collect_scores(root, MANIFEST, skipped.append)
     assert [own["model"] for own in scores] == ["whole"]
-    (note,) = passed_by
-    assert note.startswith("a run is passed by: ")
+    (note,) = skipped
+    assert note.startswith("skipped a run: ")
     assert str(damaged) in note
     assert told in note

@@ -7,7 +7,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from tracklake.pipeline.lake import Entry, connect, load, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, connect, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import split, tensors
 from tracklake.pipeline.stages.stage import Job, StageError
@@ -56,7 +56,7 @@ def put_recording(root, number, on_road_s=ON_ROAD_S):
         with open_for_writing(root) as writer:
             for table, rows in tables:
                 files = write_table(root, table, fill(table, rows), where, "0" * 16, where="test")
-                writer.commit(Entry(f"{table.name}/highd/{where['subset']}", "0" * 16, {table.name: files}, info={}))
+                writer.commit(Commit(f"{table.name}/highd/{where['subset']}", "0" * 16, {table.name: files}, info={}))
 
 
 @pytest.fixture(scope="module")
@@ -177,10 +177,10 @@ def plant(monkeypatch, change):
 )  # fmt: skip
 def test_a_planted_leak_stops_the_stage(monkeypatch, root, name, change, told):
     plant(monkeypatch, change)
-    before = load(root).entries.keys()
+    before = load(root).commits.keys()
     with pytest.raises(StageError, match=f"split {name} claims that its parts share nothing, but highd: .*{told}"):
         split.build(root, JOB, Settings(split=name, splits=[name], split_block_s=10))
-    assert load(root).entries.keys() == before
+    assert load(root).commits.keys() == before
 
 
 def test_a_split_that_claims_nothing_may_leak(monkeypatch, root):

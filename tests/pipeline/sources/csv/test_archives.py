@@ -75,7 +75,7 @@ def test_a_whole_delivery(tmp_path):
     ]
     assert not discovery.refusals
     pictures = [f"highD.zip/{top}/data/{number}_highway.png" for number in ("01", "02")]
-    assert sorted(discovery.passed_by) == sorted([f"highD.zip/{top}/Format.pdf", f"highD.zip/{top}/LICENSE", *pictures])
+    assert sorted(discovery.skipped) == sorted([f"highD.zip/{top}/Format.pdf", f"highD.zip/{top}/LICENSE", *pictures])
 
 
 def test_a_file_knows_its_folder_and_name_in_an_archive_or_not():
@@ -148,7 +148,7 @@ def test_members_that_cannot_be_read_are_refused_once_for_all_and_the_others_go_
         pack(source / "twice.zip", [("a.csv", b"x"), ("a.csv", b"y"), ("b.csv", NGSIM_FILES["named"])])
     discovery = find(source)
     assert sorted(names(discovery)) == [["nested.zip/raw.txt"], ["twice.zip/b.csv"]]
-    assert discovery.passed_by == ("locked.zip/a.png",)
+    assert discovery.skipped == ("locked.zip/a.png",)
     assert sorted(discovery.refusals) == [
         "locked.zip/0_tracks.csv and 2 more: encrypted. Expected an archive without a password. "
         "Unpack locked.zip and give the folder.",
@@ -167,7 +167,7 @@ def test_an_archive_without_raw_files_is_passed_by_where_the_user_did_not_name_i
     write(tmp_path / "in" / "raw.txt", NGSIM_FILES["text"])
     discovery = find(tmp_path / "in")
     assert not discovery.refusals
-    assert sorted(discovery.passed_by) == [
+    assert sorted(discovery.skipped) == [
         "documents.zip", "documents.zip/a.pdf", "documents.zip/notes.txt", "empty.zip"]  # fmt: skip
     (refusal,) = find(document).refusals
     assert refusal.startswith("documents.zip: an archive with no raw recordings in it. Expected highD: ")
