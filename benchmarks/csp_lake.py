@@ -22,6 +22,7 @@ from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.assemble import assemble_subset
 from tracklake.pipeline.sources.source import RawFile, Subset
+from tracklake.pipeline.stages.planner import Planner, build_job
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import FOOT_M
@@ -141,6 +142,5 @@ def run_stages(lake: Path) -> None:
     settings = Settings(lake=lake)
     with open_for_writing(lake) as writer:
         for name in NEEDED_BY_CLEAN:
-            stage = STAGE_BY_NAME[name]
-            for job in stage.plan(lake, writer.manifest, settings):
-                writer.commit(stage.build(lake, job, settings))
+            for job in Planner(lake, writer.manifest, settings).plan(name):
+                writer.commit(build_job(STAGE_BY_NAME[name], lake, job, settings))

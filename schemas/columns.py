@@ -115,7 +115,7 @@ def _unknown(_values: pl.Expr, _given: Mapping[str, Any]) -> pl.Expr:
     return pl.lit(value=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # declared once and compared by identity, so that a table can be a key
 class Table:
     """One table of the lake, declared.
 

@@ -32,15 +32,16 @@ def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal
 def refuse_mixing(lake: Path, sample: str) -> None:
     """Keep simulated recordings out of a lake of real ones, which they might even replace."""
     from tracklake.pipeline.lake import LakeError, LakeMissingError, load
-    from tracklake.pipeline.orchestration.run_plan import INGEST, RunRequest, survey
+    from tracklake.pipeline.orchestration.run_plan import RunRequest, survey_source
+    from tracklake.pipeline.stages.stage import INGEST
 
     try:
         entries = load(lake).of_stage(INGEST)
     except LakeMissingError:
         return
     order = RunRequest(str(lake.absolute()), (INGEST,), sample)
-    ours = {file.name for _, unit in survey(order).units for file in unit.files}
-    hashes = {file.sha256 for _, unit in survey(order).units for file in unit.files}
+    files = [file for _, unit in survey_source(order).units for file in unit.files]
+    ours, hashes = {file.name for file in files}, {file.sha256 for file in files}
     for source in (source for entry in entries for source in entry.built_from["sources"]):
         if source["file"] not in ours or source["sha256"] not in hashes:
             raise LakeError(

@@ -87,7 +87,7 @@ def carry_out(
 ) -> "RunResult":
     """Do what is not done; Prefect is imported only where something is."""
     from tracklake.pipeline.lake import load, refuse_foreign, refuse_if_busy
-    from tracklake.pipeline.orchestration.run_plan import RunRequest, conclude_idle, is_idle
+    from tracklake.pipeline.orchestration.run_plan import RunRequest, conclude_idle, plan_run
     from tracklake.pipeline.sources import SourceError
     from tracklake.schemas.columns import DATASETS
 
@@ -115,14 +115,15 @@ def carry_out(
             terminal.complain(_prune_nothing(order.root).strip(), label="refused")
         terminal.give({"refused": list(discovery.refusals)})
         raise typer.Exit(FAILED)
-    if is_idle(order, discovery):
+    plan = plan_run(order, discovery)
+    if plan.is_idle:
         terminal.say("nothing to do: the lake is up to date", style="dim")
-        return conclude_idle(order, discovery)
+        return conclude_idle(order, plan)
     refuse_if_busy(order.root, rebuild=rebuild)
     with terminal.working():
         from tracklake.pipeline.orchestration.flows import execute
 
-        return execute(order)
+        return execute(order, plan)
 
 
 SOON_S = 0.3
@@ -137,10 +138,10 @@ def _survey_while_importing(order: "RunRequest") -> "Discovery":
     from contextlib import suppress
     from importlib import import_module
 
-    from tracklake.pipeline.orchestration.run_plan import survey
+    from tracklake.pipeline.orchestration.run_plan import survey_source
 
     with ThreadPoolExecutor(max_workers=1) as thread:
-        discovery = thread.submit(survey, order)
+        discovery = thread.submit(survey_source, order)
         with suppress(TimeoutError):
             return discovery.result(timeout=SOON_S)
         import_module("tracklake.pipeline.orchestration.flows")

@@ -1,5 +1,6 @@
 """Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ MEMORY_BUDGET = MemoryBudget(256 << 20)
 """Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
 
 _PLANNING_FACTS = ("subset", "freeway")
+Files = dict[str, list[LakeFile]]
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
 
@@ -179,34 +181,35 @@ def build(root: Path, job: Job) -> Commit:
     Raises:
         SourceError, schemas.StructureError: the recording cannot be used.
     """
+    started = time.perf_counter()
     recording, files = job.inputs["recording"], files_of(job)
     if recording is None:
-        return _build_unassigned(root, job, files[0])
-    if needs_spill(job):
-        return _build_recording(root, job, [_spilled_part(root, file, recording) for file in files])
-    with MEMORY_BUDGET.reserve(sum(map(unpacked_bytes, files))):
-        return _build_recording(root, job, [Part(file) for file in files])
+        tables, info = _build_unassigned(root, job, files[0])
+    elif needs_spill(job):
+        tables, info = _build_recording(root, job, [_open_spilled(root, file, recording) for file in files])
+    else:
+        with MEMORY_BUDGET.reserve(sum(map(unpacked_bytes, files))):
+            tables, info = _build_recording(root, job, [Part(file) for file in files])
+    facts = {"dataset": job.inputs["dataset"], "recording": recording}
+    return make_commit(job, tables, {**facts, **info}, started)
 
 
-def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> Commit:
-    dataset, recording, files = job.inputs["dataset"], job.inputs["recording"], files_of(job)
+def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files, dict[str, Any]]:
+    dataset, recording = job.inputs["dataset"], job.inputs["recording"]
     canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
     if not canonical.subsets:
-        raise SourceError(_nothing_left(recording, canonical))
-    written = _write(root, job, canonical)
+        raise SourceError(_explain_emptiness(recording, canonical))
     info = {
-        "dataset": dataset,
-        "recording": recording,
-        "notes": [*canonical.notes, *_suspect_truncation(root, files, canonical)],
+        "notes": [*canonical.notes, *_suspect_truncation(root, files_of(job), canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }
-    return make_commit(job, written, info)
+    return _write_tables(root, job, canonical), info
 
 
-def _nothing_left(recording: str, canonical: Canonical) -> str:
-    """Why not one row of a recording could be used: the commonest reasons, and a line of each to look at."""
+def _explain_emptiness(recording: str, canonical: Canonical) -> str:
+    """Return why no row of a recording could be used: the commonest reasons, and a line of each."""
     reasons = (
         canonical.rejects.sort("file", "line")
         .group_by("reason")
@@ -237,16 +240,16 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
     ]
 
 
-def _spilled_part(root: Path, file: RawFile, recording: str) -> Part:
+def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
     folder = spill_folder(root, file)
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
     rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
     return Part(file, pl.scan_ipc(folder / recording / "*.arrow"), rejects)
 
 
-def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFile]]:
+def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
-    files: dict[str, list[LakeFile]] = {}
+    files: Files = {}
     for subset in canonical.subsets:
         values = {"dataset": dataset, "subset": subset.name}
         for table, frame in ((TRACKS, subset.tracks), (VEHICLES, subset.vehicles), (SUBSETS, subset.facts)):
@@ -263,7 +266,7 @@ def _write(root: Path, job: Job, canonical: Canonical) -> dict[str, list[LakeFil
     return files
 
 
-def _build_unassigned(root: Path, job: Job, file: RawFile) -> Commit:
+def _build_unassigned(root: Path, job: Job, file: RawFile) -> tuple[Files, dict[str, Any]]:
     dataset = job.inputs["dataset"]
     lines = pl.read_parquet(spill_folder(root, file) / REJECTS_FILE)
     log = {
@@ -284,11 +287,9 @@ def _build_unassigned(root: Path, job: Job, file: RawFile) -> Commit:
         for table, frame in ((INGEST_LOG, pl.DataFrame([log], schema=INGEST_LOG.dtypes)), (REJECTS, rejects))
     }
     info = {
-        "dataset": dataset,
-        "recording": None,
         "notes": [f"{file.name}: {lines.height} lines belong to no recording and stand in rejects"],
         "subsets": [],
         "rows_read": lines.height,
         "rows_dropped": lines.height,
     }
-    return make_commit(job, files, info)
+    return files, info

@@ -64,7 +64,7 @@ class Folder:
         return stood["sha256"] not in self._hashes and (known or not os.path.lexists(path))
 
 
-def find_gone(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:
+def find_missing(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:
     """Entries of ingestion all of whose files stood in a folder and are gone.
 
     Args:
@@ -107,7 +107,7 @@ def find_moved(jobs: Iterable[Job], manifest: Manifest) -> list[tuple[Job, Commi
     ]
 
 
-def keys_made_of(entries: Iterable[Commit], manifest: Manifest) -> set[str]:
+def find_dependents(entries: Iterable[Commit], manifest: Manifest) -> set[str]:
     """Keys of all that goes with entries of ingestion: every stage's of the same recordings, and what builds on those.
 
     Stages over the whole lake name in `built_from` the keys that they were made of.
@@ -124,7 +124,7 @@ def _named_in(entry: Commit) -> set[str]:
     return set(entry.built_from).union(*inner)
 
 
-def describe(entries: Iterable[Commit], manifest: Manifest) -> list[Removed]:
+def describe_removed(entries: Iterable[Commit], manifest: Manifest) -> list[Removed]:
     """The recordings among entries of ingestion, with the rows that go with each."""
     found = []
     for entry in entries:
@@ -142,7 +142,7 @@ def describe(entries: Iterable[Commit], manifest: Manifest) -> list[Removed]:
     return found
 
 
-def name_all(entries: Sequence[Commit]) -> str:
+def name_recordings(entries: Sequence[Commit]) -> str:
     """Entries of ingestion for a sentence: `recordings 03, 04`, or the files whose lines have no recording."""
     names = sorted({entry.info["recording"] for entry in entries if entry.info["recording"] is not None})
     if names:
@@ -169,7 +169,7 @@ def remove_recordings(root: Path, names: Sequence[str]) -> tuple[list[Removed], 
     with open_for_writing(root) as writer:
         entries = _find_named(root, names, writer.manifest)
         entries += _their_lines(entries, writer.manifest)
-        removed, keys = describe(entries, writer.manifest), keys_made_of(entries, writer.manifest)
+        removed, keys = describe_removed(entries, writer.manifest), find_dependents(entries, writer.manifest)
         writer.remove(keys)
     return removed, sorted(key for key in keys if "/" not in key)
 

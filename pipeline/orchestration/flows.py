@@ -1,7 +1,8 @@
 """Prefect flows: ingest, quality, and the whole run; one task per (stage, recording), records in and records out.
 
-The only importer of Prefect. What a task does is a pure plan-and-build of `pipeline.stages`; what is done already was
-decided before (`pipeline.orchestration.run_plan`), so an idle rerun never comes here.
+The only importer of Prefect. It runs tasks, retries them, shows runs and artifacts, and serves deployments. It caches
+nothing: what is done already is decided by the lake's fingerprints (`pipeline.orchestration.run_plan`), so that an idle
+rerun never comes here.
 """
 
 import logging
@@ -10,7 +11,8 @@ import socket
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from contextvars import ContextVar
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ os.environ.setdefault("DO_NOT_TRACK", "1")
 import httpx
 from prefect import flow, task
 from prefect.artifacts import create_link_artifact, create_table_artifact
-from prefect.cache_policies import NO_CACHE, CacheKeyFnPolicy
+from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State
 from prefect.futures import PrefectFuture, as_completed
 from prefect.logging.handlers import PrefectConsoleHandler
@@ -29,92 +31,82 @@ from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import Commit, LakeFile, Writer, is_intact, list_ingested, open_for_writing
+from tracklake.pipeline.lake import Commit, Writer, list_ingested, open_for_writing
 from tracklake.pipeline.orchestration.artifacts import summarise_report
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
-    INGEST,
     QUALITY_STEPS,
+    RunPlan,
     RunRequest,
     RunResult,
     explain_left_out,
     explain_not_rebuilt,
-    outstanding,
     plan_ingest,
-    prune,
     remember_places,
-    survey,
+    remove_missing,
+    survey_source,
 )
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile, SourceError
+from tracklake.pipeline.stages.planner import Planner, build_job
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
-from tracklake.pipeline.stages.stage import Job
+from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas import StructureError
 
 REPORT = "report"
-IN_PLACE = ("pages", REPORT)
-"""Stages whose files are replaced under one name: what a cached record tells of them, others may have overwritten."""
 OUR_FAULTS = (400, 422)
-"""Answers of Prefect's API to a request that is wrong in itself."""
+"""HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
+SERVER_START_S = 120.0
+"""Longest wait for the embedded server, in seconds."""
+FEW_THREADS: Any = ThreadPoolTaskRunner(max_workers=min(os.cpu_count() or 1, 4))
+"""Task runner of served flows: as many recordings in memory at once as the settings' default."""
 
-Results = Iterable[tuple[str, dict[str, Any] | BaseException]]
+_PLAN: ContextVar[RunPlan | None] = ContextVar("plan", default=None)
+"""What `execute` hands to its flow beside the parameters, which Prefect stores, limits in size and shows."""
+
+Results = Iterable[tuple[str, Any]]
 
 
 def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
-    """Retry what a busy disk or a network share may cause; nothing else becomes right by being tried again."""
+    """Retry what a busy disk or a network share may cause; nothing else becomes right by a retry."""
     return isinstance(state.result(raise_on_failure=False), OSError)
 
 
-def _content_key(_context: object, parameters: dict[str, Any]) -> str:
-    """The fingerprint covers the inputs' sha256, the settings and the code; the lake's id, where the files stand."""
-    return f"tracklake-{parameters['lake_id']}-{parameters['job']['fingerprint']}"
+TASK: dict[str, Any] = {
+    "cache_policy": NO_CACHE,
+    "persist_result": False,
+    "retries": 2,
+    "retry_delay_seconds": 1,
+    "retry_condition_fn": _is_io_error,
+}
+"""Options of every task: nothing is cached, and input and output are tried three times."""
 
 
-SERVER_START_S = 120.0
-FEW_THREADS: Any = ThreadPoolTaskRunner(max_workers=min(os.cpu_count() or 1, 4))
-"""Of served flows: as many recordings in memory at once as the settings' default."""
-
-RETRIES: dict[str, Any] = {"retries": 2, "retry_delay_seconds": 1, "retry_condition_fn": _is_io_error}
-
-
-@task(task_run_name="read {title}", cache_policy=NO_CACHE, **RETRIES)
+@task(task_run_name="read {title}", **TASK)
 def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
     """Read one file that holds several recordings into the staging folder."""
     del title
     return ingest.read_file(Path(lake), dataset, RawFile.from_dict(file))
 
 
-@task(
-    task_run_name="{stage} {title}",
-    cache_policy=CacheKeyFnPolicy(cache_key_fn=_content_key),
-    persist_result=True,
-    **RETRIES,
-)
-def build(
-    stage: str, title: str, lake: str, lake_id: str, job: dict[str, Any], settings: dict[str, Any]
-) -> dict[str, Any]:
-    """One stage's work on one recording: read, transform, validate, write; returns the entry to commit."""
-    del title, lake_id
-    record = Job(**job)
+@task(task_run_name="{stage} {title}", **TASK)
+def build(stage: str, title: str, lake: str, job: dict[str, Any], settings: dict[str, Any]) -> Commit:
+    """Do one stage's work on one recording: read, transform, validate, write; returns the commit to make."""
+    del title
     if stage == INGEST:
-        return asdict(ingest.build(Path(lake), record))
-    return asdict(STAGE_BY_NAME[stage].build(Path(lake), record, Settings(**settings)))
+        return ingest.build(Path(lake), Job(**job))
+    return build_job(STAGE_BY_NAME[stage], Path(lake), Job(**job), Settings(**settings))
 
 
-def _entry(record: dict[str, Any]) -> Commit:
-    files = {table: [LakeFile(**file) for file in group] for table, group in record["files"].items()}
-    return Commit(**{**record, "files": files})
-
-
-def _settle(futures: dict[PrefectFuture[Any], str]) -> Results:
-    """(title, record or what went wrong) of each future as it ends."""
+def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
+    """Yield (title, result or error) of each future as it ends."""
     for future in as_completed(list(futures)):
         future.wait()
         yield futures[future], future.state.result(raise_on_failure=False)
 
 
-def _blame(title: str, error: BaseException, result: RunResult) -> None:
+def _record_error(title: str, error: BaseException, result: RunResult) -> None:
     """Sort an error: bad input is refused and the others go on; anything else is a failure."""
     if isinstance(error, SourceError | StructureError):
         result.refused.append(str(error))
@@ -128,46 +120,31 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest,
         return
     show = reporter()
     show.begin(stage, len(jobs))
-
     settings = request.get_settings().model_dump(mode="json")
-
-    def submit(job: Job, *, refresh: bool = False) -> PrefectFuture[Any]:
-        chosen = build.with_options(refresh_cache=True) if refresh or stage in IN_PLACE else build
-        return chosen.submit(stage, job.title, request.lake, writer.manifest.lake_id, asdict(job), settings)
-
-    by_key = {job.key: job for job in jobs}
-    for title, record in _settle({submit(job): job.title for job in jobs}):
-        if isinstance(record, dict) and not is_intact(writer.root, _files(_entry(record))):
-            # A cached record whose files were swept since: the work is done again.
-            again = submit(by_key[record["key"]], refresh=True)
-            again.wait()
-            record = again.state.result(raise_on_failure=False)
-        if isinstance(record, dict):
-            entry = _entry(record)
-            # A cached record tells where the raw files stood when it was made.
-            writer.commit(replace(entry, built_from=by_key[entry.key].built_from))
+    futures = {build.submit(stage, job.title, request.lake, asdict(job), settings): job.title for job in jobs}
+    for title, made in _await_results(futures):
+        if isinstance(made, Commit):
+            writer.commit(made)
             result.built[stage] = result.built.get(stage, 0) + 1
-            result.notes += entry.info.get("notes", [])
+            result.notes += made.info.get("notes", [])
         else:
-            _blame(title, record, result)
+            _record_error(title, made, result)
         show.advance(stage, title)
 
 
-def _files(entry: Commit) -> list[LakeFile]:
-    return [file for group in entry.files.values() for file in group]
-
-
-def _ingest(writer: Writer, request: RunRequest, result: RunResult) -> None:
+def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult) -> None:
     """Read what must be read to know its recordings, then make each recording that is not in the lake."""
-    discovery = survey(request)
+    discovery, plan = prepared.discovery, prepared.ingest
+    assert discovery is not None
     result.refused += discovery.refusals
     result.skipped += discovery.skipped
     unknown = ingest.files_to_read(discovery, writer.manifest)
     _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
-    plan = plan_ingest(request, discovery, writer.manifest)
+    if plan is None or plan.manifest != writer.manifest:  # there was no lake, or it has changed since
+        plan = plan_ingest(request, discovery, writer.manifest)
     result.refused += plan.conflicts
     remember_places(writer, request, plan)
-    prune(writer, request, plan, result)
+    remove_missing(writer, request, plan, result)
     needed = {
         file.sha256: (job.inputs["dataset"], file)
         for job in plan.jobs
@@ -189,39 +166,39 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: Ru
         for sha256, (dataset, file) in files.items()
     }
     contents = {}
-    for sha256, record in _settle(futures):
+    for sha256, record in _await_results(futures):
         if isinstance(record, dict):
             contents[sha256] = record
         else:
-            _blame(files[sha256][1].name, record, result)
+            _record_error(files[sha256][1].name, record, result)
         show.advance("read", files[sha256][1].name)
     writer.remember_sources(contents)
 
 
 def _work(request: RunRequest) -> dict[str, Any]:
+    """Run every requested stage whose outputs are missing or stale."""
     result = RunResult()
+    plan = _PLAN.get() or RunPlan(survey_source(request) if INGEST in request.steps else None)
     before = list_ingested(request.root) if request.rebuild else set()
-    if request.rebuild and not survey(request).units:
-        raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not begun anew.")
+    if request.rebuild and (plan.discovery is None or not plan.discovery.units):
+        raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not rebuilt.")
+    settings = request.get_settings()
     with open_for_writing(request.root, rebuild=request.rebuild) as writer:
         if INGEST in request.steps:
-            _ingest(writer, request, result)
-        for stage in request.stages():
-            if result.failed and stage.name not in IN_PLACE:
-                continue  # what comes later builds on what failed; the report shows what there is
+            _ingest(writer, request, plan, result)
+        for stage in request.list_stages():
+            if result.failed and stage.after:
+                continue  # it builds on what failed; the report, which comes after no stage, shows what there is
             if INGEST in request.steps and not writer.manifest.of_stage(INGEST):
                 continue  # everything was refused
-            jobs, stale = outstanding(stage, writer.root, writer.manifest, request.get_settings())
+            jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(stage.name)
             writer.remove(stale)
             _build_all(writer, stage.name, jobs, request, result)
         if set(request.steps) & {"repair", "samples", "split", "tensors"}:
             result.notes += explain_left_out(writer.manifest)
         result.notes += explain_not_rebuilt(before, writer.manifest)
         made = writer.manifest
-    if (
-        REPORT in request.steps
-        and not outstanding(STAGE_BY_NAME[REPORT], request.root, made, request.get_settings())[0]
-    ):
+    if REPORT in request.steps and not Planner(request.root, made, settings).find_outstanding(REPORT)[0]:
         result.notes += _publish(request.root)
     return asdict(result)
 
@@ -285,8 +262,13 @@ def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> 
     return _work(RunRequest(lake, tuple(stage.split("+")), settings=settings or {}))
 
 
-def execute(request: RunRequest) -> RunResult:
-    """Run an order as the flow that fits it, on threads, with nothing of Prefect's on the terminal."""
+def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
+    """Run a request as the flow that fits it, with none of Prefect's lines on the terminal.
+
+    Args:
+        request: what the user asked for.
+        plan: what was found out for it already; None: the flow finds it out.
+    """
     parameters: dict[str, Any] = {"lake": request.lake, "settings": request.settings}
     chosen: Any = run_stage
     if INGEST in request.steps:
@@ -300,7 +282,11 @@ def execute(request: RunRequest) -> RunResult:
         changed[PREFECT_API_URL] = _embed_server()
     with temporary_settings(changed):
         _mute_console()  # after all that sets logging up
-        return RunResult(**chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters))
+        token = _PLAN.set(plan)
+        try:
+            return RunResult(**chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters))
+        finally:
+            _PLAN.reset(token)
 
 
 def _choose_runner(settings: Settings) -> TaskRunner[Any]:

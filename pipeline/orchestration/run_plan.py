@@ -10,13 +10,15 @@ from tracklake.pipeline.ingest import ingest, removal
 from tracklake.pipeline.ingest.discovery import Digests, Discovery, discover
 from tracklake.pipeline.lake import Commit, LakeError, LakeMissingError, Manifest, Writer, load, open_for_writing
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
-from tracklake.pipeline.stages.stage import Job, Stage, pending
+from tracklake.pipeline.stages.stage import INGEST, Job, Stage
 from tracklake.quality_reports.rules.registry import RULES, resolve
 
-INGEST = "ingest"
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
+"""Every step of `tracklake run`, in order."""
 QUALITY_STEPS = ("validate", "repair", "assess", "report")
+"""Steps of the flow that checks what is in the lake."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,8 @@ class RunRequest:
         """
         resolve(RULES, self.get_settings().thresholds)
 
-    def stages(self) -> list[Stage]:
-        """The stages after ingestion that are asked for; with the report, the pages that it leads to."""
+    def list_stages(self) -> list[Stage]:
+        """Return the requested stages after ingestion; with the report, the pages that it links to."""
         wanted = {*self.steps, *({"pages"} if "report" in self.steps else ())}
         return [stage for stage in STAGES if stage.name in wanted]
 
@@ -101,68 +103,91 @@ class IngestPlan:
     """What a source means for the lake.
 
     Args:
-        jobs: that are not done.
+        manifest: the lake that the source was compared with.
+        jobs: work that is not done.
         conflicts: messages about recordings that would lose rows of other files.
-        gone: entries whose files once stood in the source and are gone from it.
-        superseded: entries that a new version of their file makes void.
-        moved: entries that stay, with the places where their files stand now.
+        missing: commits whose files once stood in the source and are missing from it now.
+        superseded: commits that a new version of their file makes void.
+        moved: commits that stay, with the places where their files are now.
     """
 
+    manifest: Manifest
     jobs: list[Job]
     conflicts: list[str]
-    gone: list[Commit]
+    missing: list[Commit]
     superseded: list[Commit]
     moved: list[Commit]
 
 
-def survey(request: RunRequest) -> Discovery:
-    """Find the raw files of an order; their hashes are remembered in the lake.
+@dataclass(frozen=True)
+class RunPlan:
+    """What a command found out before it starts any work: it is handed on, so that nothing is found out twice.
+
+    Args:
+        discovery: the source's raw files; None where nothing is ingested.
+        ingest: the source compared with the lake; None where files have to be read first, or there is no lake yet.
+        is_idle: whether everything that was requested is in the lake already.
+    """
+
+    discovery: Discovery | None = None
+    ingest: IngestPlan | None = None
+    is_idle: bool = False
+
+
+def survey_source(request: RunRequest) -> Discovery:
+    """Find the raw files of a request; their hashes are remembered in the lake.
 
     Raises:
-        tracklake.pipeline.sources.SourceError: nothing there.
+        ValueError: the request names no source.
+        tracklake.pipeline.sources.SourceError: the source holds nothing.
     """
     if request.source is None:
-        raise ValueError("an order to ingest needs a source")
+        raise ValueError("a request to ingest needs a source")
     digests = Digests(request.root)
     discovery = discover(request.origin, dataset=request.dataset, digest=digests)
     digests.save()
     return discovery
 
 
-def is_idle(request: RunRequest, discovery: Discovery | None) -> bool:
-    """Whether everything that was asked for is in the lake already, and nothing else that was asked to go."""
+def plan_run(request: RunRequest, discovery: Discovery | None) -> RunPlan:
+    """Compare a request with the lake.
+
+    Raises:
+        StageError: a stage that is not requested has to run first.
+    """
     if request.rebuild:
-        return False
+        return RunPlan(discovery)
     try:
         manifest = load(request.root)
     except LakeMissingError:
-        return False
+        return RunPlan(discovery)
+    plan = None
     if discovery is not None:
         if ingest.files_to_read(discovery, manifest):
-            return False
+            return RunPlan(discovery)
         plan = plan_ingest(request, discovery, manifest)
-        if plan.jobs or plan.superseded or (request.prune and plan.gone):
-            return False
-    return not any(
-        any(outstanding(stage, request.root, manifest, request.get_settings())) for stage in request.stages()
-    )
+        if plan.jobs or plan.superseded or (request.prune and plan.missing):
+            return RunPlan(discovery, plan)
+    planner = Planner(request.root, manifest, request.get_settings())
+    is_idle = not any(any(planner.find_outstanding(stage.name)) for stage in request.list_stages())
+    return RunPlan(discovery, plan, is_idle)
 
 
-def conclude_idle(request: RunRequest, discovery: Discovery | None) -> RunResult:
-    """What there is to say where nothing is to do; the lake learns where files stand that were moved."""
-    if discovery is None:
+def conclude_idle(request: RunRequest, plan: RunPlan) -> RunResult:
+    """Return what an idle run has to report; the lake remembers where files that were moved are now."""
+    if plan.discovery is None or plan.ingest is None:
         return RunResult()
-    plan = plan_ingest(request, discovery, load(request.root))
-    if plan.moved:
+    if plan.ingest.moved:
         with suppress(LakeError), open_for_writing(request.root) as writer:  # where it is busy, the next run will do
-            remember_places(writer, request, plan)
-    return RunResult(refused=[*discovery.refusals, *plan.conflicts], notes=explain_gone(plan))
+            remember_places(writer, request, plan.ingest)
+    refused = [*plan.discovery.refusals, *plan.ingest.conflicts]
+    return RunResult(refused=refused, notes=explain_missing(plan.ingest))
 
 
 def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -> IngestPlan:
     """Compare a source with the lake."""
     planned = ingest.plan(discovery, manifest)
-    jobs = pending(request.root, manifest, planned)
+    jobs = find_pending(request.root, manifest, planned)
     folder = removal.Folder(request.origin, discovery)
     conflicts = {} if request.replace else ingest.find_replaced(jobs, manifest)
     for job in jobs:
@@ -171,55 +196,57 @@ def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -
             if request.prune:
                 del conflicts[job.key]
     superseded = removal.find_superseded(discovery, manifest)
-    gone = removal.find_gone(folder, planned, manifest, request.dataset)
+    missing = removal.find_missing(folder, planned, manifest, request.dataset)
     return IngestPlan(
+        manifest=manifest,
         jobs=[job for job in jobs if job.key not in conflicts],
         conflicts=sorted(conflicts.values()),
-        gone=[entry for entry in gone if entry not in superseded],
+        missing=[commit for commit in missing if commit not in superseded],
         superseded=superseded,
         moved=[
-            replace(entry, built_from={**entry.built_from, "sources": job.built_from["sources"]})
-            for job, entry in removal.find_moved(planned, manifest)
+            replace(commit, built_from={**commit.built_from, "sources": job.built_from["sources"]})
+            for job, commit in removal.find_moved(planned, manifest)
             if job not in jobs
         ],
     )
 
 
 def remember_places(writer: Writer, request: RunRequest, plan: IngestPlan) -> None:
-    """Let the lake know where the raw files of its recordings are."""
+    """Record in the lake where the raw files of its recordings are."""
     writer.remember_origin(str(request.origin))
-    for entry in plan.moved:
-        writer.commit(entry)
+    for commit in plan.moved:
+        writer.commit(commit)
 
 
-def prune(writer: Writer, request: RunRequest, plan: IngestPlan, result: RunResult) -> None:
-    """Remove what a new version of its file makes void, and what was made of files that are gone, where asked to."""
-    gone = plan.gone if request.prune else []
-    removed = removal.describe(gone, writer.manifest)
-    writer.remove(removal.keys_made_of([*plan.superseded, *gone], writer.manifest))
+def remove_missing(writer: Writer, request: RunRequest, plan: IngestPlan, result: RunResult) -> None:
+    """Remove what a new version of its file makes void; with --prune, also what was made of files that are missing."""
+    missing = plan.missing if request.prune else []
+    removed = removal.describe_removed(missing, writer.manifest)
+    writer.remove(removal.find_dependents([*plan.superseded, *missing], writer.manifest))
     result.removed += [recording.name for recording in removed]
-    if gone:
+    if missing:
         rows = sum(recording.entries for recording in removed)
         result.notes.append(
-            f"{removal.name_all(gone)}: no longer in SOURCE, and removed from the lake ({rows:,} rows of tracks)"
+            f"{removal.name_recordings(missing)}: no longer in SOURCE, and removed from the lake "
+            f"({rows:,} rows of tracks)"
         )
     else:
-        result.notes += explain_gone(plan)
+        result.notes += explain_missing(plan)
 
 
-def explain_gone(plan: IngestPlan) -> list[str]:
-    """Say which recordings are in the lake although their files are gone."""
-    if not plan.gone:
+def explain_missing(plan: IngestPlan) -> list[str]:
+    """Return a note about the recordings that are in the lake although their files are missing from the source."""
+    if not plan.missing:
         return []
-    name = removal.name_all(plan.gone)
+    name = removal.name_recordings(plan.missing)
     many = not name.startswith("recording ")
     are, their = ("are", "their") if many else ("is", "its")
     return [f"{name} {are} in the lake, but {their} files are no longer in SOURCE; --prune removes {their} tables"]
 
 
 def explain_not_rebuilt(before: set[str], manifest: Manifest) -> list[str]:
-    """Say which recordings a lake held before it was begun anew, and does not hold now."""
-    missing = sorted(before - {entry.key.partition("/")[2] for entry in manifest.of_stage(INGEST)})
+    """Return a note about recordings that a lake held before it was rebuilt, and does not hold now."""
+    missing = sorted(before - {commit.tail for commit in manifest.of_stage(INGEST)})
     if not missing:
         return []
     return [
@@ -228,23 +255,12 @@ def explain_not_rebuilt(before: set[str], manifest: Manifest) -> list[str]:
     ]
 
 
-def outstanding(stage: Stage, root: Path, manifest: Manifest, settings: Settings) -> tuple[list[Job], set[str]]:
-    """The jobs of a stage that are not done, and keys of entries it made once and would not make now.
-
-    Raises:
-        StageError: an earlier stage has to run first.
-    """
-    jobs = stage.plan(root, manifest, settings)
-    stale = {entry.key for entry in manifest.of_stage(stage.name)} - {job.key for job in jobs}
-    return pending(root, manifest, jobs), stale
-
-
 def explain_left_out(manifest: Manifest) -> list[str]:
-    """Say which subsets took no part in the freeway-only stages, and why."""
+    """Return a note about the subsets that are left out of the freeway-only stages, and why."""
     arterials = sorted(
         subset["subset"]
-        for entry in manifest.of_stage(INGEST)
-        for subset in entry.info["subsets"]
+        for commit in manifest.of_stage(INGEST)
+        for subset in commit.info["subsets"]
         if not subset["freeway"]
     )
     notes = []

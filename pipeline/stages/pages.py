@@ -1,6 +1,6 @@
-"""Pages: one of the report per subset, drawn anew only where what it shows has changed."""
+"""Pages: one of the report per subset, written again only where what it shows has changed."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -9,38 +9,37 @@ from typing import Any
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, connect, is_intact, scan
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
+from tracklake.pipeline.stages.readers import LakeReader
+from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
 from tracklake.schemas import SPLITS
 from tracklake.schemas.files import write_file
 
-VERSION = 1
 
-
-def plan(root: Path, manifest: Manifest, _settings: Settings) -> list[Job]:
-    """One job per recording, made of all that was made of it, and of where it stands in the splits."""
-    held = recordings(manifest)
-    names = name_pages(
-        [{"dataset": each["dataset"], "subset": subset["subset"]} for each in held for subset in each["subsets"]]
-    )
+def _find_inputs(root: Path, manifest: Manifest, _settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return by recording all that was made of it, its parts of the splits, and the names of its pages."""
+    recordings = manifest.of_stage(INGEST)
+    keys = {
+        each.tail: [(each.info["dataset"], subset["subset"]) for subset in each.info["subsets"]] for each in recordings
+    }
+    names = name_pages([{"dataset": dataset, "subset": subset} for own in keys.values() for dataset, subset in own])
     parts = _find_parts(root, manifest)
-    jobs = []
-    for each in held:
-        tail = f"{each['dataset']}/{each['recording']}"
-        subsets = [(each["dataset"], subset["subset"]) for subset in each["subsets"]]
-        own = manifest.of_recording(tail).commits.values()
-        made_of = {
-            "entries": {entry.key: entry.fingerprint for entry in own if "/" in entry.key and entry.stage != "pages"},
-            "parts": [parts.get(key, []) for key in subsets],
-            "pages": [names[key] for key in subsets],
+    made: dict[str, dict[str, str]] = {tail: {} for tail in keys}
+    for commit in manifest.commits.values():
+        if commit.tail in made and commit.stage != "pages":
+            made[commit.tail][commit.key] = commit.fingerprint
+    return {
+        tail: {
+            "commits": made[tail],
+            "parts": [parts.get(key, []) for key in own],
+            "pages": {subset: names[dataset, subset] for dataset, subset in own},
         }
-        inputs = {"recording": tail, "pages": [(*key, names[key]) for key in subsets]}
-        jobs.append(make_job(f"pages/{tail}", version_of_stage=VERSION, made_of=made_of, inputs=inputs))
-    return jobs
+        for tail, own in keys.items()
+    }
 
 
 def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[Any]]:
-    """The rows of `splits` by (dataset, subset); none where its files are not whole, so that it is made anew first."""
+    """Return the rows of `splits` by (dataset, subset); none where its files are not whole and are made again first."""
     if not is_intact(root, manifest.live(SPLITS.name)):
         return {}
     rows = scan(root, manifest, SPLITS).sort(SPLITS.key).collect()
@@ -50,35 +49,52 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
     }
 
 
-def build(root: Path, job: Job, _settings: Settings) -> Commit:
+def build(reader: LakeReader, _settings: Settings) -> StageResult:
     """Query what the lake holds of one recording and write its subsets' pages into reports/subsets/."""
     from tracklake.quality_reports.pages.subsets import render_pages
     from tracklake.quality_reports.summaries import collect
 
-    provenance = {
+    dataset, pages = reader.job.inputs["dataset"], reader.job.built_from["pages"]
+    names = {(dataset, subset): name for subset, name in pages.items()}
+    with connect(reader.root, recording=reader.job.tail) as connection:
+        rendered = render_pages(connection, collect(connection, describe_origin(reader.root)), names=names)
+        files = [write_report_file(reader.root, f"{FOLDER}/{name}", content) for name, content in rendered]
+    return StageResult(files={REPORTS: files}, info={"pages": [(*key, name) for key, name in names.items()]})
+
+
+STAGE = Stage(
+    name="pages",
+    meaning="Draw the report's page of each subset.",
+    scope="recording",
+    after=(),  # a page shows what there is
+    version=1,
+    build=build,
+    per_subset=False,
+    extra_inputs=_find_inputs,
+)
+
+
+def describe_origin(root: Path) -> dict[str, str]:
+    """Return which lake a report is of, and when and by which version it is made."""
+    return {
         "lake": root.resolve().name,
         "created": datetime.now(tz=UTC).isoformat(timespec="seconds"),
         "tracklake": version("tracklake"),
     }
-    names = {(dataset, subset): name for dataset, subset, name in job.inputs["pages"]}
-    with connect(root, recording=job.inputs["recording"]) as connection:
-        pages = render_pages(connection, collect(connection, provenance), names=names)
-        files = [write_report_file(root, f"{FOLDER}/{name}", content) for name, content in pages]
-    return make_commit(job, {REPORTS: files}, {"pages": job.inputs["pages"]})
 
 
-def find_pages(root: Path, entries: Iterable[Commit]) -> dict[tuple[str, str], str]:
-    """File names of the pages that are there, by (dataset, subset), of this stage's entries."""
+def find_pages(root: Path, commits: Iterable[Commit]) -> Mapping[tuple[str, str], str]:
+    """Return the file names of the pages that exist, by (dataset, subset), of this stage's commits."""
     return {
         (dataset, subset): name
-        for entry in entries
-        if is_intact(root, entry.files[REPORTS])
-        for dataset, subset, name in entry.info["pages"]
+        for commit in commits
+        if is_intact(root, commit.files[REPORTS])
+        for dataset, subset, name in commit.info["pages"]
     }
 
 
 def write_report_file(root: Path, name: str, content: str) -> LakeFile:
-    """Put one file of the report into its place."""
+    """Write one file of the report into its place."""
     target = root / REPORTS / name
     target.parent.mkdir(parents=True, exist_ok=True)
     write_file(target, content.encode("utf-8", "backslashreplace"))

@@ -1,59 +1,29 @@
 """Repair: where tracks should begin, which begin late, and the frames that are missing of those."""
 
-from pathlib import Path
+import polars as pl
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
+from tracklake.pipeline.stages.readers import SubsetReader
+from tracklake.pipeline.stages.stage import INGEST, Stage
 from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
-from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
-
-VERSION = 2
+from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, TRACKS, VEHICLE_STARTS, VEHICLES, Table
 
 
-def plan(_root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job per freeway recording."""
-    return [
-        make_job(
-            f"repair/{recording['dataset']}/{recording['recording']}",
-            version_of_stage=VERSION,
-            made_of={"ingest": recording["fingerprint"], "on_ramp_lanes": settings.on_ramp_lanes},
-            inputs={"dataset": recording["dataset"], "subsets": [item["subset"] for item in recording["subsets"]]},
-        )
-        for recording in recordings(manifest, freeway_only=True)
-    ]
-
-
-def build(root: Path, job: Job, settings: Settings) -> Commit:
+def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]:
     """Judge every vehicle's start and estimate what is missing of the late ones."""
-    manifest, dataset = load(root), job.inputs["dataset"]
-    files: dict[str, list[LakeFile]] = {}
-    late = 0
-    for subset in job.inputs["subsets"]:
-        values = {"dataset": dataset, "subset": subset}
-        tracks = scan(root, manifest, TRACKS, **values).collect()
-        vehicles = scan(root, manifest, VEHICLES, **values).collect()
-        facts = scan(root, manifest, SUBSETS, **values).collect().row(0, named=True)
-        on_ramps = settings.on_ramp_lanes.get(facts["site"], facts["on_ramp_lanes"])
-        starts, cutoffs = judge_starts(
-            vehicles,
-            dataset=dataset,
-            subset=subset,
-            first_frame=facts["first_frame"],
-            frame_rate_hz=facts["frame_rate_hz"],
-            on_ramp_lanes=tuple(on_ramps),
-        )
-        missing = estimate_missing_starts(
-            tracks,
-            starts,
-            dataset=dataset,
-            subset=subset,
-            cutoff_m=cutoffs["cutoff_m"][0],
-            first_frame=facts["first_frame"],
-            frame_rate_hz=facts["frame_rate_hz"],
-        )
-        for table, frame in ((VEHICLE_STARTS, starts), (START_CUTOFFS, cutoffs), (MISSING_STARTS, missing)):
-            written = write_table(root, table, frame, values, job.fingerprint, where=subset)
-            files.setdefault(table.name, []).extend(written)
-        late += missing.height
-    return make_commit(job, files, {"late": late})
+    on_ramps = settings.on_ramp_lanes.get(reader.facts["site"], reader.facts["on_ramp_lanes"])
+    known = {**reader.partition, **reader.clock}
+    starts, cutoffs = judge_starts(reader.table(VEHICLES), on_ramp_lanes=tuple(on_ramps), **known)
+    missing = estimate_missing_starts(reader.table(TRACKS), starts, cutoff_m=cutoffs["cutoff_m"][0], **known)
+    return {VEHICLE_STARTS: starts, START_CUTOFFS: cutoffs, MISSING_STARTS: missing}
+
+
+STAGE = Stage(
+    name="repair",
+    meaning="Find late starts and estimate what is missing of them.",
+    scope="freeway recording",
+    after=(INGEST,),
+    settings=("on_ramp_lanes",),
+    version=2,
+    build=build,
+)

@@ -1,49 +1,51 @@
 """Report: the lake's quality as one page for people and one document for programs."""
 
 import platform
-from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Commit, Manifest, connect, load
+from tracklake.pipeline.lake import Manifest, connect
 from tracklake.pipeline.lake.files import REPORTS, remove
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
-from tracklake.pipeline.stages.pages import find_pages, write_report_file
+from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_report_file
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
-from tracklake.pipeline.stages.stage import Job, make_commit, make_job, recordings
+from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE
 from tracklake.quality_reports.rules.registry import RULES, resolve
 from tracklake.schemas.files import remove_unfinished
 from tracklake.schemas.hashing import hash_chunks
 
-VERSION = 4
-PAGE, DOCUMENT = "index.html", "quality.json"
+PAGE = "index.html"
+"""Name of the report's page for people."""
+DOCUMENT = "quality.json"
+"""Name of the report's document for programs."""
 SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
+"""Libraries whose versions the report names."""
 
 
-def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job over everything that is in the lake, the subsets' pages among it."""
-    entries = {key: entry.fingerprint for key, entry in manifest.commits.items() if entry.stage != "report"}
+def _find_inputs(root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return everything in the lake, the subsets' pages and the models' runs among it, as the report's inputs."""
+    commits = {key: commit.fingerprint for key, commit in manifest.commits.items() if commit.stage != "report"}
     runs = {path.parent.name: hash_chunks([path.read_bytes()], 16) for path in finished_runs(root)}
-    made_of = {"entries": entries, "runs": runs, "settings": _shown(settings), **_find_thresholds(manifest, settings)}
-    return [make_job("report", version_of_stage=VERSION, made_of=made_of, inputs={})]
+    return {"": {"commits": commits, "runs": runs, **_find_thresholds(manifest, settings)}}
 
 
-def _shown(settings: Settings) -> dict[str, object]:
-    """Settings that change what is in the lake, not where it stands or how fast it is made; thresholds apart.
+def _describe_settings(settings: Settings) -> dict[str, Any]:
+    """Return the settings that change what is in the lake, not where it is or how fast it is made; thresholds apart.
 
-    Those that are the protocol's where nobody sets them are shown as they are in force.
+    Those that the protocol decides where the user sets none are given as they are in force.
     """
     shown = settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address", "thresholds"})
     protocol = settings.get_protocol()
-    return shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}
+    return {"settings": shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}}
 
 
 def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
-    """What validation judged by, whatever the settings are now.
+    """Return the thresholds that validation used, whatever the settings are now.
 
     Returns:
         thresholds: those of most recordings that are not the defaults, by name; of the settings before validation.
@@ -51,10 +53,8 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
     """
     defaults = resolve(RULES)
     used = {
-        entry.key.partition("/")[2]: {
-            name: entry.built_from["thresholds"].get(name, defaults[name]) for name in defaults
-        }
-        for entry in manifest.of_stage("validate")
+        commit.tail: {name: commit.built_from["thresholds"].get(name, defaults[name]) for name in defaults}
+        for commit in manifest.of_stage("validate")
     }
     usual = max(used.values(), key=list(used.values()).count, default=resolve(RULES, settings.thresholds))
     return {
@@ -67,28 +67,24 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
     }
 
 
-def build(root: Path, job: Job, settings: Settings) -> Commit:
+def build(reader: LakeReader, settings: Settings) -> StageResult:
     """Query the lake and write reports/index.html and reports/quality.json; the subsets' pages are there by then."""
     from tracklake.quality_reports.pages.report import build_report
 
-    manifest = load(root)
+    root, manifest, built_from = reader.root, reader.manifest, reader.job.built_from
+    datasets = {commit.info["dataset"] for commit in manifest.of_stage(INGEST) if commit.info["subsets"]}
     provenance = {
-        "lake": root.resolve().name,
-        "lake_id": manifest.lake_id,
-        "created": datetime.now(tz=UTC).isoformat(timespec="seconds"),
-        "tracklake": version("tracklake"),
+        **{"lake": None, "lake_id": manifest.lake_id, **describe_origin(root)},
         "python": platform.python_version(),
         "versions": {name: version(name) for name in SHOWN_VERSIONS},
-        **_find_thresholds(manifest, settings),
-        "settings": _shown(settings),
+        **{name: built_from[name] for name in ("thresholds", "thresholds_elsewhere", "settings")},
         "data": {
             source.name: {"title": source.title, "licence": source.licence, "citation": source.citation}
             for source in SOURCES
-            if any(recording["dataset"] == source.name for recording in recordings(manifest))
+            if source.name in datasets
         },
         "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
     }
-    # No overview leads to a page that is not there, and no page is of a subset that is gone.
     made = manifest.of_stage("pages")
     with connect(root) as connection:
         notes: list[str] = []
@@ -99,8 +95,21 @@ def build(root: Path, job: Job, settings: Settings) -> Commit:
         files.append(write_report_file(root, SPLITS_PAGE, report.splits_html))
     else:
         (root / REPORTS / SPLITS_PAGE).unlink(missing_ok=True)
-    live = {root / file.path for entry in made for file in entry.files[REPORTS]}
+    # Pages of subsets that are no longer in the lake, which the overview does not link to.
+    live = {root / file.path for commit in made for file in commit.files[REPORTS]}
     remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
         remove_unfinished(folder)
-    return make_commit(job, {REPORTS: files}, {"notes": notes})
+    return StageResult(files={REPORTS: files}, notes=notes)
+
+
+STAGE = Stage(
+    name="report",
+    meaning="Write the quality report.",
+    scope="lake",
+    after=(),  # the report shows what there is
+    settings=(_describe_settings,),
+    version=4,
+    build=build,
+    extra_inputs=_find_inputs,
+)

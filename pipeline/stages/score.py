@@ -5,68 +5,72 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load
+from tracklake.pipeline.lake import LakeFile, Manifest
 from tracklake.pipeline.lake.files import MODELS, TENSORS
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import tensors
-from tracklake.pipeline.stages.stage import Job, make_commit, make_job, upstream
+from tracklake.pipeline.stages.readers import LakeReader
+from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.schemas.tensors import INDEX_FILE
 
-VERSION = 2
 BASELINE = "constant-velocity"
+"""Name of the model that is scored, and of its run."""
 
 
-def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job where there are tensors."""
-    made = upstream(tensors.plan, root, manifest, settings)
-    if not made or manifest.commits[TENSORS].info["path"] is None:
-        return []
-    made_of = {**made, "model": BASELINE}
-    return [make_job("score", version_of_stage=VERSION, made_of=made_of, inputs={})]
-
-
-def build(root: Path, job: Job, settings: Settings) -> Commit:
+def build(reader: LakeReader, settings: Settings) -> StageResult:
     """Evaluate the baseline and write it as a run like any other."""
     from tracklake.training.train import train
 
-    out = root / MODELS / BASELINE
-    metrics = train(BASELINE, tensor_folder(root, load(root), settings), out)
+    out = reader.root / MODELS / BASELINE
+    metrics = train(BASELINE, tensor_folder(reader.root, reader.manifest, settings), out)
     files = [
-        LakeFile(file.relative_to(root).as_posix(), None, file.stat().st_size)
+        LakeFile(file.relative_to(reader.root).as_posix(), None, file.stat().st_size)
         for file in sorted(out.iterdir())
         if file.is_file()
     ]
-    unscored = [] if metrics["evaluation"] else ["no score: the split's evaluation part has no samples"]
-    return make_commit(job, {MODELS: files}, {"notes": unscored})
+    notes = [] if metrics["evaluation"] else ["no score: the split's evaluation part has no samples"]
+    return StageResult(files={MODELS: files}, notes=notes)
+
+
+STAGE = Stage(
+    name="score",
+    meaning="Score the constant-velocity baseline.",
+    scope="lake",
+    after=(TENSORS,),
+    settings=(lambda _settings: {"model": BASELINE},),
+    version=2,
+    build=build,
+)
 
 
 def finished_runs(root: Path) -> list[Path]:
-    """metrics.json of every run in the lake, sorted by name; what a killed training left is hidden and none."""
+    """Return metrics.json of every run in the lake, sorted by name; an unfinished run is hidden and left out."""
     return sorted(path for path in (root / MODELS).glob("*/metrics.json") if not path.parent.name.startswith("."))
 
 
-def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None]) -> list[dict[str, Any]]:
-    """What the runs in the lake scored, of those that were made from the tensors that are live now.
+def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Return the scores of the runs that were made from the tensors that are live now.
 
     Args:
-        root: the lake.
-        manifest: its live files.
-        pass_by: told of each run that is damaged or of another version: which, and why.
+        root: the lake's folder.
+        manifest: live files of the lake.
+        skip: called with a message for each run that is damaged or of another version.
 
     Returns:
         {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
     """
     from tracklake.training.runs.run_folder import StaleRunError, read_config
 
-    if TENSORS not in manifest.commits or manifest.commits[TENSORS].info["path"] is None:
+    commit = manifest.commits.get(TENSORS)
+    if commit is None or commit.info["path"] is None:
         return []
-    index = json.loads((root / manifest.commits[TENSORS].info["path"] / "index.json").read_text(encoding="utf-8"))
+    index = json.loads((root / commit.info["path"] / INDEX_FILE).read_text(encoding="utf-8"))
     scores = []
     for path in finished_runs(root):
         try:
             config, scored = read_config(path.parent), _read_score(path)
         except (StaleRunError, FileNotFoundError) as stale:
-            pass_by(f"skipped a run: {stale}")
+            skip(f"skipped a run: {stale}")
             continue
         if scored is not None and (config["protocol"], config["blocks"]) == (index["protocol"], index["blocks"]):
             scores.append({"model": path.parent.name, **scored})
@@ -74,7 +78,7 @@ def collect_scores(root: Path, manifest: Manifest, pass_by: Callable[[str], None
 
 
 def _read_score(path: Path) -> dict[str, Any] | None:
-    """Part and rows of a run's metrics.json; None where the part had no samples.
+    """Return part and rows of a run's metrics.json; None where the part had no samples.
 
     Raises:
         StaleRunError: the file is damaged.

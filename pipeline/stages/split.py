@@ -1,15 +1,14 @@
 """Split: which subsets train and which evaluate, by every recipe that is asked for, and what the parts share."""
 
-from pathlib import Path
+from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.lake import Commit, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import samples
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.split_leakage import Leakage, measure, open_tables, refuse_leaks
 from tracklake.pipeline.stages.split_makers import SplitInputs, SplitResult, make_split
-from tracklake.pipeline.stages.stage import Job, make_commit, make_job, upstream
+from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
 from tracklake.schemas import (
     SAMPLES,
     SPLIT_BALANCE,
@@ -25,77 +24,49 @@ from tracklake.schemas import (
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.split_recipes import MEANINGS, SplitRecipe
 
-VERSION = 3
 
-
-def plan(root: Path, manifest: Manifest, settings: Settings) -> list[Job]:
-    """One job over all freeway recordings; samples come before."""
-    drawn = upstream(samples.plan, root, manifest, settings)
-    if not drawn:
-        return []
-    recipes = settings.get_split_recipes()
-    return [
-        make_job(
-            "split",
-            version_of_stage=VERSION,
-            made_of={
-                "samples": drawn,
-                "protocol": settings.get_protocol().digest,
-                "splits": {recipe.name: recipe.digest for recipe in recipes},
-                "validation_part": settings.validation_part,
-                "seed": settings.split_seed,
-            },
-            inputs={},
-        )
-    ]
-
-
-def build(root: Path, job: Job, settings: Settings) -> Commit:
+def build(reader: LakeReader, settings: Settings) -> StageResult:
     """Divide the subsets that are not excluded by every recipe, and measure what the parts share.
 
     Raises:
         StageError: a split that claims to be free of leakage is not.
     """
-    manifest, protocol = load(root), settings.get_protocol()
-    subsets = gather_subsets(root, manifest, protocol)
-    material = SplitInputs(root, manifest, subsets, protocol)
-    made = {recipe: make_split(recipe, material) for recipe in settings.get_split_recipes()}
-    measured = _measure_all(material, made)
+    inputs = SplitInputs(reader, gather_subsets(reader, settings.get_protocol()), settings.get_protocol())
+    made = {recipe: make_split(recipe, inputs) for recipe in settings.get_split_recipes()}
+    measured = _measure_all(inputs, made)
     refuse_leaks(measured)
-    frames = [
-        (SPLITS, [split.allocation.splits for split in made.values()]),
-        (SPLIT_BALANCE, [split.allocation.balance for split in made.values()]),
-        (SPLIT_LEFT_OUT, [split.left_out for split in made.values()]),
-        (SPLIT_RECIPES, [_describe(made, protocol)]),
-        (SPLIT_LEAKAGE, [found.leakage for found in measured.values()]),
-        (SPLIT_CONTEXT, [found.context for found in measured.values()]),
-        (SPLIT_SHIFTS, [found.shifts for found in measured.values()]),
-    ]
-    files = {
-        table.name: write_table(root, table, pl.concat(parts).sort(table.key), {}, job.fingerprint, where="split")
-        for table, parts in frames
+    frames = {
+        SPLITS: [split.allocation.splits for split in made.values()],
+        SPLIT_BALANCE: [split.allocation.balance for split in made.values()],
+        SPLIT_LEFT_OUT: [split.left_out for split in made.values()],
+        SPLIT_RECIPES: [_describe_recipes(made, inputs.protocol)],
+        SPLIT_LEAKAGE: [found.leakage for found in measured.values()],
+        SPLIT_CONTEXT: [found.context for found in measured.values()],
+        SPLIT_SHIFTS: [found.shifts for found in measured.values()],
     }
-    notes = [note for recipe, split in made.items() for note in _tell(recipe, split, measured[recipe])]
-    return make_commit(job, files, {"notes": notes, "subsets": subsets.height})
+    return StageResult(
+        {table: pl.concat(parts).sort(table.key) for table, parts in frames.items()},
+        notes=[note for recipe, split in made.items() for note in _write_notes(recipe, split, measured[recipe])],
+    )
 
 
-def gather_subsets(root: Path, manifest: Manifest, protocol: Protocol) -> pl.DataFrame:
-    """The freeway subsets that are not excluded, with their kept samples.
+def gather_subsets(reader: LakeReader, protocol: Protocol) -> pl.DataFrame:
+    """Return the freeway subsets that are not excluded, with the number of their samples.
 
     Returns:
         What `allocate_flow_balanced` reads, and recording, lanes, frame_rate_hz.
     """
     kept = (
-        scan(root, manifest, SAMPLES)
+        reader.scan(SAMPLES)
         .filter(pl.col("protocol") == protocol.name)
         .group_by("dataset", "subset")
         .agg(weight=pl.len().cast(pl.Int64))
     )
     shown = ("dataset", "subset", "recording", "site", "direction", "lanes", "frame_rate_hz", "vehicles", "weight")
     return (
-        scan(root, manifest, SUBSETS)
+        reader.scan(SUBSETS)
         .filter(pl.col("freeway"))
-        .join(scan(root, manifest, SUBSET_STATUS).select("dataset", "subset", "excluded"), on=["dataset", "subset"])
+        .join(reader.scan(SUBSET_STATUS).select("dataset", "subset", "excluded"), on=["dataset", "subset"])
         .filter(~pl.col("excluded"))
         .join(kept, on=["dataset", "subset"], how="left")
         .with_columns(pl.col("weight").fill_null(0))
@@ -104,9 +75,9 @@ def gather_subsets(root: Path, manifest: Manifest, protocol: Protocol) -> pl.Dat
     )
 
 
-def _measure_all(material: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> dict[SplitRecipe, Leakage]:
-    places = material.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
-    with open_tables(material.root, material.manifest) as connection:
+def _measure_all(inputs: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> dict[SplitRecipe, Leakage]:
+    places = inputs.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
+    with open_tables(inputs.reader.root, inputs.reader.manifest) as connection:
         return {
             recipe: measure(
                 connection,
@@ -114,15 +85,15 @@ def _measure_all(material: SplitInputs, made: dict[SplitRecipe, SplitResult]) ->
                 split.left_out,
                 places,
                 recipe=recipe,
-                protocol=material.protocol.name,
+                protocol=inputs.protocol.name,
                 flows=split.flows,
             )
             for recipe, split in made.items()
         }
 
 
-def _describe(made: dict[SplitRecipe, SplitResult], protocol: Protocol) -> pl.DataFrame:
-    """Rows of `split_recipes`."""
+def _describe_recipes(made: dict[SplitRecipe, SplitResult], protocol: Protocol) -> pl.DataFrame:
+    """Return the rows of `split_recipes`."""
     rows = [
         {
             "split": recipe.name,
@@ -138,8 +109,8 @@ def _describe(made: dict[SplitRecipe, SplitResult], protocol: Protocol) -> pl.Da
     return pl.DataFrame(rows, schema=SPLIT_RECIPES.dtypes)
 
 
-def _tell(recipe: SplitRecipe, made: SplitResult, measured: Leakage) -> list[str]:
-    """What the user should know of a split: constraints that were relaxed, vehicles left out, leakage."""
+def _write_notes(recipe: SplitRecipe, made: SplitResult, measured: Leakage) -> list[str]:
+    """Return what the user should know of a split: constraints that were relaxed, vehicles left out, leakage."""
     notes = [
         f"split {recipe.name} of {dataset} is relaxed: {reason}"
         for dataset, reason in sorted(made.allocation.relaxations.items())
@@ -153,3 +124,22 @@ def _tell(recipe: SplitRecipe, made: SplitResult, measured: Leakage) -> list[str
     if measured.find_leaks(recipe.window_s):
         notes.append(f"split {recipe.name}, made for comparison, leaks: {'; '.join(measured.sum_up())}")
     return notes
+
+
+def _describe_splits(settings: Settings) -> dict[str, Any]:
+    return {
+        "protocol": settings.get_protocol().digest,
+        "splits": {recipe.name: recipe.digest for recipe in settings.get_split_recipes()},
+        "seed": settings.split_seed,
+    }
+
+
+STAGE = Stage(
+    name="split",
+    meaning="Divide the subsets into train and eval.",
+    scope="lake",
+    after=(INGEST, "validate", "samples"),
+    settings=(_describe_splits, "validation_part"),
+    version=3,
+    build=build,
+)

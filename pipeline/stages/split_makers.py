@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, write_up
 from tracklake.pipeline.transforms.splits.comparisons import divide_by_id, divide_by_recording
 from tracklake.pipeline.transforms.splits.tables import Allocation
@@ -30,22 +29,20 @@ class SplitInputs:
     """What splits are made from.
 
     Args:
-        root: the lake.
-        manifest: of it.
-        subsets: the freeway subsets that are not excluded: the columns of `split_tables.COLUMNS`, and recording,
+        reader: tables of the lake.
+        subsets: the freeway subsets that are not excluded: the columns of `splits.tables.COLUMNS`, and recording,
             lanes, frame_rate_hz.
-        protocol: whose samples count.
+        protocol: the protocol whose samples count.
     """
 
-    root: Path
-    manifest: Manifest
+    reader: LakeReader
     subsets: pl.DataFrame
     protocol: Protocol
 
 
 @dataclass(frozen=True)
 class SplitResult:
-    """A split.
+    """A split as tables.
 
     Args:
         allocation: its rows of `splits` and `split_balance`.
@@ -58,14 +55,14 @@ class SplitResult:
     flows: pl.DataFrame | None = None
 
 
-def make_split(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
+def make_split(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     """Make one split of the lake's subsets."""
-    return _MAKERS[recipe.name](recipe, material)
+    return _MAKERS[recipe.name](recipe, inputs)
 
 
-def _make_flow_balanced(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
+def _make_flow_balanced(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     allocation = allocate_flow_balanced(
-        material.subsets,
+        inputs.subsets,
         split=recipe.name,
         train_share=recipe.train_share,
         validation=recipe.validation,
@@ -75,19 +72,18 @@ def _make_flow_balanced(recipe: SplitRecipe, material: SplitInputs) -> SplitResu
     return SplitResult(allocation, SPLIT_LEFT_OUT.empty())
 
 
-def _make_time_blocks(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
-    blocks = cut_blocks(material.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
+def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
+    blocks = cut_blocks(inputs.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
     visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema=WEIGHTS)]
-    for facts in material.subsets.sort("dataset", "subset").iter_rows(named=True):
-        values = {"dataset": facts["dataset"], "subset": facts["subset"]}
+    for facts in inputs.subsets.sort("dataset", "subset").iter_rows(named=True):
+        reader = inputs.reader.open_subset(facts["dataset"], facts["subset"])
         own = blocks.filter(pl.col("dataset") == facts["dataset"], pl.col("subset") == facts["subset"])
-        tracks = scan(material.root, material.manifest, TRACKS, **values).select("vehicle_id", "frame").collect()
-        visits.append(find_visits(tracks, own))
-        samples = scan(material.root, material.manifest, SAMPLES, **values)
+        visits.append(find_visits(reader.table(TRACKS, "vehicle_id", "frame"), own))
+        samples = reader.scan(SAMPLES)
         stride = facts["frame_rate_hz"] / recipe.rate_hz
         weights.append(
             count_samples(
-                samples.filter(pl.col("protocol") == material.protocol.name).select("vehicle_id", "tick").collect(),
+                samples.filter(pl.col("protocol") == inputs.protocol.name).select("vehicle_id", "tick").collect(),
                 own,
                 stride=stride,
                 first_frame=facts["first_frame"],
@@ -96,7 +92,7 @@ def _make_time_blocks(recipe: SplitRecipe, material: SplitInputs) -> SplitResult
             )
         )
     seen, sampled = pl.concat(visits), pl.concat(weights)
-    units = describe_blocks(blocks, material.subsets, seen, sampled)
+    units = describe_blocks(blocks, inputs.subsets, seen, sampled)
     allocation = allocate_flow_balanced(
         units,
         split=recipe.name,
@@ -112,28 +108,28 @@ def _make_time_blocks(recipe: SplitRecipe, material: SplitInputs) -> SplitResult
     return SplitResult(written, left_out, units.select("dataset", "subset", "block", "flow"))
 
 
-def _make_csp(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
+def _make_csp(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     kept = (
-        scan(material.root, material.manifest, SAMPLES)
-        .filter(pl.col("protocol") == material.protocol.name)
+        inputs.reader.scan(SAMPLES)
+        .filter(pl.col("protocol") == inputs.protocol.name)
         .group_by("dataset", "subset", "vehicle_id")
         .agg(weight=pl.len().cast(pl.Int64))
     )
     vehicles = (
-        scan(material.root, material.manifest, VEHICLES)
+        inputs.reader.scan(VEHICLES)
         .select("dataset", "subset", "vehicle_id")
-        .join(material.subsets.lazy().select("dataset", "subset"), on=["dataset", "subset"], how="semi")
+        .join(inputs.subsets.lazy().select("dataset", "subset"), on=["dataset", "subset"], how="semi")
         .join(kept, on=["dataset", "subset", "vehicle_id"], how="left")
         .with_columns(pl.col("weight").fill_null(0))
         .collect()
         .sort("dataset", "subset", "vehicle_id")
     )
-    return SplitResult(divide_by_id(material.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
+    return SplitResult(divide_by_id(inputs.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
 
 
-def _make_by_recording(recipe: SplitRecipe, material: SplitInputs) -> SplitResult:
+def _make_by_recording(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     allocation = divide_by_recording(
-        material.subsets,
+        inputs.subsets,
         split=recipe.name,
         train_share=recipe.train_share,
         validation=recipe.validation,

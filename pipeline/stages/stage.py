@@ -1,18 +1,27 @@
-"""What a stage is: jobs planned from the manifest, each built into files and one entry to commit."""
+"""What a stage is: a declaration, the jobs planned from it, and what its build function returns."""
 
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact
+import polars as pl
+
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest
 from tracklake.pipeline.settings import Settings
-from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas import SCHEMA_VERSION, Table
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.hashing import hash_values
 
+INGEST = "ingest"
+"""Name of the stage that makes the recordings; every other stage works on what it committed."""
 
-class StageError(Exception):
+Scope = Literal["recording", "freeway recording", "lake"]
+
+
+class StageError(TracklakeError):
     """A stage cannot run as things stand; the message says what to run first."""
 
 
@@ -21,10 +30,10 @@ class Job:
     """One stage's work on one recording (or on the whole lake): a small record, fit to be sent to another process.
 
     Args:
-        key: of the entry it will make: `stage/dataset/recording`, or `stage`.
-        fingerprint: of its inputs, settings and code version.
+        key: key of the commit that it makes: `stage/dataset/recording`, or `stage`.
+        fingerprint: digest of its inputs, settings and code version.
         built_from: what the fingerprint was made of, for the manifest.
-        inputs: what the stage's build function needs.
+        inputs: what the build function needs: dataset and subsets, or an ingested recording's files.
     """
 
     key: str
@@ -34,33 +43,72 @@ class Job:
 
     @property
     def title(self) -> str:
-        """For progress bars and messages: the recording, or the stage where it is over the whole lake."""
+        """Name in progress bars and messages: the recording, or the stage where it is over the whole lake."""
         return self.key.rpartition("/")[2]
 
+    @property
+    def tail(self) -> str:
+        """The key without the stage: `dataset/recording`, or nothing for a stage over the whole lake."""
+        return self.key.partition("/")[2]
 
-Plan = Callable[[Path, Manifest, Settings], list[Job]]
-"""(lake, manifest, settings) to the jobs that would make a stage complete."""
+
+@dataclass(frozen=True)
+class StageResult:
+    """What a build function returns where it makes more than tables.
+
+    Args:
+        tables: frames by table; they are validated and written by the planner.
+        files: files that the build function wrote into the lake itself, by folder (tensors, reports, models).
+        info: small facts that later stages and commands read from the manifest.
+        notes: sentences for the user.
+    """
+
+    tables: Mapping[Table, pl.DataFrame] = field(default_factory=dict)
+    files: Mapping[str, list[LakeFile]] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage of the pipeline.
+    """The declaration of a stage; jobs, fingerprints and staleness follow from it.
 
     Args:
-        name: of the stage and of its command.
-        meaning: one line for people.
-        plan: what there would be to do.
-        build: (lake, job, settings) to the entry to commit; writes the files.
+        name: name of the stage, and of its command where it has one.
+        meaning: one line for help texts.
+        scope: what one job works on; freeway recordings are those with freeway subsets, and only these are built.
+        after: stages whose tables it reads, `ingest` among them. Without any, it takes the lake as it is.
+        settings: what its result depends on: names of settings, or functions that give values by name.
+        version: number to raise when the code makes other results of the same inputs.
+        build: (reader, settings) to frames by table, or a StageResult. The reader is a SubsetReader, once for every
+            subset of the recording; a LakeReader for the scope `lake`, and where `per_subset` is False.
+        per_subset: whether a recording's subsets are built one by one.
+        extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
+            (by "" for the scope `lake`).
     """
 
     name: str
     meaning: str
-    plan: Plan
-    build: Callable[[Path, Job, Settings], Commit]
+    scope: Scope
+    after: tuple[str, ...]
+    version: int
+    build: Callable[[Any, Settings], StageResult | Mapping[Table, pl.DataFrame]]
+    settings: tuple[str | Callable[[Settings], Mapping[str, Any]], ...] = ()
+    per_subset: bool = True
+    extra_inputs: Callable[[Path, Manifest, Settings], Mapping[str, Mapping[str, Any]]] | None = None
+
+    def describe_settings(self, settings: Settings) -> dict[str, Any]:
+        """Return the values of the settings that the result depends on, by name."""
+        names = {item for item in self.settings if isinstance(item, str)}
+        values: dict[str, Any] = settings.model_dump(mode="json", include=names)
+        for item in self.settings:
+            if not isinstance(item, str):
+                values |= item(settings)
+        return values
 
 
-def make_job(key: str, *, version_of_stage: int, made_of: dict[str, Any], inputs: dict[str, Any]) -> Job:
-    """A job whose fingerprint covers its key, the code's version, the schemas' and everything it is made of."""
+def make_job(key: str, *, version_of_stage: int, made_of: Mapping[str, Any], inputs: dict[str, Any]) -> Job:
+    """Return a job whose fingerprint covers its key, the code's version, the schemas' and all that it is made of."""
     built_from = {
         "tracklake": version("tracklake"),
         "stage_version": version_of_stage,
@@ -70,47 +118,14 @@ def make_job(key: str, *, version_of_stage: int, made_of: dict[str, Any], inputs
     return Job(key, hash_values([key, version_of_stage, SCHEMA_VERSION, made_of], 16), built_from, inputs)
 
 
-def make_commit(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any]) -> Commit:
-    """The entry a job's files make."""
-    return Commit(key=job.key, fingerprint=job.fingerprint, files=files, built_from=job.built_from, info=info)
+def make_commit(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any], started: float) -> Commit:
+    """Return the commit of a job's files, with the seconds that it took.
 
-
-def pending(root: Path, manifest: Manifest, jobs: Iterable[Job]) -> list[Job]:
-    """The jobs that are not done: no entry, one made of something else, or one whose files are not whole."""
-    return [job for job in jobs if not _is_done(root, manifest, job)]
-
-
-def _is_done(root: Path, manifest: Manifest, job: Job) -> bool:
-    entry = manifest.commits.get(job.key)
-    if entry is None or entry.fingerprint != job.fingerprint:
-        return False
-    return is_intact(root, (file for group in entry.files.values() for file in group))
-
-
-def recordings(manifest: Manifest, *, freeway_only: bool = False) -> list[dict[str, Any]]:
-    """What ingestion committed: dataset, recording, fingerprint and the subsets (of freeways) of each recording."""
-    found = []
-    for entry in manifest.of_stage("ingest"):
-        subsets = [s for s in entry.info.get("subsets", []) if s["freeway"] or not freeway_only]
-        if subsets:
-            facts = {"dataset": entry.info["dataset"], "recording": entry.info["recording"], "subsets": subsets}
-            found.append({**facts, "fingerprint": entry.fingerprint})
-    return found
-
-
-def upstream(plan: Plan, root: Path, manifest: Manifest, settings: Settings) -> dict[str, str]:
-    """Fingerprints of an earlier stage's entries by key, each as that stage would make it now.
-
-    Raises:
-        StageError: the stage has not run, or ran on other inputs or with other settings than now.
+    Args:
+        job: the work that was done.
+        files: the files it made, by table.
+        info: small facts that later stages and commands read.
+        started: `time.perf_counter()` when the work began, in seconds.
     """
-    found = {}
-    for job in plan(root, manifest, settings):
-        entry = manifest.commits.get(job.key)
-        if entry is None or entry.fingerprint != job.fingerprint:
-            stage = job.key.split("/", 1)[0]
-            what = f"{stage} of {job.title}" if job.title != stage else stage
-            state = "has not been made" if entry is None else "was made from other inputs or with other settings"
-            raise StageError(f"{what} {state}. Run `tracklake {stage}` first, or `tracklake run` for everything.")
-        found[job.key] = entry.fingerprint
-    return found
+    timed = {**info, "seconds": round(time.perf_counter() - started, 3)}
+    return Commit(key=job.key, fingerprint=job.fingerprint, files=files, built_from=job.built_from, info=timed)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from raw_texts import as_text, ngsim_row, read_highd, read_ngsim, write
 from small_recordings import write_highd
+from stage_runs import run_stage
 
 from tracklake.pipeline.lake import Commit, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
 FINGERPRINT = "0" * 16
@@ -58,7 +58,5 @@ def ingest(root, folder, recordings, highd=()):
 
 def run_stages(settings: Settings, *names):
     """Stages after ingestion, without Prefect."""
-    with open_for_writing(settings.lake) as writer:
-        for name in names:
-            for job in STAGE_BY_NAME[name].plan(settings.lake, writer.manifest, settings):
-                writer.commit(STAGE_BY_NAME[name].build(settings.lake, job, settings))
+    for name in names:
+        run_stage(settings.lake, name, settings)

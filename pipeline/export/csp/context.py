@@ -9,9 +9,10 @@ import polars as pl
 from tracklake.pipeline.export.folder import ExportError
 from tracklake.pipeline.lake import Manifest, scan
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import split
+from tracklake.pipeline.stages.planner import Planner
+from tracklake.pipeline.stages.readers import LakeReader
+from tracklake.pipeline.stages.split import gather_subsets
 from tracklake.pipeline.stages.split_makers import SplitInputs, make_split
-from tracklake.pipeline.stages.stage import upstream
 from tracklake.pipeline.transforms.csp.subset import Context
 from tracklake.schemas import MISSING_STARTS, SPLITS, SUBSET_STATUS, VEHICLE_STARTS
 from tracklake.schemas.columns import PARTS
@@ -44,14 +45,15 @@ def read_context(
             f"--clean is for splits whose parts share nothing, and the setting `split` is {protocol.split!r}. Set it "
             f"to one of {', '.join(LEAKAGE_FREE)}, or leave --clean out: the files are then cut by vehicle id."
         )
-    upstream(split.plan, root, manifest, settings)
+    Planner(root, manifest, settings).require("split")
     names = {facts["dataset"] for facts in subsets}
     splits = scan(root, manifest, SPLITS).filter(split=protocol.split).collect()
     parts = splits.select("dataset", "part").unique().rows()
     if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
         recipe = settings.get_split_recipe()
-        material = SplitInputs(root, manifest, split.gather_subsets(root, manifest, protocol), protocol)
-        allocation = make_split(replace(recipe, validation=True), material).allocation
+        reader = LakeReader(root, manifest)
+        inputs = SplitInputs(reader, gather_subsets(reader, protocol), protocol)
+        allocation = make_split(replace(recipe, validation=True), inputs).allocation
         splits = allocation.splits
         notes.append(
             f"the lake's split {protocol.split} has no validation part; the files hold the one that `validation_part = "

@@ -5,16 +5,17 @@ import json
 import polars as pl
 import pytest
 from small_recordings import VEHICLES, write_highd
+from stage_runs import find_outstanding, run_stage
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli import app as cli
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
-from tracklake.pipeline.lake import connect, load, open_for_writing
+from tracklake.pipeline.lake import connect, open_for_writing
 from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, RunRequest, RunResult
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.csv.raw_files import hash_raw
-from tracklake.pipeline.stages import assess, repair
+from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.pipeline.transforms.starts.assessment import POSITIONS_M
 from tracklake.schemas.start_assessments import ESTIMATORS
@@ -114,13 +115,10 @@ def test_the_stage_works_on_what_repair_made(tmp_path):
         (job,) = ingest.plan(discovery, writer.manifest)
         writer.commit(ingest.build(root, job))
         with pytest.raises(StageError, match="repair of 01 has not been made"):
-            assess.plan(root, writer.manifest, settings)
-        for stage in (repair, assess):
-            (job,) = stage.plan(root, writer.manifest, settings)
-            writer.commit(stage.build(root, job, settings))
-    manifest = load(root)
-    (job,) = assess.plan(root, manifest, settings)
-    assert manifest.commits["assess/highd/01"].fingerprint == job.fingerprint
+            Planner(root, writer.manifest, settings).plan("assess")
+    for name in ("repair", "assess"):
+        assert [commit.key for commit in run_stage(root, name, settings)] == [f"{name}/highd/01"]
+    assert find_outstanding(root, "assess", settings) == []
     with connect(root) as connection:
         table = connection.sql("SELECT subset, estimator, beyond_m, starts, coverage FROM start_assessments").pl()
     reached = [position for position in POSITIONS_M if position < 150 * 30 / 25]

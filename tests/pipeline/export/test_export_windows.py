@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 from export_lakes import ingest, run_stages
+from stage_runs import build_one, find_outstanding, plan_stage
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
@@ -18,7 +19,7 @@ from tracklake.pipeline.export.windows.export import export_windows
 from tracklake.pipeline.lake import load, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
-from tracklake.pipeline.stages.stage import StageError, pending
+from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SPLITS, TRACKS
 
 STAGES = ("validate", "repair", "samples", "split", "tensors")
@@ -243,9 +244,9 @@ def flatten(rows, axis):
 
 def test_positions_as_int16_are_made_anew_and_the_card_says_how_exact_they_are(lake, parquet, tmp_path):
     settings = Settings(lake=lake, tensor_positions="int16-centimetres")
-    assert pending(lake, load(lake), tensors.plan(lake, load(lake), Settings(lake=lake))) == []
-    (job,) = pending(lake, load(lake), tensors.plan(lake, load(lake), settings))
-    entry = tensors.build(lake, job, settings)
+    assert find_outstanding(lake, "tensors", Settings(lake=lake)) == []
+    (job,) = plan_stage(lake, "tensors", settings)
+    entry = build_one(lake, job, settings)
     index = json.loads((lake / entry.info["path"] / "index.json").read_text())
     assert index["storage"] == "int16-centimetres"
     assert 0.002 < index["max_error_m"][0] <= 0.0051

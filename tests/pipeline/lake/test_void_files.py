@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from small_lake import find_files, put_round
+from stage_runs import build_one
 
 from tracklake.pipeline.lake import load, open_for_writing
 from tracklake.pipeline.settings import Settings
@@ -46,14 +47,14 @@ def test_the_tensors_of_a_rebuild_are_those_it_made(tmp_path: Path, monkeypatch:
         (folder / INDEX_FILE).write_text(json.dumps({"sizes": {"S": samples}, "samples_by_part": {}}))
 
     monkeypatch.setattr(tensors, "read_split", lambda *_: (None, SPLIT_LEFT_OUT.empty()))
-    monkeypatch.setattr(tensors, "_sampled_subsets", lambda *_: [{}])
+    monkeypatch.setattr(tensors, "_list_sampled_subsets", lambda *_: [{}])
     monkeypatch.setattr(tensors, "write_tensors", write)
     job, settings = Job("tensors", f"{1:016x}"), Settings(lake=tmp_path)
     with open_for_writing(tmp_path) as writer:
-        writer.commit(tensors.build(tmp_path, job, settings))
+        writer.commit(build_one(tmp_path, job, settings))
     samples = 2
     with open_for_writing(tmp_path, rebuild=True) as writer:
-        again = tensors.build(tmp_path, job, settings)
+        again = build_one(tmp_path, job, settings)
         writer.commit(again)
     assert again.info["samples"] == 2
     assert {Path(file.path).parent.as_posix() for file in again.files["tensors"]} == {again.info["path"]}

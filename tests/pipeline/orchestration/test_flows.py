@@ -1,4 +1,4 @@
-"""What Prefect adds: tasks that are seen, retries on I/O, results cached by content, deployments."""
+"""What Prefect adds: tasks that are seen, retries on I/O, deployments; and that it caches nothing."""
 
 import json
 import os
@@ -8,17 +8,19 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import httpx
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.settings import PREFECT_API_URL
 from prefect.testing.utilities import prefect_test_harness
+from small_recordings import write_highd
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import connect, load
+from tracklake.pipeline.lake import connect, load, open_for_writing
 from tracklake.pipeline.lake.manifest import Manifest, store
-from tracklake.pipeline.orchestration import flows
+from tracklake.pipeline.orchestration import flows, run_plan
 from tracklake.pipeline.sources import SourceError
 
 pytestmark = [
@@ -111,27 +113,87 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
     assert tries["hopeless"] == 1
 
 
-@pytest.mark.usefixtures("server")
-def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, calls):
+def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(server, raw, tmp_path, calls):
+    del server
     root = tmp_path / "lake"
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     finished = load(root)
-    # As if the process had died between the task's end and the commit.
+    assert flows.ingest_files(str(root), str(raw))["built"] == {}
+    assert calls == {"04": 1}
+    # As if the process had died between the task's end and the commit: the files stay, and are committed.
+    written = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
     store(root, Manifest(lake_id=finished.lake_id))
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
-    assert calls == {"04": 1}
-    assert load(root).commits == finished.commits
-    # A cached result whose files are gone is worth nothing.
+    assert calls == {"04": 2}
+    assert {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")} == written
+    again = load(root).commits["ingest/highd/04"]
+    assert (again.files, again.fingerprint) == (
+        finished.commits["ingest/highd/04"].files,
+        finished.commits["ingest/highd/04"].fingerprint,
+    )
+    # Files that were removed are made again, and a changed file is another content.
     shutil.rmtree(root / "tracks")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
-    assert calls == {"04": 2}
-    # Another lake is another place, and a changed file another content.
-    assert flows.ingest_files(str(tmp_path / "other"), str(raw))["built"] == {"ingest": 1}
-    assert calls == {"04": 3}
     with (raw / "04_tracks.csv").open("a") as file:
         file.write("\n")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 4}
+    assert list(Path(os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]).iterdir()) == []
+
+
+@pytest.fixture
+def searches(monkeypatch) -> tuple[Mock, Mock]:
+    """Counts how often the source was searched, and compared with the lake."""
+    discover, plan = Mock(wraps=run_plan.discover), Mock(wraps=run_plan.plan_ingest)
+    monkeypatch.setattr(run_plan, "discover", discover)
+    for user in (run_plan, flows):
+        monkeypatch.setattr(user, "plan_ingest", plan)
+    return discover, plan
+
+
+def count_calls(mocks: tuple[Mock, Mock]) -> tuple[int, ...]:
+    """The calls since the last count."""
+    counts = tuple(mock.call_count for mock in mocks)
+    for mock in mocks:
+        mock.reset_mock()
+    return counts
+
+
+def ingest_as_a_command(root: Path, source: Path, **settings) -> run_plan.RunResult:
+    """What `tracklake ingest` does with a request."""
+    request = run_plan.RunRequest(str(root), ("ingest",), str(source), **settings)
+    plan = run_plan.plan_run(request, run_plan.survey_source(request))
+    return run_plan.conclude_idle(request, plan) if plan.is_idle else flows.execute(request, plan)
+
+
+@pytest.mark.usefixtures("server")
+def test_a_command_searches_the_source_once_and_compares_it_with_the_lake_once(raw, tmp_path, searches):
+    root = tmp_path / "lake"
+    cases = [({}, 1), ({}, 0), ({}, 1), ({"rebuild": True}, 2)]
+    for number, (flags, expected) in enumerate(cases):  # no lake yet; nothing to do; one more recording; all again
+        if number == 2:
+            write_highd(raw, "05")
+        result = ingest_as_a_command(root, raw, **flags)
+        assert (result.built.get("ingest", 0), result.refused, result.failed) == (expected, [], [])
+        assert count_calls(searches) == (1, 1), flags
+    # A served deployment searches the source by itself, once as well.
+    write_highd(raw, "07")
+    assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
+    assert count_calls(searches) == (1, 1)
+
+
+@pytest.mark.usefixtures("server")
+def test_a_lake_that_changed_since_it_was_planned_is_planned_again(raw, tmp_path, searches):
+    request = run_plan.RunRequest(str(tmp_path / "lake"), ("ingest",), str(raw))
+    flows.ingest_files(str(tmp_path / "lake"), str(raw))
+    write_highd(raw, "05")
+    count_calls(searches)
+    plan = run_plan.plan_run(request, run_plan.survey_source(request))
+    assert [job.key for job in plan.ingest.jobs] == ["ingest/highd/05"]
+    with open_for_writing(tmp_path / "lake") as writer:  # another process, between the plan and the run
+        writer.remove({"ingest/highd/04"})
+    assert flows.execute(request, plan).built == {"ingest": 2}
+    assert count_calls(searches) == (1, 2)
 
 
 def artifacts_of(root: Path) -> dict[str, list]:

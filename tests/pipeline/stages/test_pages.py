@@ -8,14 +8,13 @@ from pathlib import Path
 import polars as pl
 import pytest
 from small_recordings import write_highd
+from stage_runs import find_outstanding, plan_stage, run_stage
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.ingest.removal import remove_recordings
-from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
-from tracklake.pipeline.orchestration.run_plan import outstanding
+from tracklake.pipeline.lake import Commit, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.schemas import SPLITS
 
 LOW = {"high_acceleration_mps2": 1.0}
@@ -23,19 +22,12 @@ LOW = {"high_acceleration_mps2": 1.0}
 
 def ask(root: Path, stage: str, **settings) -> list[str]:
     """Keys of what the stage would make."""
-    return [job.key for job in outstanding(STAGE_BY_NAME[stage], root, load(root), Settings(**settings))[0]]
+    return find_outstanding(root, stage, Settings(**settings))
 
 
 def make(root: Path, stage: str, *keys: str, **settings) -> list[str]:
     """Make what is not made (only some of it), as the flows do; returns its keys."""
-    chosen = Settings(**settings)
-    with open_for_writing(root) as writer:
-        jobs, stale = outstanding(STAGE_BY_NAME[stage], root, writer.manifest, chosen)
-        writer.remove(stale)
-        for job in jobs:
-            if not keys or job.key in keys:
-                writer.commit(STAGE_BY_NAME[stage].build(root, job, chosen))
-    return [job.key for job in jobs]
+    return [commit.key for commit in run_stage(root, stage, Settings(**settings), *keys)]
 
 
 def put_split(root: Path, part_of_02: str) -> None:
@@ -159,5 +151,5 @@ def test_the_report_tells_the_thresholds_that_validation_used(lake: Path):
 def test_before_validation_the_report_tells_those_of_the_settings(lake: Path):
     with open_for_writing(lake) as writer:
         writer.remove({"validate/highd/01", "validate/highd/02"})
-    (job,) = STAGE_BY_NAME["report"].plan(lake, load(lake), Settings(thresholds=LOW))
+    (job,) = plan_stage(lake, "report", Settings(thresholds=LOW))
     assert (job.built_from["thresholds"], job.built_from["thresholds_elsewhere"]) == (LOW, {})

@@ -4,10 +4,10 @@ import shutil
 
 import polars as pl
 import pytest
+from stage_runs import build_one, plan_stage
 
 from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import samples
 
 OVERLAPS = """
 SELECT s.dataset, s.subset, s.vehicle_id, s.tick
@@ -33,7 +33,7 @@ FROM sample_counts AS c
 
 
 def plan(root, **changed):
-    return {job.key: job for job in samples.plan(root, load(root), Settings(lake=root, **changed))}
+    return {job.key: job for job in plan_stage(root, "samples", Settings(lake=root, **changed))}
 
 
 def test_the_settings_are_part_of_the_fingerprint(lake):
@@ -69,7 +69,7 @@ def test_samples_around_findings_of_errors_are_dropped_on_request(lake, tmp_path
     shutil.copytree(lake.root, root)
     strict = Settings(lake=root, drop_error_findings=True, nearest=0)
     job = next(job for name, job in plan(root, drop_error_findings=True, nearest=0).items() if name.startswith(key))
-    entry = samples.build(root, job, strict)
+    entry = build_one(root, job, strict)
     named = pl.col("subset").is_in(job.inputs["subsets"]) & (pl.col("dataset") == job.inputs["dataset"])
     with connect(lake.root) as connection:
         before = connection.sql("FROM samples").pl().filter(named)

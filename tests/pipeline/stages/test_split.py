@@ -6,14 +6,18 @@ from dataclasses import replace
 
 import polars as pl
 import pytest
+from stage_runs import build_one
 
 from tracklake.pipeline.lake import Commit, connect, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import split, tensors
+from tracklake.pipeline.stages import split
 from tracklake.pipeline.stages.stage import Job, StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitRecipe
 
+MAKERS = {"tracks": "ingest", "vehicles": "ingest", "subsets": "ingest", "subset_status": "validate",
+          "samples": "samples", "neighbors": "samples"}  # fmt: skip
+"""The stage that makes a table."""
 SECONDS, RATE_HZ, ON_ROAD_S = 60, 5, 4
 """Each vehicle is on the road for so long, and a new one comes every second."""
 
@@ -56,7 +60,8 @@ def put_recording(root, number, on_road_s=ON_ROAD_S):
         with open_for_writing(root) as writer:
             for table, rows in tables:
                 files = write_table(root, table, fill(table, rows), where, "0" * 16, where="test")
-                writer.commit(Commit(f"{table.name}/highd/{where['subset']}", "0" * 16, {table.name: files}, info={}))
+                key = f"{MAKERS[table.name]}/highd/{where['subset']}-{table.name}"
+                writer.commit(Commit(key, "0" * 16, {table.name: files}, info={}))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +78,7 @@ JOB = Job("split", "1" * 16)
 
 @pytest.fixture(scope="module")
 def ask(root):
-    entry = split.build(root, JOB, SETTINGS)
+    entry = build_one(root, JOB, SETTINGS)
     with open_for_writing(root) as writer:
         writer.commit(entry)
     with connect(root) as connection:
@@ -139,7 +144,7 @@ def test_csp_2018_shares_the_frames_at_its_cuts(ask):
 
 
 def test_notes_say_what_leaks_and_what_is_relaxed(root):
-    notes = split.build(root, JOB, SETTINGS).info["notes"]
+    notes = build_one(root, JOB, SETTINGS).info["notes"]
     # In three subsets each: frames 196 to 240 of 40 to 45, and 226 to 295 of 46 to 56; four samples of each but 56,
     # whom nobody follows.
     assert notes[-1] == (
@@ -179,14 +184,14 @@ def test_a_planted_leak_stops_the_stage(monkeypatch, root, name, change, told):
     plant(monkeypatch, change)
     before = load(root).commits.keys()
     with pytest.raises(StageError, match=f"split {name} claims that its parts share nothing, but highd: .*{told}"):
-        split.build(root, JOB, Settings(split=name, splits=[name], split_block_s=10))
+        build_one(root, JOB, Settings(split=name, splits=[name], split_block_s=10))
     assert load(root).commits.keys() == before
 
 
 def test_a_split_that_claims_nothing_may_leak(monkeypatch, root):
     again = {"block": pl.lit(9, pl.Int32), "part": pl.lit("eval")}
     plant(monkeypatch, lambda rows: pl.concat([rows, rows.head(1).with_columns(**again)]))
-    entry = split.build(root, JOB, Settings(split="csp-2018", splits=["csp-2018"]))
+    entry = build_one(root, JOB, Settings(split="csp-2018", splits=["csp-2018"]))
     assert "csp-2018, made for comparison, leaks: highd: train has 45" in entry.info["notes"][-1]
     assert entry.files["split_leakage"][0].rows == 3
 
@@ -240,9 +245,9 @@ def test_time_blocks_are_balanced_by_what_is_left_when_vehicles_are_left_out(tmp
         put_recording(root, number, on_road_s=20)
     settings = Settings(lake=root, split="time-blocks", splits=["time-blocks"], split_block_s=10, validation_part=True)
     with open_for_writing(root) as writer:
-        writer.commit(split.build(root, JOB, settings))
+        writer.commit(build_one(root, JOB, settings))
     with open_for_writing(root) as writer:
-        made = tensors.build(root, Job("tensors", "2" * 16), settings)
+        made = build_one(root, Job("tensors", "2" * 16), settings)
         writer.commit(made)
     with connect(root) as connection:
         balance = connection.sql("SELECT part, samples, vehicles, vehicle_share, relaxed, relaxed_reason "

@@ -1,0 +1,150 @@
+"""The planner: jobs, fingerprints and staleness from the declared stages, and the loop that builds and writes a job."""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, write_table
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
+from tracklake.pipeline.stages.registry import STAGES
+from tracklake.pipeline.stages.stage import INGEST, Job, Stage, StageError, StageResult, make_commit, make_job
+
+
+class Planner:
+    """What the stages have to do, as a lake stands.
+
+    Args:
+        root: the lake's folder.
+        manifest: live files of the lake.
+        settings: what the user set.
+        stages: the declared stages.
+    """
+
+    def __init__(self, root: Path, manifest: Manifest, settings: Settings, stages: Sequence[Stage] = STAGES) -> None:
+        self._root = root
+        self._manifest = manifest
+        self._settings = settings
+        self._stages = {stage.name: stage for stage in stages}
+        self._jobs: dict[str, list[Job]] = {}
+        self._commits: dict[str, dict[str, Commit]] = {}
+
+    def plan(self, name: str) -> list[Job]:
+        """Return the jobs that make a stage complete, done or not.
+
+        Raises:
+            StageError: a stage before it has not run, or ran on other inputs or with other settings than now.
+        """
+        if name not in self._jobs:
+            self._jobs[name] = self._plan(self._stages[name])
+        return self._jobs[name]
+
+    def find_outstanding(self, name: str) -> tuple[list[Job], set[str]]:
+        """Return the jobs of a stage that are not done, and the keys of its commits that it would not make now.
+
+        Raises:
+            StageError: a stage before it has to run first.
+        """
+        jobs = self.plan(name)
+        stale = {commit.key for commit in self._manifest.of_stage(name)} - {job.key for job in jobs}
+        return find_pending(self._root, self._manifest, jobs), stale
+
+    def require(self, name: str) -> Mapping[str, Commit]:
+        """Return the commits of a stage by key, each as the stage would make it now.
+
+        Raises:
+            StageError: the stage has not run, or ran on other inputs or with other settings than now.
+        """
+        if name not in self._commits:
+            if name == INGEST:
+                self._commits[name] = {commit.key: commit for commit in _find_recordings(self._manifest)}
+            else:
+                self._commits[name] = {job.key: self._find_commit(name, job) for job in self.plan(name)}
+        return self._commits[name]
+
+    def _find_commit(self, stage: str, job: Job) -> Commit:
+        commit = self._manifest.commits.get(job.key)
+        if commit is None or commit.fingerprint != job.fingerprint:
+            what = f"{stage} of {job.title}" if job.tail else stage
+            state = "has not been made" if commit is None else "was made from other inputs or with other settings"
+            raise StageError(f"{what} {state}. Run `tracklake {stage}` first, or `tracklake run` for everything.")
+        return commit
+
+    def _plan(self, stage: Stage) -> list[Job]:
+        inputs = {name: self.require(name) for name in stage.after}
+        values = stage.describe_settings(self._settings)
+        extra = stage.extra_inputs(self._root, self._manifest, self._settings) if stage.extra_inputs else {}
+
+        def make(key: str, tail: str, before: dict[str, Any], facts: dict[str, Any]) -> Job:
+            made_of = {**before, **values, **extra.get(tail, {})}
+            return make_job(key, version_of_stage=stage.version, made_of=made_of, inputs=facts)
+
+        if stage.scope == "lake":
+            if not all(any(commit.all_files for commit in commits.values()) for commits in inputs.values()):
+                return []  # a stage before it made nothing, so there is nothing to work on
+            all_prints = {
+                name: {key: commit.fingerprint for key, commit in found.items()} for name, found in inputs.items()
+            }
+            return [make(stage.name, "", all_prints, {})]
+        jobs = []
+        for recording in _find_recordings(self._manifest):
+            subsets = [own for own in recording.info["subsets"] if own["freeway"] or stage.scope == "recording"]
+            if subsets:
+                facts = {"dataset": recording.info["dataset"], "subsets": [own["subset"] for own in subsets]}
+                prints = {name: _find_fingerprint(found, name, recording.tail) for name, found in inputs.items()}
+                jobs.append(make(f"{stage.name}/{recording.tail}", recording.tail, prints, facts))
+        return jobs
+
+
+def _find_recordings(manifest: Manifest) -> list[Commit]:
+    """Return the commits of ingestion that hold subsets; lines that belong to no recording have none."""
+    return [commit for commit in manifest.of_stage(INGEST) if commit.info.get("subsets")]
+
+
+def _find_fingerprint(commits: Mapping[str, Commit], stage: str, tail: str) -> str | None:
+    """Return the fingerprint of a stage's commit for a recording, or of its commit over the whole lake."""
+    return next((commits[key].fingerprint for key in (f"{stage}/{tail}", stage) if key in commits), None)
+
+
+def find_pending(root: Path, manifest: Manifest, jobs: Iterable[Job]) -> list[Job]:
+    """Return the jobs without a commit, with a commit made of other inputs, and with files that are not whole."""
+    return [job for job in jobs if not _is_done(root, manifest, job)]
+
+
+def _is_done(root: Path, manifest: Manifest, job: Job) -> bool:
+    commit = manifest.commits.get(job.key)
+    return commit is not None and commit.fingerprint == job.fingerprint and is_intact(root, commit.all_files)
+
+
+def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
+    """Build what a job asks for, validate and write its tables, and return the commit to make.
+
+    Raises:
+        StageError: the stage refuses what it made.
+        schemas.StructureError: a frame breaks its table's rules.
+    """
+    started = time.perf_counter()
+    files: dict[str, list[LakeFile]] = {}
+    info: dict[str, Any] = {}
+    notes: list[str] = []
+    for reader in _open_readers(stage, root, job):
+        built = stage.build(reader, settings)
+        result = built if isinstance(built, StageResult) else StageResult(built)
+        for table, frame in result.tables.items():
+            written = write_table(root, table, frame, reader.partition, job.fingerprint, where=reader.title)
+            files.setdefault(table.name, []).extend(written)
+        for folder, own in result.files.items():
+            files.setdefault(folder, []).extend(own)
+        info |= result.info
+        notes += result.notes
+    return make_commit(job, files, {**info, "notes": notes}, started)
+
+
+def _open_readers(stage: Stage, root: Path, job: Job) -> Iterator[LakeReader | SubsetReader]:
+    lake = LakeReader(root, load(root), stage.after, job)
+    if stage.scope == "lake" or not stage.per_subset:
+        yield lake
+        return
+    for subset in job.inputs["subsets"]:
+        yield lake.open_subset(job.inputs["dataset"], subset)

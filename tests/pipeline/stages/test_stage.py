@@ -1,0 +1,129 @@
+"""A toy stage, declared in 20 lines: planned, run, skipped, redone and refused by the one planner."""
+
+import polars as pl
+import pytest
+from small_recordings import write_highd
+from stage_runs import find_outstanding, plan_stage, run_stage
+
+from tracklake.pipeline.ingest import ingest
+from tracklake.pipeline.ingest.discovery import Digests, discover
+from tracklake.pipeline.lake import load, open_for_writing, scan
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import Stage, StageError, StageResult
+from tracklake.schemas import SUBSET_STATUS, TRACKS, VEHICLES, StructureError
+
+
+def build_status(reader, settings):
+    """Exclude a subset by the share of its entries that stand on lane 1."""
+    share = (reader.table(TRACKS, "lane")["lane"] == 1).mean()
+    excluded = share > settings.max_backward_share
+    row = {**reader.partition, "backward_vehicles": 0, "excluded": excluded, "excluded_reason": "lane 1"}
+    return {SUBSET_STATUS: pl.DataFrame([row], schema=SUBSET_STATUS.dtypes)}
+
+
+TOY = Stage(
+    name="toy",
+    meaning="Exclude subsets that drive on lane 1.",
+    scope="recording",
+    after=("ingest",),
+    settings=("max_backward_share",),
+    version=1,
+    build=build_status,
+)
+TOTAL = Stage(
+    name="total",
+    meaning="Count what the toy excluded.",
+    scope="lake",
+    after=("toy",),
+    settings=(lambda settings: {"workers": settings.workers},),
+    version=1,
+    build=lambda reader, _: StageResult(info={"excluded": int(reader.table(SUBSET_STATUS)["excluded"].sum())}),
+)
+STAGES = (TOY, TOTAL)
+SETTINGS = Settings()
+
+
+def put_recordings(root, raw, *numbers):
+    for number in numbers:
+        write_highd(raw, number)
+    with open_for_writing(root) as writer:
+        for job in ingest.plan(discover(raw, digest=Digests(root)), writer.manifest):
+            writer.commit(ingest.build(root, job))
+
+
+@pytest.fixture
+def root(tmp_path):
+    put_recordings(tmp_path / "lake", tmp_path / "raw", "01", "02")
+    return tmp_path / "lake"
+
+
+def run(root, name, settings=SETTINGS, stages=STAGES):
+    return [commit.key for commit in run_stage(root, name, settings, stages=stages)]
+
+
+def test_a_declared_stage_is_planned_run_and_skipped_when_up_to_date(root):
+    jobs = plan_stage(root, "toy", SETTINGS, STAGES)
+    assert [(job.key, job.title, job.inputs["subsets"]) for job in jobs] == [
+        (f"toy/highd/{number}", number, [f"{number}-upper", f"{number}-lower"]) for number in ("01", "02")
+    ]
+    assert jobs[0].built_from["ingest"] == load(root).commits["ingest/highd/01"].fingerprint
+    assert run(root, "toy") == ["toy/highd/01", "toy/highd/02"]
+    manifest = load(root)
+    table = scan(root, manifest, SUBSET_STATUS).collect()
+    assert set(table["subset"]) == {"01-upper", "01-lower", "02-upper", "02-lower"}
+    commit = manifest.commits["toy/highd/01"]
+    assert commit.fingerprint == jobs[0].fingerprint
+    assert commit.info["seconds"] > 0
+    assert run(root, "toy") == []
+    assert run(root, "total") == ["total"]
+    assert load(root).commits["total"].info["excluded"] == table["excluded"].sum()
+
+
+def test_it_is_redone_after_settings_version_inputs_or_files_change(root):
+    run(root, "toy")
+    assert find_outstanding(root, "toy", Settings(nearest=3), STAGES) == [], "a setting that it does not name"
+    other = Settings(max_backward_share=1.0)
+    assert run(root, "toy", other) == ["toy/highd/01", "toy/highd/02"]
+    assert not scan(root, load(root), SUBSET_STATUS).collect()["excluded"].any()
+    newer = Stage(**{**vars(TOY), "version": 2})
+    assert len(find_outstanding(root, "toy", other, (newer,))) == 2
+    (root / load(root).commits["toy/highd/02"].all_files[0].path).unlink()
+    assert run(root, "toy", other) == ["toy/highd/02"]
+    put_recordings(root, root.parent / "raw", "03")
+    assert run(root, "toy", other) == ["toy/highd/03"]
+
+
+def test_it_is_refused_when_its_inputs_are_missing_or_outdated(root):
+    with pytest.raises(StageError, match=r"toy of 01 has not been made\. Run `tracklake toy` first"):
+        plan_stage(root, "total", SETTINGS, STAGES)
+    run(root, "toy")
+    run(root, "total")
+    with pytest.raises(StageError, match="toy of 01 was made from other inputs or with other settings"):
+        plan_stage(root, "total", Settings(max_backward_share=0.5), STAGES)
+
+
+def test_what_it_would_not_make_now_is_removed(root):
+    run(root, "toy")
+    with open_for_writing(root) as writer:
+        writer.remove({"ingest/highd/02"})
+    assert run(root, "toy") == []
+    assert [commit.key for commit in load(root).of_stage("toy")] == ["toy/highd/01"]
+
+
+def test_a_stage_over_the_lake_has_nothing_to_do_where_one_before_it_made_nothing(tmp_path, root):
+    empty = Stage(**{**vars(TOY), "build": lambda *_: {}})
+    run(root, "toy", stages=(empty, TOTAL))
+    assert plan_stage(root, "total", SETTINGS, (empty, TOTAL)) == []
+    with open_for_writing(tmp_path / "other"):
+        pass
+    assert plan_stage(tmp_path / "other", "total", SETTINGS, STAGES) == []
+
+
+def test_tables_are_checked_and_undeclared_reads_are_found(root):
+    bad = Stage(**{**vars(TOY), "build": lambda reader, _: {SUBSET_STATUS: reader.table(TRACKS, "frame")}})
+    with pytest.raises(StructureError):
+        run(root, "toy", stages=(bad,))
+    hidden = Stage(**{**vars(TOTAL), "build": lambda reader, _: {SUBSET_STATUS: reader.table(VEHICLES)}})
+    run(root, "toy")
+    with pytest.raises(LookupError, match=r"total reads `vehicles`, which ingest makes; expected .* got toy"):
+        run(root, "total", stages=(TOY, hidden))
