@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -82,15 +82,15 @@ def run(
 
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers, protocol=protocol)
+        check = refuse_mixing if source is None else None
         if source is None:
             if prune or rebuild:
                 raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
             source = str(provide_sample(settings.lake, minutes, seed, terminal))
-            refuse_mixing(settings.lake, source)
         elif minutes is not None or seed is not None:
             raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
         flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
-        outcome = carry_out(terminal, settings, ALL_STEPS, source, dataset, **flags)
+        outcome = carry_out(terminal, settings, ALL_STEPS, source, dataset, **flags, check=check)
         conclude(terminal, settings, outcome)
 
 
@@ -109,7 +109,7 @@ def ingest(
     """Raw files to tracks, vehicles and subsets (the format is detected)."""
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers)
-        flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
+        flags: dict[str, Any] = {"replace": replace, "prune": prune, "rebuild": rebuild}
         outcome = carry_out(terminal, settings, ("ingest",), source, dataset, **flags)
         conclude(terminal, settings, outcome, headline=False)
 

@@ -12,6 +12,7 @@ from tracklake.pipeline.cli.session import failure
 
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
+    from tracklake.pipeline.ingest.discovery import Discovery
     from tracklake.pipeline.synthetic import SampleSummary
 
 SAMPLE = "sample"
@@ -29,18 +30,16 @@ def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal
     return out
 
 
-def refuse_mixing(lake: Path, sample: str) -> None:
+def refuse_mixing(lake: Path, discovery: "Discovery") -> None:
     """Keep simulated recordings out of a lake of real ones, which they might even replace."""
     from tracklake.pipeline.lake import LakeError, LakeMissingError, load
-    from tracklake.pipeline.orchestration.run_plan import RunRequest, survey_source
     from tracklake.pipeline.stages.stage import INGEST
 
     try:
         entries = load(lake).of_stage(INGEST)
     except LakeMissingError:
         return
-    order = RunRequest(str(lake.absolute()), (INGEST,), sample)
-    files = [file for _, unit in survey_source(order).units for file in unit.files]
+    files = [file for _, unit in discovery.units for file in unit.files]
     ours, hashes = {file.name for file in files}, {file.sha256 for file in files}
     for source in (source for entry in entries for source in entry.built_from["sources"]):
         if source["file"] not in ours or source["sha256"] not in hashes:

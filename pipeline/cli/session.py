@@ -5,7 +5,7 @@ Like the commands, it imports heavy libraries where they are used.
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -84,8 +84,12 @@ def carry_out(
     replace: bool = False,
     prune: bool = False,
     rebuild: bool = False,
+    check: "Callable[[Path, Discovery], None] | None" = None,
 ) -> "RunResult":
-    """Do what is not done; Prefect is imported only where something is."""
+    """Run every requested step whose outputs are missing or stale; Prefect is imported only where there is one.
+
+    `check` gets the lake and the source's files, and may refuse them.
+    """
     from tracklake.pipeline.lake import load, refuse_foreign, refuse_if_busy
     from tracklake.pipeline.orchestration.run_plan import RunRequest, conclude_idle, plan_run
     from tracklake.pipeline.sources import SourceError
@@ -115,6 +119,8 @@ def carry_out(
             terminal.complain(_prune_nothing(order.root).strip(), label="refused")
         terminal.give({"refused": list(discovery.refusals)})
         raise typer.Exit(FAILED)
+    if check is not None and discovery is not None:
+        check(settings.lake, discovery)
     plan = plan_run(order, discovery)
     if plan.is_idle:
         terminal.say("nothing to do: the lake is up to date", style="dim")

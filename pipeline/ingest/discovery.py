@@ -1,4 +1,4 @@
-"""Which raw files a folder holds, recognised by content."""
+"""Discovery: the raw files of a folder, recognised by their content."""
 
 import json
 import os
@@ -17,17 +17,18 @@ from tracklake.pipeline.sources.source import Unit
 from tracklake.schemas.files import write_file
 
 SUFFIXES = (".csv", ".txt", ".dat", ".gz", ENDING, "")
-"""Endings under which trajectory files circulate; others (pictures, Parquet, documents) are passed by."""
+"""Endings under which trajectory files circulate; files with others (pictures, Parquet, documents) are skipped."""
 
 PROSE = (".txt", ".dat", ENDING, "")
-"""Of these, endings that documents share: unrecognised, they are passed by and named, not refused."""
+"""Endings that documents share: an unrecognised file with one is skipped and named, not refused."""
 
 HASHES = ".hashes.json"
+"""Name of the file in the lake that remembers raw files' hashes."""
 
 
 @dataclass(frozen=True)
 class Discovery:
-    """What a SOURCE holds.
+    """The raw files that a SOURCE holds.
 
     Args:
         units: files to be read together, by source.
@@ -53,11 +54,11 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawF
     Raises:
         SourceError: nothing there, or nothing recognised in it.
     """
-    candidates = _candidates(source)
+    candidates = _list_candidates(source)
     search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest)
     for path in candidates:
-        search.look_at(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
-    search.identify()
+        search.sort_file(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+    search.hash_files()
     units: list[tuple[Source, Unit]] = []
     refusals = search.refusals
     for item in search.sources:
@@ -65,28 +66,28 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawF
         units += [(item, unit) for unit in grouping.units]
         refusals += grouping.refusals
     if not units and not refusals:
-        raise SourceError(_nothing(source, candidates, search.sources))
+        raise SourceError(_explain_nothing(source, candidates, search.sources))
     return Discovery(tuple(units), tuple(refusals), tuple(search.skipped), tuple(chain(*search.recognised.values())))
 
 
 def recognise(source: Path, dataset: str) -> list[RawFile]:
-    """Find a dataset's raw files by their first lines alone: nothing is read through, and none is given its hash.
+    """Find a dataset's raw files by their first lines alone; none is read to its end or hashed.
 
     Args:
         source: as for `discover`.
-        dataset: whose.
+        dataset: name of the dataset.
 
     Raises:
         SourceError: no such file or folder.
     """
     search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
-    for path in _candidates(source):
-        search.look_at(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+    for path in _list_candidates(source):
+        search.sort_file(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
     return search.found
 
 
 class _Search:
-    """What has been found so far."""
+    """The results of a search that is going on."""
 
     def __init__(self, sources: list[Source], source: Path, digest: Callable[[RawFile], str]) -> None:
         self.sources = sources
@@ -99,45 +100,45 @@ class _Search:
 
     @property
     def found(self) -> list[RawFile]:
-        """What was recognised, before it has hashes."""
+        """The recognised files, before they are hashed."""
         return [file for _, file in self._found]
 
-    def look_at(self, file: RawFile) -> None:
-        """Sort a file of the source, or the members of an archive, into recognised, refused and passed by."""
+    def sort_file(self, file: RawFile) -> None:
+        """Sort a file of the source, or the members of an archive, into recognised, refused and skipped."""
         if file.path.suffix.lower() not in SUFFIXES:
             self.skipped.append(file.name)
             return
         with self._refusing(file):
             if is_archive(file.path):
-                self._look_into(file)
+                self._sort_members(file)
             else:
-                self._take(file)
+                self._detect_source(file)
 
-    def _look_into(self, archive: RawFile) -> None:
+    def _sort_members(self, archive: RawFile) -> None:
         contents = list_members(archive, SUFFIXES)
-        before = self._outcome()
+        before = self._count_results()
         self.refusals += contents.refusals
         for member in contents.files:
             with self._refusing(member):
-                self._take(member)
+                self._detect_source(member)
         self.skipped += contents.others
-        if self._outcome() == before:
-            self._pass_by(archive, _no_raw_files(archive, contents, self.sources))
+        if self._count_results() == before:
+            self._skip_or_refuse(archive, _explain_archive(archive, contents, self.sources))
 
-    def _outcome(self) -> tuple[int, int]:
+    def _count_results(self) -> tuple[int, int]:
         return len(self._found), len(self.refusals)
 
-    def _take(self, file: RawFile) -> None:
+    def _detect_source(self, file: RawFile) -> None:
         head = read_head(file)
         found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.filename)) is not None)
         source, dialect = next(found, (None, ""))
         if source is None:
-            self._pass_by(file, _unknown(file.name, head, self.sources))
+            self._skip_or_refuse(file, _explain_unknown(file.name, head, self.sources))
             return
         self._found.append((source, replace(file, dialect=dialect)))
 
-    def identify(self) -> None:
-        """Give the files that were found their hashes; of two with the same bytes the second is refused."""
+    def hash_files(self) -> None:
+        """Hash the files that were found; the second of two with the same bytes is refused."""
         seen: dict[str, str] = {}
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
             hashes = [threads.submit(self._digest, file) for _, file in self._found]
@@ -163,8 +164,8 @@ class _Search:
                 f"{file.name}: cannot be read ({refused.strerror}). Give yourself the right to read it."
             )
 
-    def _pass_by(self, file: RawFile, refusal: str) -> None:
-        """Pass an unrecognised file by where its ending promises no data and the user did not name it; else refuse."""
+    def _skip_or_refuse(self, file: RawFile, refusal: str) -> None:
+        """Skip an unrecognised file where its ending promises no data and the user did not name it; else refuse it."""
         named_by_user = file.member is None and file.path == self._single
         if PurePosixPath(file.filename).suffix.lower() in PROSE and not named_by_user:
             self.skipped.append(file.name)
@@ -172,7 +173,7 @@ class _Search:
             self.refusals.append(refusal)
 
 
-def _candidates(source: Path) -> list[Path]:
+def _list_candidates(source: Path) -> list[Path]:
     if not source.exists():
         raise SourceError(
             f"{source}: no such file or folder. Give the folder with the raw files as downloaded, or one file; "
@@ -191,44 +192,44 @@ def _candidates(source: Path) -> list[Path]:
     return sorted(path for path in found if path.is_file())
 
 
-def _expected(sources: list[Source]) -> str:
+def _describe_formats(sources: list[Source]) -> str:
     return "; ".join(item.looks_like for item in sources)
 
 
-def _unknown(name: str, head: bytes, sources: list[Source]) -> str:
+def _explain_unknown(name: str, head: bytes, sources: list[Source]) -> str:
     if not head.strip():
-        return f"{name}: empty file. Expected {_expected(sources)}. Download it again."
+        return f"{name}: empty file. Expected {_describe_formats(sources)}. Download it again."
     line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
     shown = line if len(line) <= 100 else f"{line[:100]}..."
     return (
-        f"{name}, line 1: not a known trajectory file. Expected {_expected(sources)}. Got {shown!r}. "
+        f"{name}, line 1: not a known trajectory file. Expected {_describe_formats(sources)}. Got {shown!r}. "
         "Move the file out of the folder, or restore its header."
     )
 
 
-def _no_raw_files(archive: RawFile, contents: Contents, sources: list[Source]) -> str:
+def _explain_archive(archive: RawFile, contents: Contents, sources: list[Source]) -> str:
     held = [*contents.others, *(file.name for file in contents.files)]
     got = ", ".join(name.removeprefix(f"{archive.name}/") for name in held[:5]) + (", ..." if len(held) > 5 else "")
     return (
-        f"{archive.name}: an archive with no raw recordings in it. Expected {_expected(sources)}. "
+        f"{archive.name}: an archive with no raw recordings in it. Expected {_describe_formats(sources)}. "
         f"Got {got or 'an empty archive'}. Give the archive as downloaded."
     )
 
 
-def _nothing(source: Path, candidates: list[Path], sources: list[Source]) -> str:
+def _explain_nothing(source: Path, candidates: list[Path], sources: list[Source]) -> str:
     got = ", ".join(path.name for path in candidates[:5]) + (", ..." if len(candidates) > 5 else "")
     return (
-        f"{source}: no raw recordings in it. Expected {_expected(sources)}. "
+        f"{source}: no raw recordings in it. Expected {_describe_formats(sources)}. "
         f"Got {got or 'an empty folder'}. Give the folder with the downloads, unpacked or not."
     )
 
 
-_HASHED: dict[str, list[object]] = {}
-"""Of this process: a lake that is still to be made has no place to keep hashes, and no file is read twice for them."""
+_HASHES_OF_PROCESS: dict[str, list[object]] = {}
+"""Hashes computed in this process: a lake that does not exist yet cannot keep them, and no file is read twice."""
 
 
 class Digests:
-    """sha256 of files, remembered by path, size and modification time so that idle reruns read nothing.
+    """The sha256 of files, remembered by path, size and modification time so that idle reruns read nothing.
 
     Those of an archive's members are remembered by the archive's size and time, and the member's name.
     """
@@ -245,7 +246,7 @@ class Digests:
         self._changed = False
 
     def __call__(self, file: RawFile) -> str:
-        """The sha256 of a file's bytes.
+        """Return the sha256 of a file's bytes.
 
         Raises:
             SourceError: it is a member of a damaged archive.
@@ -255,13 +256,13 @@ class Digests:
         state = [stat.st_size, stat.st_mtime_ns]
         if self._known.get(key, [])[:2] == state:
             return str(self._known[key][2])
-        if _HASHED.get(key, [])[:2] != state:
-            _HASHED[key] = [*state, hash_raw(file)]
-        self._known[key] = _HASHED[key]
+        if _HASHES_OF_PROCESS.get(key, [])[:2] != state:
+            _HASHES_OF_PROCESS[key] = [*state, hash_raw(file)]
+        self._known[key] = _HASHES_OF_PROCESS[key]
         self._changed = True
         return str(self._known[key][2])
 
     def save(self) -> None:
-        """Keep what was computed beside the lake's manifest, where there is a lake."""
+        """Store new hashes beside the lake's manifest, where there is a lake."""
         if self._changed and self._path.with_name(MANIFEST).exists():
             write_file(self._path, json.dumps(self._known).encode())

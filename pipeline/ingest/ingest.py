@@ -20,21 +20,26 @@ from tracklake.pipeline.stages.stage import Job, make_commit, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
 VERSION = 2
+"""Number to raise when the code makes other tables of the same files."""
 SPREADSHEET_ROWS = 1_048_575
+"""Most rows that a spreadsheet holds under its header."""
 REJECTS_FILE = "rejects.parquet"
+"""Name of the file, in a spill folder, of lines that belong to no recording."""
 REASONS_SHOWN = 3
-"""Of those for which all rows of a recording were dropped."""
+"""Reasons named in the message about a recording of which every row was dropped."""
 MEMORY_BUDGET = MemoryBudget(256 << 20)
-"""Of raw text that is read at once; a recording takes about four times as much memory. highD's longest has 240 MB."""
+"""Raw text read at once, in bytes; a recording takes four times as much memory, and highD's longest has 240 MB."""
 
 _PLANNING_FACTS = ("subset", "freeway")
+"""Columns of `subsets` that stages are planned with."""
 Files = dict[str, list[LakeFile]]
+"""Files by table."""
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
 
 @dataclass(frozen=True)
 class FileContents:
-    """What reading a spilled file told: a small record the manifest remembers by the file's sha256."""
+    """The contents of a file that holds several recordings, as the manifest remembers them by its sha256."""
 
     dataset: str
     version: int
@@ -43,22 +48,22 @@ class FileContents:
     unassigned: int
 
 
-def files_to_read(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
-    """Files that hold several recordings and whose contents the manifest does not know."""
+def find_unread_files(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
+    """Return files that hold several recordings and whose contents the manifest does not know."""
     return [
         (source, unit.files[0])
         for source, unit in discovery.units
-        if source.spill is not None and not _known_contents(source, unit.files[0], manifest)
+        if source.spill is not None and not _find_contents(source, unit.files[0], manifest)
     ]
 
 
-def _known_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[str, Any] | None:
+def _find_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[str, Any] | None:
     contents = manifest.sources.get(file.sha256)
     return contents if contents is not None and contents["version"] == source.version else None
 
 
-def spill_folder(root: Path, file: RawFile) -> Path:
-    """Where a file's rows wait, by recording, for the length of a writing session."""
+def locate_spill(root: Path, file: RawFile) -> Path:
+    """Return the folder where a file's rows wait, by recording, for the length of a writing session."""
     return root / STAGING / "spilled" / file.sha256
 
 
@@ -70,11 +75,11 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
     """
     source = SOURCE_BY_NAME[dataset]
     assert source.spill is not None
-    folder = spill_folder(root, file)
+    folder = locate_spill(root, file)
     folder.mkdir(parents=True, exist_ok=True)
     spilled = source.spill(file, folder)
     if not spilled.recordings:
-        raise SourceError(_unreadable(file, spilled.rows_read, spilled.rejects))
+        raise SourceError(_explain_unreadable(file, spilled.rows_read, spilled.rejects))
     spilled.rejects.write_parquet(folder / REJECTS_FILE)
     return vars(
         FileContents(
@@ -87,7 +92,7 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
     )
 
 
-def _unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:
+def _explain_unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:
     if rejects.is_empty():
         return f"{file.name}: a header and no rows. Download it again."
     line, reason, text = rejects.row(0)
@@ -98,9 +103,9 @@ def _unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:
 
 
 def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
-    """One job per recording that the discovered files hold, and one per file with lines that belong to no recording.
+    """Return a job for each recording that the files hold, and for each file with lines of no recording.
 
-    Files whose contents are not known yet (see `files_to_read`) give no jobs.
+    Files whose contents are not known yet (see `find_unread_files`) give no jobs.
     """
     by_recording: dict[tuple[str, str], list[RawFile]] = {}
     jobs = []
@@ -108,28 +113,28 @@ def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
         if unit.recording is not None:
             by_recording[source.name, unit.recording] = list(unit.files)
             continue
-        contents = _known_contents(source, unit.files[0], manifest)
+        contents = _find_contents(source, unit.files[0], manifest)
         if contents is None:
             continue
         for recording in contents["recordings"]:
             by_recording.setdefault((source.name, recording), []).append(unit.files[0])
         if contents["unassigned"]:
-            jobs.append(_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
-    jobs += [_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
+            jobs.append(_make_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
+    jobs += [_make_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
     return jobs
 
 
 def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
-    """Messages, by key, about recordings whose earlier files these jobs do not hold: their rows would be lost.
+    """Return messages, by key, about recordings that would lose the rows of files that these jobs do not hold.
 
     A file of the same name with other content is a new version of that file, and replaces it.
     """
     messages = {}
     for job in jobs:
-        entry = manifest.commits.get(job.key)
-        if entry is None:
+        commit = manifest.commits.get(job.key)
+        if commit is None:
             continue
-        if lost := find_lost(job, entry):
+        if lost := find_lost(job, commit):
             names = (source["file"] for source in job.built_from["sources"])
             messages[job.key] = (
                 f"recording {job.title}: it is in the lake already, from {', '.join(s['file'] for s in lost)}, and now "
@@ -139,13 +144,13 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
     return messages
 
 
-def find_lost(job: Job, entry: Commit) -> list[dict[str, Any]]:
-    """The sources of a recording's entry that a job for it does not hold, neither by name nor by content."""
+def find_lost(job: Job, commit: Commit) -> list[dict[str, Any]]:
+    """Return the sources of a recording's commit that a job for it does not hold, neither by name nor by content."""
     names, hashes = ({source[part] for source in job.built_from["sources"]} for part in ("file", "sha256"))
-    return [s for s in entry.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
+    return [s for s in commit.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
 
 
-def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
+def _make_job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
     sources = [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files]
     job = make_job(
         f"ingest/{dataset}/{title}",
@@ -165,13 +170,13 @@ def _job(dataset: str, title: str, files: Sequence[RawFile], recording: str | No
     return replace(job, built_from={**job.built_from, "sources": placed})
 
 
-def files_of(job: Job) -> list[RawFile]:
-    """The raw files of an ingest job."""
+def list_files(job: Job) -> list[RawFile]:
+    """Return the raw files of an ingest job."""
     return [RawFile.from_dict(file) for file in job.inputs["files"]]
 
 
 def needs_spill(job: Job) -> bool:
-    """Whether the job's files must have been read into the staging folder first."""
+    """Return whether the job's files must have been read into the staging folder first."""
     return SOURCE_BY_NAME[job.inputs["dataset"]].spill is not None
 
 
@@ -182,7 +187,7 @@ def build(root: Path, job: Job) -> Commit:
         SourceError, schemas.StructureError: the recording cannot be used.
     """
     started = time.perf_counter()
-    recording, files = job.inputs["recording"], files_of(job)
+    recording, files = job.inputs["recording"], list_files(job)
     if recording is None:
         tables, info = _build_unassigned(root, job, files[0])
     elif needs_spill(job):
@@ -200,7 +205,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
     if not canonical.subsets:
         raise SourceError(_explain_emptiness(recording, canonical))
     info = {
-        "notes": [*canonical.notes, *_suspect_truncation(root, files_of(job), canonical)],
+        "notes": [*canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
@@ -228,7 +233,7 @@ def _explain_emptiness(recording: str, canonical: Canonical) -> str:
 
 
 def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:
-    """Files of exactly as many rows as a spreadsheet can hold have circulated; what lay beyond is missing."""
+    """Return notes about files of exactly as many rows as a spreadsheet can hold, whose end may be missing."""
     known = load(root).sources
     rows = dict(canonical.log.select("sha256", "rows_read").iter_rows())
     rows |= {file.sha256: known[file.sha256]["rows_read"] for file in files if file.sha256 in known}
@@ -241,7 +246,7 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
 
 
 def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
-    folder = spill_folder(root, file)
+    folder = locate_spill(root, file)
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
     rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
     return Part(file, pl.scan_ipc(folder / recording / "*.arrow"), rejects)
@@ -268,7 +273,7 @@ def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
 
 def _build_unassigned(root: Path, job: Job, file: RawFile) -> tuple[Files, dict[str, Any]]:
     dataset = job.inputs["dataset"]
-    lines = pl.read_parquet(spill_folder(root, file) / REJECTS_FILE)
+    lines = pl.read_parquet(locate_spill(root, file) / REJECTS_FILE)
     log = {
         "dataset": dataset,
         "recording": None,

@@ -1,4 +1,4 @@
-"""Room in memory for what is worked on at once: large recordings wait for one another, small ones do not."""
+"""A budget of memory for recordings that are read at once: large ones wait for one another, small ones do not."""
 
 import threading
 from collections.abc import Iterator
@@ -6,33 +6,33 @@ from contextlib import contextmanager
 
 
 class MemoryBudget:
-    """So many bytes, of which threads take some and give them back.
+    """A number of bytes that threads reserve and release.
 
     Args:
-        size: in bytes.
+        size: size of the whole budget, in bytes.
     """
 
     def __init__(self, size: int) -> None:
         self._size = size
         self._free = size
-        self._given_back = threading.Condition()
+        self._released = threading.Condition()
 
     @contextmanager
     def reserve(self, size: int) -> Iterator[None]:
-        """Wait until so many bytes are free, and take them for the length of a block.
+        """Wait until enough bytes are free, and reserve them for the length of a block.
 
-        What is larger than the whole budget takes all of it, and so is worked on alone.
+        A size larger than the whole budget reserves all of it, so that its recording is read alone.
 
         Args:
-            size: in bytes.
+            size: how much to reserve, in bytes.
         """
         size = min(size, self._size)
-        with self._given_back:
-            self._given_back.wait_for(lambda: self._free >= size)
+        with self._released:
+            self._released.wait_for(lambda: self._free >= size)
             self._free -= size
         try:
             yield
         finally:
-            with self._given_back:
+            with self._released:
                 self._free += size
-                self._given_back.notify_all()
+                self._released.notify_all()

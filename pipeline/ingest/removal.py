@@ -1,4 +1,4 @@
-"""What goes when raw files are gone or a recording is named: its tables, and what was built on them."""
+"""Removal of recordings, named or with missing raw files: their tables, and all that was built on them."""
 
 import os
 from collections.abc import Collection, Iterable, Sequence
@@ -17,12 +17,12 @@ class Removed:
     """A recording that was taken out of a lake.
 
     Args:
-        dataset: of the recording.
-        recording: its name.
-        subsets: its subsets.
-        entries: rows it had in `tracks`.
-        rows: rows it had in all tables.
-        files: its raw files that are still where they were read.
+        dataset: name of the dataset.
+        recording: name of the recording.
+        subsets: names of its subsets.
+        entries: number of its rows in `tracks`.
+        rows: number of its rows in all tables.
+        files: raw files that are still where they were read.
     """
 
     dataset: str
@@ -34,12 +34,12 @@ class Removed:
 
     @property
     def name(self) -> str:
-        """As `tracklake remove` takes it, whatever else is in the lake."""
+        """Name that `tracklake remove` takes, whatever else is in the lake."""
         return f"{self.dataset}/{self.recording}"
 
 
 class Folder:
-    """What a SOURCE holds now, to compare with what the lake remembers of it."""
+    """The present contents of a SOURCE, to compare with what the lake remembers of it."""
 
     def __init__(self, source: Path, discovery: Discovery) -> None:
         self._root = source
@@ -51,112 +51,113 @@ class Folder:
         # A folder in which nothing is usable tells nothing: it may be the wrong one, or a disk that is not there.
         self._tells = source.is_dir() and bool(discovery.units)
 
-    def lost(self, stood: dict[str, Any]) -> bool:
-        """Whether a file of an entry that nothing makes now stood in this folder, and is nowhere in it any more.
+    def is_lost(self, file: dict[str, Any]) -> bool:
+        """Return whether a file that a commit was made of was in this folder, and is nowhere in it now.
 
         A file that is still there and cannot be read, or is not recognised, is not lost; nor is a member of an
         archive that is still there.
         """
-        path = stood.get("path")  # lakes of before do not know it
+        path = file.get("path")  # older lakes do not know it
         if path is None or not self._tells or not Path(path).is_relative_to(self._root):
             return False
-        known = (path, stood["file"]) in self._places
-        return stood["sha256"] not in self._hashes and (known or not os.path.lexists(path))
+        known = (path, file["file"]) in self._places
+        return file["sha256"] not in self._hashes and (known or not os.path.lexists(path))
 
 
 def find_missing(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:
-    """Entries of ingestion all of whose files stood in a folder and are gone.
+    """Return the commits of ingestion all of whose files were in a folder and are missing from it now.
 
     Args:
-        folder: as it is now.
-        jobs: all that its files give: what one of these makes is not gone.
-        manifest: of the lake.
-        dataset: the only one that was looked for.
+        folder: present contents of the folder.
+        jobs: all jobs that its files give: what one of these makes is not missing.
+        manifest: live files of the lake.
+        dataset: the only dataset that was searched for; None for all.
     """
     planned = {job.key for job in jobs}
     return [
-        entry
-        for entry in manifest.of_stage("ingest")
-        if entry.key not in planned
-        and dataset in (None, entry.info["dataset"])
-        and all(folder.lost(stood) for stood in entry.built_from["sources"])
+        commit
+        for commit in manifest.of_stage("ingest")
+        if commit.key not in planned
+        and dataset in (None, commit.info["dataset"])
+        and all(folder.is_lost(file) for file in commit.built_from["sources"])
     ]
 
 
 def find_superseded(discovery: Discovery, manifest: Manifest) -> list[Commit]:
-    """Entries for lines without a recording whose file was since replaced by a new version of it, which was read."""
+    """Return commits of lines without a recording whose file was replaced by a new version, which was read."""
     now = {(str(file.path), file.name): file.sha256 for file in discovery.recognised}
     found = []
-    for entry in manifest.of_stage("ingest"):
-        stood = entry.built_from["sources"][0]
-        sha256 = now.get((stood.get("path"), stood["file"]), stood["sha256"])
-        if entry.info["recording"] is None and sha256 != stood["sha256"] and sha256 in manifest.sources:
-            found.append(entry)
+    for commit in manifest.of_stage("ingest"):
+        file = commit.built_from["sources"][0]
+        sha256 = now.get((file.get("path"), file["file"]), file["sha256"])
+        if commit.info["recording"] is None and sha256 != file["sha256"] and sha256 in manifest.sources:
+            found.append(commit)
     return found
 
 
 def find_moved(jobs: Iterable[Job], manifest: Manifest) -> list[tuple[Job, Commit]]:
-    """Jobs whose work is done and whose files are not where the lake remembers them, with what is remembered."""
+    """Return jobs that are done and whose files are not where the lake remembers them, each with its commit."""
     done = [(job, manifest.commits[job.key]) for job in jobs if job.key in manifest.commits]
     return [
-        (job, entry)
-        for job, entry in done
-        if entry.fingerprint == job.fingerprint
-        and entry.built_from["sources"] != job.built_from["sources"]
-        and not all(os.path.lexists(stood.get("path", "")) for stood in entry.built_from["sources"])
+        (job, commit)
+        for job, commit in done
+        if commit.fingerprint == job.fingerprint
+        and commit.built_from["sources"] != job.built_from["sources"]
+        and not all(os.path.lexists(file.get("path", "")) for file in commit.built_from["sources"])
     ]
 
 
-def find_dependents(entries: Iterable[Commit], manifest: Manifest) -> set[str]:
-    """Keys of all that goes with entries of ingestion: every stage's of the same recordings, and what builds on those.
+def find_dependents(commits: Iterable[Commit], manifest: Manifest) -> set[str]:
+    """Return the keys of all commits of the same recordings, whatever their stage, and of what was built on those.
 
     Stages over the whole lake name in `built_from` the keys that they were made of.
     """
-    tails = {entry.key.partition("/")[2] for entry in entries}
-    gone = {key for key in manifest.commits if key.partition("/")[2] in tails}
-    while more := {key for key, entry in manifest.commits.items() if key not in gone and gone & _named_in(entry)}:
-        gone |= more
-    return gone
+    tails = {commit.tail for commit in commits}
+    found = {key for key, commit in manifest.commits.items() if commit.tail in tails}
+    while more := {
+        key for key, commit in manifest.commits.items() if key not in found and found & _list_inputs(commit)
+    }:
+        found |= more
+    return found
 
 
-def _named_in(entry: Commit) -> set[str]:
-    inner = [value.keys() for value in entry.built_from.values() if isinstance(value, dict)]
-    return set(entry.built_from).union(*inner)
+def _list_inputs(commit: Commit) -> set[str]:
+    inner = [value.keys() for value in commit.built_from.values() if isinstance(value, dict)]
+    return set(commit.built_from).union(*inner)
 
 
-def describe_removed(entries: Iterable[Commit], manifest: Manifest) -> list[Removed]:
-    """The recordings among entries of ingestion, with the rows that go with each."""
+def describe_removed(commits: Iterable[Commit], manifest: Manifest) -> list[Removed]:
+    """Return the recordings among commits of ingestion, with the rows that are removed with each."""
     found = []
-    for entry in entries:
-        dataset, recording = entry.info["dataset"], entry.info["recording"]
+    for commit in commits:
+        dataset, recording = commit.info["dataset"], commit.info["recording"]
         if recording is None:
             continue
-        tail = entry.key.partition("/")[2]
-        own = [other for key, other in manifest.commits.items() if key.partition("/")[2] == tail]
-        files = [file for other in own for group in other.files.values() for file in group]
-        entries_kept = sum(file.rows or 0 for file in entry.files.get(TRACKS.name, []))
-        subsets = sorted(subset["subset"] for subset in entry.info["subsets"])
-        places = (stood.get("path", "") for stood in entry.built_from["sources"])
+        own = [other for other in manifest.commits.values() if other.tail == commit.tail]
+        files = [file for other in own for file in other.all_files]
+        entries_kept = sum(file.rows or 0 for file in commit.files.get(TRACKS.name, []))
+        subsets = sorted(subset["subset"] for subset in commit.info["subsets"])
+        places = (file.get("path", "") for file in commit.built_from["sources"])
         there = sorted({place for place in places if os.path.lexists(place)})
         found.append(Removed(dataset, recording, subsets, entries_kept, sum(file.rows or 0 for file in files), there))
     return found
 
 
-def name_recordings(entries: Sequence[Commit]) -> str:
-    """Entries of ingestion for a sentence: `recordings 03, 04`, or the files whose lines have no recording."""
-    names = sorted({entry.info["recording"] for entry in entries if entry.info["recording"] is not None})
+def name_recordings(commits: Sequence[Commit]) -> str:
+    """Return commits of ingestion for a sentence: `recordings 03, 04`, or files whose lines have no recording."""
+    names = sorted({commit.info["recording"] for commit in commits if commit.info["recording"] is not None})
     if names:
         return f"recording{'s' if len(names) > 1 else ''} {', '.join(names)}"
-    files = sorted({stood["file"] for entry in entries for stood in entry.built_from["sources"]})
+    files = sorted({file["file"] for commit in commits for file in commit.built_from["sources"]})
     return f"lines of {', '.join(files)} that belong to no recording"
 
 
 def remove_recordings(root: Path, names: Sequence[str]) -> tuple[list[Removed], list[str]]:
-    """Take recordings out of a lake, with all that was made of them; their files are retired, not deleted yet.
+    """Remove recordings from a lake, with all that was made of them; their files are retired, not deleted yet.
 
     Args:
-        root: the lake.
-        names: of recordings, as in `subsets.recording`, or `dataset/recording`.
+        root: the lake's folder.
+        names: names of recordings, as in `subsets.recording`, or `dataset/recording`.
 
     Returns:
         What was removed, and the stages over the whole lake that have to run again.
@@ -167,37 +168,39 @@ def remove_recordings(root: Path, names: Sequence[str]) -> tuple[list[Removed], 
     """
     _find_named(root, names, load(root))  # before anything is locked or made
     with open_for_writing(root) as writer:
-        entries = _find_named(root, names, writer.manifest)
-        entries += _their_lines(entries, writer.manifest)
-        removed, keys = describe_removed(entries, writer.manifest), find_dependents(entries, writer.manifest)
+        commits = _find_named(root, names, writer.manifest)
+        commits += _find_unassigned(commits, writer.manifest)
+        removed, keys = describe_removed(commits, writer.manifest), find_dependents(commits, writer.manifest)
         writer.remove(keys)
     return removed, sorted(key for key in keys if "/" not in key)
 
 
 def _find_named(root: Path, names: Collection[str], manifest: Manifest) -> list[Commit]:
-    known = [entry for entry in manifest.of_stage("ingest") if entry.info["recording"] is not None]
+    known = [commit for commit in manifest.of_stage("ingest") if commit.info["recording"] is not None]
     found: dict[str, Commit] = {}
     for name in names:
-        full = {entry.key: f"{entry.info['dataset']}/{entry.info['recording']}" for entry in known}
-        fitting = [entry for entry in known if name in (entry.info["recording"], full[entry.key])]
+        full = {commit.key: f"{commit.info['dataset']}/{commit.info['recording']}" for commit in known}
+        fitting = [commit for commit in known if name in (commit.info["recording"], full[commit.key])]
         if not fitting:
             listed = ", ".join(sorted(full.values())) or "none"
             raise LakeError(f"{root}: no recording {name!r} in the lake; it has {listed}. Nothing was removed.")
         if len(fitting) > 1:
-            choice = " or ".join(sorted(full[entry.key] for entry in fitting))
+            choice = " or ".join(sorted(full[commit.key] for commit in fitting))
             raise LakeError(f"{root}: the recording {name!r} may be {choice}; say which. Nothing was removed.")
         found[fitting[0].key] = fitting[0]
     return list(found.values())
 
 
-def _their_lines(entries: Sequence[Commit], manifest: Manifest) -> list[Commit]:
-    """Lines without a recording, of files of which nothing else stays in the lake."""
-    keys = {entry.key for entry in entries}
-    others = [entry for entry in manifest.of_stage("ingest") if entry.key not in keys]
-    used = {s["sha256"] for entry in others if entry.info["recording"] is not None for s in entry.built_from["sources"]}
-    theirs = {s["sha256"] for entry in entries for s in entry.built_from["sources"]} - used
+def _find_unassigned(commits: Sequence[Commit], manifest: Manifest) -> list[Commit]:
+    """Return the commits of lines without a recording, of files of which nothing else stays in the lake."""
+    keys = {commit.key for commit in commits}
+    others = [commit for commit in manifest.of_stage("ingest") if commit.key not in keys]
+    used = {
+        s["sha256"] for commit in others if commit.info["recording"] is not None for s in commit.built_from["sources"]
+    }
+    theirs = {s["sha256"] for commit in commits for s in commit.built_from["sources"]} - used
     return [
-        entry
-        for entry in others
-        if entry.info["recording"] is None and entry.built_from["sources"][0]["sha256"] in theirs
+        commit
+        for commit in others
+        if commit.info["recording"] is None and commit.built_from["sources"][0]["sha256"] in theirs
     ]

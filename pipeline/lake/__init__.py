@@ -1,7 +1,7 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError, LakeVersionError, QueryError
-from tracklake.pipeline.lake.files import free_path, is_intact, scan, write_folder, write_table
+from tracklake.pipeline.lake.files import find_free_path, is_intact, scan, write_folder, write_table
 from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest, load
 from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested
@@ -19,7 +19,7 @@ __all__ = [
     "QueryError",
     "Writer",
     "connect",
-    "free_path",
+    "find_free_path",
     "is_intact",
     "list_ingested",
     "load",

@@ -1,4 +1,4 @@
-"""The lake as SQL: views over the live Parquet files and table macros over the views, and catalog.duckdb of both."""
+"""The catalog: views over the live Parquet files, table macros over the views, and catalog.duckdb with both."""
 
 import re
 import tempfile
@@ -10,7 +10,7 @@ import polars as pl
 from polars.datatypes import DataTypeClass
 
 from tracklake.pipeline.lake.errors import LakeError
-from tracklake.pipeline.lake.files import partition_values
+from tracklake.pipeline.lake.files import read_partition
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
@@ -20,12 +20,13 @@ if TYPE_CHECKING:
     import duckdb
 
 CATALOG = "catalog.duckdb"
+"""Name of the database file in the lake."""
 
 JOINED: dict[str, tuple[Table, tuple[str, ...]]] = {
     VEHICLES.name: (VEHICLE_STARTS, ("eligible", "starts_late", "fully_tracked", "early")),
     SUBSETS.name: (SUBSET_STATUS, ("backward_vehicles", "excluded", "excluded_reason")),
 }
-"""Views that show what a later stage found out beside what ingestion wrote."""
+"""Views that show columns of a later stage beside those that ingestion wrote."""
 
 _SQL_TYPES: dict[pl.DataType, str] = {
     pl.String(): "VARCHAR",
@@ -40,7 +41,7 @@ _SQL_TYPES: dict[pl.DataType, str] = {
 
 
 def sql_type(dtype: pl.DataType | DataTypeClass) -> str:
-    """DuckDB's name of a Polars dtype."""
+    """Return DuckDB's name of a Polars dtype."""
     if isinstance(dtype, pl.List):
         return f"{sql_type(dtype.inner)}[]"
     if isinstance(dtype, pl.Struct):
@@ -53,27 +54,27 @@ def sql_type(dtype: pl.DataType | DataTypeClass) -> str:
 
 
 def quote(text: str) -> str:
-    """A SQL string literal."""
+    """Return a text as a SQL string literal."""
     return "'" + text.replace("'", "''") + "'"
 
 
-def literally(path: str) -> str:
-    """A path in which DuckDB finds no pattern."""
+def escape_pattern(path: str) -> str:
+    """Return a path in which DuckDB finds no pattern."""
     return re.sub(r"[*?\[]", r"[\g<0>]", path)
 
 
-def view_statements(manifest: Manifest, locate: Callable[[str], str]) -> list[str]:
-    """CREATE VIEW statements for every table of the lake.
+def list_view_statements(manifest: Manifest, locate: Callable[[str], str]) -> list[str]:
+    """Return CREATE VIEW statements for every table of the lake.
 
     Args:
-        manifest: which files are live.
+        manifest: live files of the lake.
         locate: turns a path relative to the lake into the path to write into the view.
     """
-    return [f'CREATE VIEW "{table.name}" AS {_select(table, manifest, locate)}' for table in TABLES]
+    return [f'CREATE VIEW "{table.name}" AS {_write_select(table, manifest, locate)}' for table in TABLES]
 
 
-def _select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
-    rows = _rows(table, manifest, locate)
+def _write_select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
+    rows = _write_read(table, manifest, locate)
     if table.name not in JOINED:
         return rows
     later, columns = JOINED[table.name]
@@ -81,11 +82,11 @@ def _select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> s
     shown = ", ".join(f"later.{name}" for name in columns)
     return (
         f"SELECT ingested.*, {shown} FROM ({rows}) AS ingested "
-        f"LEFT JOIN ({_rows(later, manifest, locate)}) AS later USING ({key})"
+        f"LEFT JOIN ({_write_read(later, manifest, locate)}) AS later USING ({key})"
     )
 
 
-def _rows(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
+def _write_read(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
     paths = [file.path for file in manifest.live(table.name)]
     files = [quote(locate(path)) for path in paths]
     if not files:
@@ -96,15 +97,15 @@ def _rows(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str
         return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = false)"
     if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
         # A folder above the lake looks like a partition, and DuckDB would believe it.
-        return " UNION ALL ".join(_one_file(table, path, locate) for path in paths)
+        return " UNION ALL ".join(_write_read_of_file(table, path, locate) for path in paths)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
     return (
         f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = true, hive_types = {{{types}}})"
     )
 
 
-def _one_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
-    stated = partition_values(table, path)
+def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
+    stated = read_partition(table, path)
     columns = ", ".join(
         f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'"{name}"'
         for name, dtype in table.dtypes.items()
@@ -112,13 +113,15 @@ def _one_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
     return f"SELECT {columns} FROM read_parquet([{quote(locate(path))}], hive_partitioning = false)"
 
 
-def fill(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest, locate: Callable[[str], str]) -> None:
-    """Make the views, the macros over them, and a comment on each that says what it is.
+def create_views(
+    connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest, locate: Callable[[str], str]
+) -> None:
+    """Create the views, the macros over them, and a comment on each with its meaning.
 
     Args:
-        connection: with nothing in it yet.
-        root: the lake, for messages.
-        manifest: which files are live.
+        connection: connection to an empty database.
+        root: the lake's folder, for messages.
+        manifest: live files of the lake.
         locate: turns a path relative to the lake into the path to write into the views.
 
     Raises:
@@ -126,7 +129,7 @@ def fill(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest
     """
     import duckdb
 
-    for table, statement in zip(TABLES, view_statements(manifest, locate), strict=True):
+    for table, statement in zip(TABLES, list_view_statements(manifest, locate), strict=True):
         try:
             connection.execute(statement)
         except duckdb.Error as failed:
@@ -141,15 +144,15 @@ def fill(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest
         connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
 
 
-def rebuild(root: Path, manifest: Manifest) -> None:
-    """Replace catalog.duckdb, the last step of a session; its views hold paths relative to the lake's folder.
+def rebuild_catalog(root: Path, manifest: Manifest) -> None:
+    """Replace catalog.duckdb, as the last step of a session; its views hold paths relative to the lake's folder.
 
     It is made in a temporary folder, where the lake goes by a link. Views are checked on creation against files
     relative to DuckDB's search path, which is a list of patterns without a way to quote, and "?" in a database's path
     starts its options; a lake may be called "a,b" or "c[1]?".
 
     Raises:
-        LakeError: a live file is missing or unreadable; the catalog of before stays.
+        LakeError: a live file is missing or unreadable; the earlier catalog stays.
     """
     import duckdb
 
@@ -158,7 +161,7 @@ def rebuild(root: Path, manifest: Manifest) -> None:
         link.symlink_to(root.resolve(), target_is_directory=True)
         with duckdb.connect(str(made)) as connection:
             connection.execute(f"SET file_search_path = {quote(str(link))}")
-            fill(connection, root, manifest, locate=str)
+            create_views(connection, root, manifest, locate=str)
         content = made.read_bytes()
     # What a client that wrote to the old catalog left would be replayed into the new one.
     (root / f"{CATALOG}.wal").unlink(missing_ok=True)

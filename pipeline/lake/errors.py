@@ -1,4 +1,4 @@
-"""What can be wrong with a lake, as its user should read it."""
+"""The errors of a lake, with messages for its user."""
 
 
 class LakeError(Exception):

@@ -1,4 +1,4 @@
-"""The files of a lake: where they stand and how they come to stand there whole or not at all."""
+"""The files of a lake: their paths, and how they are written whole or not at all."""
 
 import json
 import re
@@ -17,30 +17,34 @@ from tracklake.schemas import TABLES, Table
 from tracklake.schemas.files import sync
 
 STAGING = ".staging"
+"""Folder of the lake for files that are not whole yet."""
 TENSORS = "tensors"
+"""Folder of the lake for tensors."""
 REPORTS = "reports"
+"""Folder of the lake for the report."""
 MODELS = "models"
+"""Folder of the lake for trained models."""
 LISTING = "files.json"
-"""In every folder of `write_folder`: names and sizes of its files, so that one left half deleted is noticed."""
+"""File in every folder of `write_folder` with the names and sizes of its files, to notice one half deleted."""
 ZSTD_LEVEL = 1
-"""Level 3 makes tables a quarter smaller and takes half as long again to write them."""
+"""Compression level of Parquet files; level 3 writes a quarter less and takes half as long again."""
 
 TABLE_BY_NAME = {table.name: table for table in TABLES}
 
 
-def place(table: Table, values: Mapping[str, str], fingerprint: str) -> str:
-    """Where a table's file stands: `tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
-    folders = [_folder(name, values[name]) for name in table.partition]
+def name_table_file(table: Table, values: Mapping[str, str], fingerprint: str) -> str:
+    """Return the path of a table's file: `tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
+    folders = [_name_folder(name, values[name]) for name in table.partition]
     return "/".join([table.name, *folders, f"part-{fingerprint}.parquet"])
 
 
-def _folder(name: str, value: str) -> str:
-    """A hive partition's folder; what would end the name or be a pattern is percent-encoded, as readers expect."""
+def _name_folder(name: str, value: str) -> str:
+    """Return a hive partition's folder; what would end the name or be a pattern is percent-encoded."""
     return f"{name}=" + re.sub(r"[^\w.\- ]", lambda found: quote(found[0], safe=""), value)
 
 
-def partition_values(table: Table, path: str) -> dict[str, str]:
-    """The partition columns' values that the path of a table's file states."""
+def read_partition(table: Table, path: str) -> dict[str, str]:
+    """Return the partition columns' values that the path of a table's file states."""
     folders = dict(part.split("=", 1) for part in path.split("/") if "=" in part)
     return {name: unquote(folders[name]) for name in table.partition}
 
@@ -51,13 +55,13 @@ def write_table(
     """Validate a frame and put it into the lake under its own name; nothing is visible before it is complete.
 
     Args:
-        root: the lake.
-        table: what it is.
+        root: the lake's folder.
+        table: declaration of the table.
         frame: all the table's columns, in order.
-        values: of the partition columns.
-        fingerprint: part of the name; a whole file that stands there already came from the same inputs and is kept,
-            unless a rebuild made it void (see `free_path`).
-        where: the recording, for messages.
+        values: values of the partition columns.
+        fingerprint: digest that is part of the name; a whole file of that name came from the same inputs and is kept,
+            unless a rebuild made it void (see `find_free_path`).
+        where: name of the recording, for messages.
 
     Returns:
         The file, or nothing for a frame of no rows (a table without files is an empty table).
@@ -68,20 +72,20 @@ def write_table(
     if frame.is_empty():
         return []
     table.validate(frame, where=where)
-    path = free_path(root, place(table, values, fingerprint))
+    path = find_free_path(root, name_table_file(table, values, fingerprint))
     target = root / path
-    if not _holds(target, frame.height):
+    if not _has_rows(target, frame.height):
         stored = frame.drop(*table.partition)
 
         def write(aside: Path) -> None:
             stored.write_parquet(aside, compression="zstd", compression_level=ZSTD_LEVEL, row_group_size=250_000)
 
-        _put(root, target, write)
+        _write_aside(root, target, write)
     return [LakeFile(path=path, rows=frame.height, bytes=target.stat().st_size)]
 
 
-def _holds(target: Path, rows: int) -> bool:
-    """Whether a Parquet file stands there, to its end (the footer), with so many rows."""
+def _has_rows(target: Path, rows: int) -> bool:
+    """Return whether a Parquet file is there, to its end (the footer), with so many rows."""
     if not target.is_file():
         return False
     try:
@@ -91,10 +95,10 @@ def _holds(target: Path, rows: int) -> bool:
     return bool(found == rows)
 
 
-def free_path(root: Path, path: str) -> str:
-    """A path for a file or folder, numbered where a void one has it: `part-1.parquet`, `part-1-2.parquet`.
+def find_free_path(root: Path, path: str) -> str:
+    """Return a path for a file or folder, numbered where a void one has it: `part-1.parquet`, `part-1-2.parquet`.
 
-    What a rebuild found is neither replaced, as readers may have it open, nor used again.
+    What was there before a rebuild is neither replaced, as readers may have it open, nor used again.
     """
     if not (root / path).exists():
         return path
@@ -114,46 +118,46 @@ def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[L
     """Put a whole folder of files into the lake at once.
 
     Args:
-        root: the lake.
-        path: of the folder, relative to the lake; carries the fingerprint. A whole folder that stands there is kept,
-            unless a rebuild made it void; `free_path` tells the path of the one that is then made.
+        root: the lake's folder.
+        path: path of the folder, relative to the lake; it carries the fingerprint. A whole folder there is kept, unless
+            a rebuild made it void; `find_free_path` returns the path of the one that is then made.
         write: fills the folder it is given.
 
     Returns:
         Its files, and the listing of them that is added.
     """
-    target = root / free_path(root, path)
+    target = root / find_free_path(root, path)
     if not _is_whole(target):
 
-        def fill(aside: Path) -> None:
+        def write_listed(aside: Path) -> None:
             aside.mkdir()
             write(aside)
-            sizes = {file.relative_to(aside).as_posix(): file.stat().st_size for file in _files_in(aside)}
+            sizes = {file.relative_to(aside).as_posix(): file.stat().st_size for file in _list_files(aside)}
             (aside / LISTING).write_text(json.dumps(sizes, indent=1), encoding="utf-8")
 
-        _put(root, target, fill)
+        _write_aside(root, target, write_listed)
     return [
         LakeFile(path=file.relative_to(root).as_posix(), rows=None, bytes=file.stat().st_size)
-        for file in _files_in(target)
+        for file in _list_files(target)
     ]
 
 
-def _files_in(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.rglob("*") if file.is_file())
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether a folder holds what its listing says: deleting one is no single step, and may have been killed."""
+    """Return whether a folder holds what its listing says; its deletion may have been killed half way."""
     try:
         sizes = json.loads((folder / LISTING).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    found = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files_in(folder)}
+    found = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _list_files(folder)}
     found.pop(LISTING)
     return bool(found == sizes)
 
 
-def _put(root: Path, target: Path, write: Callable[[Path], None]) -> None:
+def _write_aside(root: Path, target: Path, write: Callable[[Path], None]) -> None:
     aside = root / STAGING / f"{uuid.uuid4().hex}.tmp"
     aside.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -183,24 +187,24 @@ def _make_folder(folder: Path) -> list[Path]:
 
 
 def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.LazyFrame:
-    """The live rows of a table, with its partition columns, lazily.
+    """Return the live rows of a table, with its partition columns, lazily.
 
     Args:
-        root: the lake.
-        manifest: which files are live.
+        root: the lake's folder.
+        manifest: live files of the lake.
         table: what to read.
-        values: of partition columns, to read only those files (`dataset="highd", subset="01-upper"`).
+        values: values of partition columns, to read only those files (`dataset="highd", subset="01-upper"`).
 
     Raises:
         ValueError: the table is not partitioned by a column of `values`.
     """
-    strangers = values.keys() - set(table.partition)
-    if strangers:
-        raise ValueError(f"{table.name} has no partition {', '.join(sorted(strangers))}; filter its rows instead")
+    others = values.keys() - set(table.partition)
+    if others:
+        raise ValueError(f"{table.name} has no partition {', '.join(sorted(others))}; filter its rows instead")
     # Not by the reader's hive option: that takes `name=value` folders above the lake for partitions, too.
     by_values: dict[tuple[tuple[str, str], ...], list[Path]] = {}
     for file in manifest.live(table.name):
-        stated = partition_values(table, file.path)
+        stated = read_partition(table, file.path)
         if values.items() <= stated.items():
             by_values.setdefault(tuple(stated.items()), []).append(root / file.path)
     if not by_values:
@@ -214,7 +218,7 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
 
 
 def is_intact(root: Path, files: Iterable[LakeFile]) -> bool:
-    """Whether files stand in the lake with the size they were committed with."""
+    """Return whether files are in the lake with the size they were committed with."""
     try:
         return all((root / file.path).stat().st_size == file.bytes for file in files)
     except (FileNotFoundError, NotADirectoryError):
@@ -231,7 +235,7 @@ def remove_orphans(root: Path, manifest: Manifest) -> int:
         for file in folder.rglob("*")
         if file.is_file() and file.relative_to(root).as_posix() not in known
     ]
-    remove(root, orphans)
+    remove_files(root, orphans)
     for folder in folders:
         for item in sorted(folder.rglob("*"), reverse=True):
             if item.is_dir() and not any(item.iterdir()):
@@ -239,8 +243,8 @@ def remove_orphans(root: Path, manifest: Manifest) -> int:
     return len(orphans)
 
 
-def remove(root: Path, files: Iterable[Path]) -> None:
-    """Delete files, and the folders that become empty by it."""
+def remove_files(root: Path, files: Iterable[Path]) -> None:
+    """Delete files, and the folders that become empty."""
     for file in files:
         file.unlink(missing_ok=True)
         for folder in file.parents:

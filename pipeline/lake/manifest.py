@@ -1,4 +1,4 @@
-"""manifest.json: the live files of every table, and what each was built from."""
+"""The manifest: the live files of every table, and what each was built from."""
 
 import json
 import shlex
@@ -13,16 +13,17 @@ from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.files import write_file
 
 MANIFEST = "manifest.json"
+"""Name of the manifest's file in the lake."""
 
 
 @dataclass(frozen=True)
 class LakeFile:
-    """One live file.
+    """One live file of a lake.
 
     Args:
-        path: relative to the lake's root, with forward slashes.
-        rows: of a table; None for anything else (reports, tensors).
-        bytes: size, so that a truncated file is noticed.
+        path: path relative to the lake's root, with forward slashes.
+        rows: number of rows of a table; None for anything else (reports, tensors).
+        bytes: size in bytes, so that a truncated file is noticed.
     """
 
     path: str
@@ -32,14 +33,14 @@ class LakeFile:
 
 @dataclass(frozen=True)
 class Commit:
-    """What one stage made of one recording (or of the whole lake), as committed.
+    """The committed work of one stage on one recording (or on the whole lake).
 
     Args:
-        key: `stage/dataset/recording`, or `stage` for a stage over the whole lake.
-        fingerprint: of the inputs, settings and code version; part of every file's name.
-        files: by table.
+        key: name of the work: `stage/dataset/recording`, or `stage` for a stage over the whole lake.
+        fingerprint: digest of the inputs, settings and code version; part of every file's name.
+        files: live files by table.
         built_from: sources with sha256, upstream fingerprints, settings, versions.
-        info: small facts later stages plan with (subsets, counts, notes).
+        info: small facts that later stages plan with (subsets, counts, notes), and the seconds it took.
     """
 
     key: str
@@ -69,9 +70,9 @@ class Retired:
     """A file that is no longer live, kept for readers that opened the lake before it was replaced.
 
     Args:
-        path: relative to the lake's root.
-        generation: in which it was replaced.
-        void: never to be used again, though what it was made of may be as before: a rebuild makes all anew.
+        path: path relative to the lake's root.
+        generation: number of the session in which it was replaced.
+        void: whether it must not be used again, even for the same inputs: a rebuild makes everything again.
     """
 
     path: str
@@ -84,12 +85,12 @@ class Manifest:
     """The state of a lake: replaced as a whole, never edited in place.
 
     Args:
-        lake_id: made with the lake; results cached elsewhere are bound to it.
-        generation: counts the writing sessions that changed something.
-        commits: by key; `entries` in the file.
-        sources: by sha256: which dataset, dialect and recordings a raw file holds.
+        lake_id: identifier made with the lake; artifacts in Prefect are named after it.
+        generation: number of writing sessions that changed something.
+        commits: committed work by key; `entries` in the file.
+        sources: dataset, dialect and recordings of raw files, by sha256.
         retired: files to delete two generations after they were replaced.
-        ingested_from: the SOURCEs it was made from, the last one last.
+        ingested_from: SOURCEs that it was made from, the last one last.
     """
 
     lake_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -100,41 +101,43 @@ class Manifest:
     ingested_from: tuple[str, ...] = ()
 
     def live(self, table: str) -> list[LakeFile]:
-        """The live files of a table, sorted by path."""
+        """Return the live files of a table, sorted by path."""
         files = [file for commit in self.commits.values() for file in commit.files.get(table, [])]
         return sorted(files, key=lambda file: file.path)
 
     def live_paths(self) -> set[str]:
-        """Paths of all live files."""
+        """Return the paths of all live files."""
         return {file.path for commit in self.commits.values() for file in commit.all_files}
 
     def of_stage(self, stage: str) -> list[Commit]:
-        """The commits of a stage, sorted by key."""
+        """Return the commits of a stage, sorted by key."""
         return sorted(
             (commit for commit in self.commits.values() if commit.stage == stage), key=lambda commit: commit.key
         )
 
     def of_recording(self, recording: str) -> "Manifest":
-        """The manifest without what was made of other recordings than this one (`dataset/recording`)."""
-        commits = {key: commit for key, commit in self.commits.items() if key.partition("/")[2] in ("", recording)}
+        """Return the manifest without what was made of other recordings than this one (`dataset/recording`)."""
+        commits = {key: commit for key, commit in self.commits.items() if commit.tail in ("", recording)}
         return replace(self, commits=commits)
 
-    def committing(self, commit: Commit, generation: int) -> "Manifest":
-        """The manifest with a commit added or replaced; what it replaces is retired."""
+    def add_commit(self, commit: Commit, generation: int) -> "Manifest":
+        """Return the manifest with a commit added or replaced; the replaced files are retired."""
         replaced = [self.commits[commit.key]] if commit.key in self.commits else []
-        return self._becoming({**self.commits, commit.key: commit}, replaced, generation)
+        return self._replace_commits({**self.commits, commit.key: commit}, replaced, generation)
 
-    def removing(self, keys: Collection[str], generation: int) -> "Manifest":
-        """The manifest without some commits; their files are retired."""
+    def remove_commits(self, keys: Collection[str], generation: int) -> "Manifest":
+        """Return the manifest without some commits; their files are retired."""
         removed = [commit for key, commit in self.commits.items() if key in keys]
-        return self._becoming({k: e for k, e in self.commits.items() if k not in keys}, removed, generation)
+        return self._replace_commits(
+            {key: commit for key, commit in self.commits.items() if key not in keys}, removed, generation
+        )
 
-    def _becoming(self, commits: dict[str, Commit], replaced: Iterable[Commit], generation: int) -> "Manifest":
+    def _replace_commits(self, commits: dict[str, Commit], replaced: Iterable[Commit], generation: int) -> "Manifest":
         changed = replace(self, commits=commits, generation=generation)
         live = changed.live_paths()
-        gone = {file.path for commit in replaced for file in commit.all_files} - live
+        dropped = {file.path for commit in replaced for file in commit.all_files} - live
         kept = tuple(item for item in self.retired if item.path not in live)
-        return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(gone)))
+        return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(dropped)))
 
 
 def load(root: Path) -> Manifest:
@@ -150,16 +153,16 @@ def load(root: Path) -> Manifest:
     if version != SCHEMA_VERSION:
         raise LakeVersionError(
             f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
-            f"{SCHEMA_VERSION}. Rebuild it from the raw files: {_rebuilding(root, document)}."
+            f"{SCHEMA_VERSION}. Rebuild it from the raw files: {_write_rebuild_commands(root, document)}."
         )
     try:
-        return _parse(document)
+        return _parse_document(document)
     except (ValueError, KeyError, TypeError, AttributeError) as broken:
-        raise not_ours(root / MANIFEST, broken) from broken
+        raise make_foreign_error(root / MANIFEST, broken) from broken
 
 
 def read_document(root: Path) -> dict[str, Any]:
-    """A lake's manifest of any schema version; only `schema_version` is sure to be in it.
+    """Return a lake's manifest of any schema version; only `schema_version` is sure to be in it.
 
     Raises:
         LakeMissingError: no manifest there.
@@ -178,24 +181,24 @@ def read_document(root: Path) -> dict[str, Any]:
             f"{path}: cannot be read ({failed.strerror}). A lake's manifest is a readable file."
         ) from failed
     except UnicodeDecodeError as broken:
-        raise not_ours(path, broken) from broken
+        raise make_foreign_error(path, broken) from broken
     try:
         document: dict[str, Any] = json.loads(text)
         document["schema_version"]
     except (ValueError, KeyError, TypeError) as broken:
-        raise not_ours(path, broken) from broken
+        raise make_foreign_error(path, broken) from broken
     return document
 
 
-def remembered_sources(document: dict[str, Any]) -> tuple[str, ...]:
-    """The SOURCEs that a manifest of any version remembers, as far as it does."""
+def read_sources(document: dict[str, Any]) -> tuple[str, ...]:
+    """Return the SOURCEs that a manifest of any version remembers, as far as it does."""
     found = document.get("ingested_from")
     return tuple(item for item in found if isinstance(item, str)) if isinstance(found, list) else ()
 
 
-def _rebuilding(root: Path, document: dict[str, Any]) -> str:
-    """The commands that make a lake anew of the SOURCEs it was made from, the last one first."""
-    there = [Path(name) for name in reversed(remembered_sources(document)) if Path(name).exists()]
+def _write_rebuild_commands(root: Path, document: dict[str, Any]) -> str:
+    """Return the commands that rebuild a lake from the SOURCEs it was made from, the last one first."""
+    there = [Path(name) for name in reversed(read_sources(document)) if Path(name).exists()]
     outer = [path for path in there if not any(path != other and path.is_relative_to(other) for other in there)]
     first, *others = (shlex.quote(str(path)) for path in outer or [Path("SOURCE")])
     lake = shlex.quote(str(root))
@@ -203,14 +206,14 @@ def _rebuilding(root: Path, document: dict[str, Any]) -> str:
     return ", then ".join(commands + [f"`tracklake run {source} --lake {lake}`" for source in others])
 
 
-def not_ours(path: Path, broken: Exception) -> LakeError:
-    """The error of a manifest.json that some other program wrote, or that is damaged."""
+def make_foreign_error(path: Path, broken: Exception) -> LakeError:
+    """Return the error of a manifest.json that another program wrote, or that is damaged."""
     return LakeError(
         f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
     )
 
 
-def _parse(document: dict[str, Any]) -> Manifest:
+def _parse_document(document: dict[str, Any]) -> Manifest:
     commits = {
         key: Commit(
             key=key,
@@ -227,12 +230,12 @@ def _parse(document: dict[str, Any]) -> Manifest:
         commits=commits,
         sources=document["sources"],
         retired=tuple(Retired(**item) for item in document["retired"]),
-        ingested_from=remembered_sources(document),
+        ingested_from=read_sources(document),
     )
 
 
-def store(root: Path, manifest: Manifest) -> None:
-    """Replace a lake's manifest: the moment at which a commit happens."""
+def store_manifest(root: Path, manifest: Manifest) -> None:
+    """Replace a lake's manifest, which is the moment at which a commit happens."""
     document = {"schema_version": SCHEMA_VERSION, **asdict(manifest)}
     document["entries"] = document.pop("commits")
     write_file(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from tracklake.pipeline.lake.catalog import fill, literally, quote
+from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
 from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import load
@@ -35,7 +35,7 @@ Parameters = Mapping[str, Any] | Sequence[Any]
 
 
 class LakeResult:
-    """What a SELECT found; DuckDB computes it when it is fetched.
+    """The result of a SELECT; DuckDB computes it when it is fetched.
 
     Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`.
     """
@@ -45,7 +45,7 @@ class LakeResult:
 
     @property
     def columns(self) -> list[str]:
-        """The columns' names."""
+        """Names of the columns, in order."""
         return self._relation.columns
 
     @property
@@ -59,20 +59,20 @@ class LakeResult:
         return list(self._relation.description)
 
     def fetchall(self) -> list[tuple[Any, ...]]:
-        """All rows that were not fetched yet."""
+        """Return all rows that were not fetched yet."""
         return self._relation.fetchall()
 
     def fetchone(self) -> tuple[Any, ...] | None:
-        """The next row, or None after the last one."""
+        """Return the next row, or None after the last one."""
         return self._relation.fetchone()
 
     def count(self) -> int:
-        """How many rows there are, by asking anew."""
+        """Return the number of rows, by a query of its own."""
         ((rows,),) = self._relation.count("*").fetchall()
         return int(rows)
 
     def pl(self) -> pl.DataFrame:
-        """The rows as a Polars frame; whole numbers of 128 bits, as DuckDB's sums are, in 64 where they fit.
+        """Return the rows as a Polars frame; whole numbers of 128 bits, as DuckDB's sums are, in 64 where they fit.
 
         Where they do not, they are Decimal, which JSON writes as text.
         """
@@ -84,11 +84,11 @@ class LakeResult:
         )
 
     def limit(self, n: int, offset: int = 0) -> "LakeResult":
-        """At most n rows, after the first `offset`."""
+        """Return at most n rows, after the first `offset`."""
         return LakeResult(self._relation.limit(n, offset))
 
     def project(self, expressions: str) -> "LakeResult":
-        """Other columns computed of these, a list of SQL expressions.
+        """Return other columns computed from these by a list of SQL expressions.
 
         Raises:
             QueryError: not admitted, or DuckDB's own message.
@@ -108,7 +108,7 @@ class LakeConnection:
         self._raw = raw
 
     def sql(self, statement: str, parameters: Parameters | None = None) -> LakeResult:
-        """The result of a statement.
+        """Return the result of a statement.
 
         Args:
             statement: one SELECT.
@@ -120,18 +120,18 @@ class LakeConnection:
         return _select_only(self._raw, statement, parameters)
 
     execute = sql
-    """As DuckDB's connections have it."""
+    """Same as `sql`, under the name that DuckDB's connections have."""
 
     def close(self) -> None:
-        """Let go of the lake's files."""
+        """Close the connection and the lake's files."""
         self._raw.close()
 
     def __enter__(self) -> "LakeConnection":
-        """Use it in a `with` block."""
+        """Use the connection in a `with` block."""
         return self
 
     def __exit__(self, *_raised: object) -> None:
-        """Close it."""
+        """Close the connection after a `with` block."""
         self.close()
 
 
@@ -161,10 +161,10 @@ def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection
             "allow_community_extensions": False,
         },
     )
-    fill(connection, root, manifest, locate=lambda path: literally(str(root / path)))
+    create_views(connection, root, manifest, locate=lambda path: escape_pattern(str(root / path)))
     live = [str(root / file.path) for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
-    allowed = ", ".join(quote(path) for path in {*live, *map(literally, live)})
+    allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})
     for setting in (
         "temp_directory = ''",
         "python_enable_replacements = false",
@@ -197,7 +197,7 @@ def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: 
         allowed = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
         if len(statements) != 1 or kinds[0] not in allowed:
             asked = ", ".join(str(kind).rpartition(".")[2] for kind in kinds) or "nothing"
-            hint = _PIVOT_HINT if any(word.lower() == "pivot" for word in _split(sql)) else ""
+            hint = _PIVOT_HINT if any(word.lower() == "pivot" for word in _split_words(sql)) else ""
             raise QueryError(f"one SELECT or EXPLAIN at a time; got {asked}. The lake is read-only.{hint}")
         if kinds[0] == duckdb.StatementType.EXPLAIN:
             _refuse_explained_writes(connection, statements[0].query)
@@ -206,15 +206,15 @@ def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: 
 
 
 def _refuse_switches(sql: str) -> None:
-    words = _split(sql)
+    words = _split_words(sql)
     for place, word in enumerate(words):
         name, following = word.strip('"').lower(), words[place + 1 :]
-        if name in _SWITCHES and following[:1] == ["("] and not _goes_on_as_a_with(following):
+        if name in _SWITCHES and following[:1] == ["("] and not _continues_as_with(following):
             raise QueryError(f"{name}(...) is not available here; the lake is read-only.")
 
 
-def _split(sql: str) -> list[str]:
-    """A statement's words and signs, as DuckDB itself reads it: without comments, and a quote for every text."""
+def _split_words(sql: str) -> list[str]:
+    """Return a statement's words and signs, as DuckDB itself reads it: without comments, and a quote for every text."""
     import duckdb
 
     text, tokens = sql.encode(), duckdb.tokenize(sql)
@@ -227,8 +227,8 @@ def _split(sql: str) -> list[str]:
     return words
 
 
-def _goes_on_as_a_with(following: list[str]) -> bool:
-    """Whether a name's following words are `(x, y) AS (`, as in a WITH; after no call of a function are they."""
+def _continues_as_with(following: list[str]) -> bool:
+    """Return whether a name's following words are `(x, y) AS (`, as in a WITH and after no function call."""
     end = following.index(")") if ")" in following else 0
     is_list = all(word == "," or _WORD.fullmatch(word) for word in following[1:end])
     return is_list and [word.upper() for word in following[end + 1 : end + 3]] == ["AS", "("]

@@ -1,4 +1,4 @@
-"""A lake begun anew in its place: whatever version it was of, its files are retired, and nothing is live."""
+"""The rebuild of a lake in its place: whatever its version, its files are retired, and nothing is live."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,18 +11,18 @@ from tracklake.pipeline.lake.manifest import (
     Manifest,
     Retired,
     load,
-    not_ours,
+    make_foreign_error,
     read_document,
-    remembered_sources,
+    read_sources,
 )
 from tracklake.schemas import SCHEMA_VERSION
 
 
-def begin_anew(root: Path) -> Manifest:
-    """The manifest that takes a lake's place, not stored yet: without entries, under a new id.
+def start_rebuild(root: Path) -> Manifest:
+    """Return the manifest that takes a lake's place, not stored yet: without commits, under a new id.
 
     Readers of the old tables find their files for two more generations, like those of any replaced file. Nothing of
-    them is used again, and none is overwritten: see `files.free_path`.
+    them is used again, and none is overwritten: see `files.find_free_path`.
 
     Raises:
         LakeMissingError: no manifest there.
@@ -33,35 +33,35 @@ def begin_anew(root: Path) -> Manifest:
         load(root)
     elif not isinstance(document.get("lake_id"), str) and not (root / CATALOG).exists():
         # Other programs number the schemas of their manifest.json, too; theirs must not be replaced.
-        raise not_ours(root / MANIFEST, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))
+        raise make_foreign_error(root / MANIFEST, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))
     number = document.get("generation")
     generation = max(number, 0) if isinstance(number, int) else 0
-    files = {*_committed(root, document), *_standing(root)}
+    files = {*_list_committed(root, document), *_list_existing(root)}
     return Manifest(
         generation=generation,
         retired=tuple(Retired(path, generation + 1, void=True) for path in sorted(files)),
-        ingested_from=remembered_sources(document),
+        ingested_from=read_sources(document),
     )
 
 
 def list_ingested(root: Path) -> set[str]:
-    """`dataset/recording` of what a lake of any version says it holds; nothing where there is no lake."""
+    """Return `dataset/recording` of all that a lake of any version holds; nothing where there is no lake."""
     if not (root / MANIFEST).exists():
         return set()
-    stages = (key.partition("/") for key in _mapping(read_document(root).get("entries")))
+    stages = (key.partition("/") for key in _to_mapping(read_document(root).get("entries")))
     return {of for stage, _, of in stages if stage == "ingest" and not of.partition("/")[2].startswith("lines-")}
 
 
-def _committed(root: Path, document: dict[str, Any]) -> Iterator[str]:
-    """Files that a manifest of any version names, of those that stand in the lake's folders.
+def _list_committed(root: Path, document: dict[str, Any]) -> Iterator[str]:
+    """Return the files in the lake's folders that a manifest of any version names.
 
     They will be deleted one day, so nothing outside may be meant, nor the manifest itself.
     """
-    entries = _mapping(document.get("entries")).values()
-    groups = [group for entry in entries for group in _mapping(_mapping(entry).get("files")).values()]
+    entries = _to_mapping(document.get("entries")).values()
+    groups = [group for entry in entries for group in _to_mapping(_to_mapping(entry).get("files")).values()]
     top = root.resolve()
     for item in (item for group in [*groups, document.get("retired")] if isinstance(group, list) for item in group):
-        path = _mapping(item).get("path")
+        path = _to_mapping(item).get("path")
         if not isinstance(path, str) or not (top / path).is_file():
             continue
         file = (top / path).resolve()
@@ -69,11 +69,11 @@ def _committed(root: Path, document: dict[str, Any]) -> Iterator[str]:
             yield file.relative_to(top).as_posix()
 
 
-def _standing(root: Path) -> Iterator[str]:
-    """Files in the folders that are the lake's alone, named by a manifest or not."""
+def _list_existing(root: Path) -> Iterator[str]:
+    """Return the files in the folders that are the lake's alone, named by a manifest or not."""
     for folder in (root / name for name in (*TABLE_BY_NAME, TENSORS)):
         yield from (file.relative_to(root).as_posix() for file in folder.rglob("*") if file.is_file())
 
 
-def _mapping(value: object) -> dict[str, Any]:
+def _to_mapping(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}

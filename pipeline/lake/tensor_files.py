@@ -49,7 +49,7 @@ def write_tensors(
     files = {name: path.open("wb") for name, path in spooled.items()}
     try:
         for facts, tensors in subsets:
-            _check(tensors.arrays, storage, f"{facts['dataset']}/{facts['subset']}")
+            _check_arrays(tensors.arrays, storage, f"{facts['dataset']}/{facts['subset']}")
             for name, values in join_after(tensors.arrays, sizes, len(described)).items():
                 values.tofile(files[name])
             own = count_sizes(tensors.arrays)
@@ -81,7 +81,7 @@ def write_tensors(
 
 
 def make_header(sizes: Mapping[str, int], storage: str) -> bytes:
-    """The head of a safetensors file: its length, and dtype, shape and place of every array of ARRAYS, in that order.
+    """Return the head of a safetensors file: its length, and dtype, shape and offsets of every array, in order.
 
     Padded with blanks, so that the arrays begin at a multiple of 8 bytes, and arrays of wide elements stay aligned.
     """
@@ -111,7 +111,7 @@ def _join_files(target: Path, spooled: Mapping[str, Path], sizes: Mapping[str, i
             spooled[array.name].unlink()
 
 
-def _check(arrays: Arrays, storage: str, where: str) -> None:
+def _check_arrays(arrays: Arrays, storage: str, where: str) -> None:
     """Refuse arrays that are not as declared."""
     missing = [array.name for array in ARRAYS if array.name not in arrays]
     if missing:

@@ -1,4 +1,4 @@
-"""One writer at a time: the lock, commits, and the sweeping of what is no longer needed."""
+"""The writer of a lake, one at a time: the lock, commits, and the removal of files that are no longer needed."""
 
 import fcntl
 import os
@@ -12,25 +12,26 @@ from typing import Any
 
 from tracklake.pipeline.lake import catalog, files
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store
-from tracklake.pipeline.lake.rebuild import begin_anew
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
+from tracklake.pipeline.lake.rebuild import start_rebuild
 from tracklake.schemas.files import remove_unfinished
 
 LOCK = ".lock"
+"""Name of the lock's file in the lake."""
 KEPT_GENERATIONS = 2
-"""A replaced file is deleted at the end of the session that makes this many generations since."""
+"""Generations for which a replaced file is kept, in writing sessions."""
 
 _HELD: set[int] = set()
 """Descriptors of the locks this process holds."""
 
 
-def _let_go() -> None:
-    """A forked child shares its parent's lock and would keep it after the parent's death."""
+def _release_locks() -> None:
+    """Close the locks that a forked child shares with its parent, or it would keep them after the parent's end."""
     while _HELD:
         os.close(_HELD.pop())
 
 
-os.register_at_fork(after_in_child=_let_go)
+os.register_at_fork(after_in_child=_release_locks)
 
 
 class Writer:
@@ -49,7 +50,7 @@ class Writer:
             if not files.is_intact(self.root, commit.all_files):
                 raise LakeError(f"{self.root}: files of {commit.key} vanished before they were committed. Run again.")
             if self.manifest.commits.get(commit.key) != commit:
-                self._store(self.manifest.committing(commit, self._generation))
+                self._store(self.manifest.add_commit(commit, self._generation))
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -59,31 +60,31 @@ class Writer:
                 self._store(replace(self.manifest, sources=merged, generation=self._generation))
 
     def remove(self, keys: Collection[str]) -> None:
-        """Take commits out of the lake; their files are retired like replaced ones."""
+        """Remove commits from the lake; their files are retired like replaced ones."""
         with self._guard:
             if not self.manifest.commits.keys().isdisjoint(keys):
-                self._store(self.manifest.removing(keys, self._generation))
+                self._store(self.manifest.remove_commits(keys, self._generation))
 
     def remember_origin(self, source: str) -> None:
-        """Record a SOURCE as the last one, so that a rebuild can be told where the raw files are."""
+        """Record a SOURCE as the last one, so that a message about a rebuild can name it."""
         with self._guard:
             origins = (*(name for name in self.manifest.ingested_from if name != source), source)
             if origins != self.manifest.ingested_from:
                 self._store(replace(self.manifest, ingested_from=origins))
 
     def finish(self) -> None:
-        """Rebuild the catalog, then sweep what neither it nor a reader of the one before needs: a session's last step.
+        """Rebuild the catalog, then delete what neither it nor a reader of the one before needs: a session's last step.
 
         Raises:
             LakeError: live files were removed or damaged by others, so that there is no catalog to make.
         """
         with self._guard:
             self._refuse_child()
-            catalog.rebuild(self.root, self.manifest)
+            catalog.rebuild_catalog(self.root, self.manifest)
             limit = self.manifest.generation - KEPT_GENERATIONS
             old = [item for item in self.manifest.retired if item.generation <= limit]
             live = self.manifest.live_paths()
-            files.remove(self.root, (self.root / item.path for item in old if item.path not in live))
+            files.remove_files(self.root, (self.root / item.path for item in old if item.path not in live))
             if old:
                 self._store(replace(self.manifest, retired=tuple(i for i in self.manifest.retired if i not in old)))
             files.remove_orphans(self.root, self.manifest)
@@ -95,7 +96,7 @@ class Writer:
 
     def _store(self, manifest: Manifest) -> None:
         self._refuse_child()
-        store(self.root, manifest)
+        store_manifest(self.root, manifest)
         self.manifest = manifest
 
 
@@ -107,7 +108,7 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
 
     Args:
         root: the lake.
-        rebuild: begin with nothing live, whatever schema version the lake is of; see `rebuild.begin_anew`.
+        rebuild: begin with nothing live, whatever schema version the lake is of; see `rebuild.start_rebuild`.
 
     Raises:
         LakeLockedError: another process holds the lock.
@@ -116,17 +117,17 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     refuse_foreign(root, rebuild=rebuild)
     descriptor = _open_lock(root)
     try:
-        _take(root, descriptor)
+        _acquire_lock(root, descriptor)
         # What is said of its holder stays in the file where a session did not come to its end.
         broken_off = bool(os.pread(descriptor, 1, 0))
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
-        writer = _begin(root, broken_off=broken_off, rebuild=rebuild)
+        writer = _open_writer(root, broken_off=broken_off, rebuild=rebuild)
         yield writer
         writer.finish()
         os.ftruncate(descriptor, 0)
     finally:
-        if descriptor in _HELD:  # not in a forked child, which let go of it
+        if descriptor in _HELD:  # not in a forked child, which closed it
             _HELD.discard(descriptor)
             os.close(descriptor)
 
@@ -142,7 +143,7 @@ def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
     if (root / LOCK).exists():
         descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            _take(root, descriptor)
+            _acquire_lock(root, descriptor)
         finally:
             os.close(descriptor)
 
@@ -159,7 +160,7 @@ def _open_lock(root: Path) -> int:
     return descriptor
 
 
-def _take(root: Path, descriptor: int) -> None:
+def _acquire_lock(root: Path, descriptor: int) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -170,22 +171,22 @@ def _take(root: Path, descriptor: int) -> None:
         ) from None
 
 
-def _begin(root: Path, *, broken_off: bool, rebuild: bool) -> Writer:
-    """Load the manifest (or make the first), sweep what was half written, and bring the catalog up to date."""
+def _open_writer(root: Path, *, broken_off: bool, rebuild: bool) -> Writer:
+    """Load the manifest (or make the first), delete what was half written, and bring the catalog up to date."""
     try:
-        manifest = begin_anew(root) if rebuild else load(root)
+        manifest = start_rebuild(root) if rebuild else load(root)
         if rebuild:
-            store(root, manifest)
+            store_manifest(root, manifest)
     except LakeMissingError:
         manifest = Manifest()
-        store(root, manifest)
+        store_manifest(root, manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
     remove_unfinished(root)
     remove_unfinished(root / files.REPORTS)
     if broken_off and not rebuild:
         # Readers of the catalog must not fall behind by more generations than files are kept for.
         with suppress(LakeError):  # files are missing: this session may be the one that makes them again
-            catalog.rebuild(root, manifest)
+            catalog.rebuild_catalog(root, manifest)
     return Writer(root, manifest)
 
 
@@ -202,7 +203,7 @@ def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:
     if root.exists() and not root.is_dir():
         raise LakeError(f"{root}: is a file; a lake is a folder. Name another with --lake.")
     if (root / MANIFEST).exists():
-        (begin_anew if rebuild else load)(root)  # another program's manifest is found out before anything is touched
+        (start_rebuild if rebuild else load)(root)  # another program's manifest is found out before anything is touched
     elif root.is_dir():
         foreign = sorted(item.name for item in root.iterdir() if not item.name.startswith("."))
         if foreign:

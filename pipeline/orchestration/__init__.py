@@ -1,1 +1,1 @@
-"""What there is to do, and the Prefect flows that do it."""
+"""The plan of a run, and the Prefect flows that carry it out."""

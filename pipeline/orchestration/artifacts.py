@@ -1,4 +1,4 @@
-"""What a flow run shows of the report in Prefect's UI, as plain values: tables of figures and the page's address."""
+"""Artifacts of a flow run in Prefect's UI, as plain values: the report's tables of figures and its address."""
 
 import json
 import re
@@ -10,17 +10,17 @@ from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 
-KEY_CHARACTERS = 40
-"""Of the lake's folder name in a key."""
+MAX_NAME_CHARS = 40
+"""Longest part of the lake's folder name in a key, in characters."""
 
 
 @dataclass(frozen=True)
 class FigureTable:
-    """A table of the report.
+    """A table of the report's figures.
 
     Args:
         key: lowercase letters, digits and dashes; the same in every run over this lake, another in another lake.
-        description: what a row is.
+        description: meaning of a row.
         rows: plain values by heading.
     """
 
@@ -31,13 +31,13 @@ class FigureTable:
 
 @dataclass(frozen=True)
 class ReportLink:
-    """Where the report stands.
+    """A link to the report's page.
 
     Args:
-        key: as a table's.
-        description: what it is.
-        address: the page's file URI.
-        text: to show instead of it.
+        key: as that of a table.
+        description: meaning of the link.
+        address: file URI of the page.
+        text: words shown instead of the address.
     """
 
     key: str
@@ -53,34 +53,40 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
         root: a lake with a report.
 
     Raises:
-        OSError: there is none.
+        OSError: the lake has no report.
     """
     quality = json.loads((root / REPORTS / DOCUMENT).read_text(encoding="utf-8"))
     lake, name = load(root), root.resolve().name
 
-    def key(what: str) -> str:
-        return "-".join(filter(None, ("tracklake", what, _slug(name), _slug(lake.lake_id)[:8])))
+    def make_key(what: str) -> str:
+        return "-".join(filter(None, ("tracklake", what, _make_slug(name), _make_slug(lake.lake_id)[:8])))
 
     tables = [
-        FigureTable(key("findings"), "Per rule: what breaks it in the whole lake.", _findings(quality)),
-        FigureTable(key("subsets"), "Per subset: its size, and the entries that break each rule.", _subsets(quality)),
-        FigureTable(key("ingestion"), "Per source file: rows read = rows kept + rows dropped.", _ingested(quality)),
+        FigureTable(make_key("findings"), "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
         FigureTable(
-            key("completeness"), "Per recording: what was announced beside what was found.", _completeness(quality)
+            make_key("subsets"), "Per subset: its size, and the entries that break each rule.", _list_subsets(quality)
+        ),
+        FigureTable(
+            make_key("ingestion"), "Per source file: rows read = rows kept + rows dropped.", _list_files(quality)
+        ),
+        FigureTable(
+            make_key("completeness"),
+            "Per recording: what was announced beside what was found.",
+            _list_completeness(quality),
         ),
     ]
     page = (root / REPORTS / PAGE).resolve()
     # Brackets would end the link's text in the Markdown that Prefect makes of it.
     text = "quality report of " + re.sub(r"[^\w .-]", "_", name)
     where = "A page on the disk of the machine that made it; browsers open it by its address, not by a click."
-    return tables, ReportLink(key("report"), where, page.as_uri(), text)
+    return tables, ReportLink(make_key("report"), where, page.as_uri(), text)
 
 
-def _slug(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:KEY_CHARACTERS].strip("-")
+def _make_slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:MAX_NAME_CHARS].strip("-")
 
 
-def _findings(quality: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_findings(quality: dict[str, Any]) -> list[dict[str, Any]]:
     counted = ("runs", "vehicles", "entries", "entry_share", "worst")
     return [
         {
@@ -94,7 +100,7 @@ def _findings(quality: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _subsets(quality: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_subsets(quality: dict[str, Any]) -> list[dict[str, Any]]:
     entries = {
         (rule["name"], row["dataset"], row["subset"]): row["entries"]
         for rule in quality["rules"]
@@ -109,11 +115,11 @@ def _subsets(quality: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _ingested(quality: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_files(quality: dict[str, Any]) -> list[dict[str, Any]]:
     shown = ("dataset", "file", "recording", "dialect", "rows_read", "rows_kept", "rows_dropped")
     return [{name: row[name] for name in shown} for row in quality["ingestion"]["files"]]
 
 
-def _completeness(quality: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_completeness(quality: dict[str, Any]) -> list[dict[str, Any]]:
     shown = ("dataset", "recording", "measure", "authority", "expected", "found", "agrees")
     return [{name: row[name] for name in shown} for row in quality["completeness"]]

@@ -55,6 +55,7 @@ from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas import StructureError
 
 REPORT = "report"
+"""Name of the stage whose figures a run shows as artifacts."""
 OUR_FAULTS = (400, 422)
 """HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
 SERVER_START_S = 120.0
@@ -66,6 +67,7 @@ _PLAN: ContextVar[RunPlan | None] = ContextVar("plan", default=None)
 """What `execute` hands to its flow beside the parameters, which Prefect stores, limits in size and shows."""
 
 Results = Iterable[tuple[str, Any]]
+"""Titles of tasks with their results or errors."""
 
 
 def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
@@ -138,7 +140,7 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
     assert discovery is not None
     result.refused += discovery.refusals
     result.skipped += discovery.skipped
-    unknown = ingest.files_to_read(discovery, writer.manifest)
+    unknown = ingest.find_unread_files(discovery, writer.manifest)
     _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
     if plan is None or plan.manifest != writer.manifest:  # there was no lake, or it has changed since
         plan = plan_ingest(request, discovery, writer.manifest)
@@ -149,8 +151,8 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
         file.sha256: (job.inputs["dataset"], file)
         for job in plan.jobs
         if ingest.needs_spill(job)
-        for file in ingest.files_of(job)
-        if not ingest.spill_folder(writer.root, file).exists()
+        for file in ingest.list_files(job)
+        if not ingest.locate_spill(writer.root, file).exists()
     }
     _read_all(writer, needed, request, result)
     _build_all(writer, INGEST, plan.jobs, request, result)
@@ -204,9 +206,9 @@ def _work(request: RunRequest) -> dict[str, Any]:
 
 
 def _publish(root: Path) -> list[str]:
-    """Attach the report's tables and its address to the flow run; returns a note where Prefect's API is not up to it.
+    """Attach the report's tables and its address to the flow run; returns a note where Prefect's API fails.
 
-    The lake is whole without them, so that a server that is busy, gone or forbids it fails no run. One that
+    The lake is whole without them, so that a server that is busy, missing or forbids it fails no run. One that
     understands the request and calls it wrong has found a fault of ours, which is raised.
     """
     tables, link = summarise_report(root)
@@ -232,7 +234,7 @@ def run(
     prune: bool = False,
     rebuild: bool = False,
 ) -> dict[str, Any]:
-    """The whole pipeline: raw files to tables, findings, repair, samples, split, tensors, first score and report."""
+    """Run the whole pipeline: raw files to tables, findings, repair, samples, split, tensors, score and report."""
     return _work(RunRequest(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild))
 
 
@@ -246,19 +248,19 @@ def ingest_files(
     prune: bool = False,
     rebuild: bool = False,
 ) -> dict[str, Any]:
-    """Raw files to tracks, vehicles and subsets."""
+    """Ingest raw files: to tracks, vehicles and subsets."""
     return _work(RunRequest(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild))
 
 
 @flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
 def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Findings, late starts and the report over what is in the lake."""
+    """Make findings, late starts and the report of what is in the lake."""
     return _work(RunRequest(lake, QUALITY_STEPS, settings=settings or {}))
 
 
 @flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False, task_runner=FEW_THREADS)
 def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """One stage over what is in the lake, or several (`repair+assess`)."""
+    """Run one stage over what is in the lake, or several (`repair+assess`)."""
     return _work(RunRequest(lake, tuple(stage.split("+")), settings=settings or {}))
 
 
@@ -277,7 +279,7 @@ def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
         parameters |= {"replace": request.replace, "prune": request.prune, "rebuild": request.rebuild}
     else:
         parameters["stage"] = "+".join(request.steps)
-    changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nobody listens for it
+    changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nothing uses it
     if PREFECT_API_URL.value() is None:
         changed[PREFECT_API_URL] = _embed_server()
     with temporary_settings(changed):
@@ -290,7 +292,7 @@ def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
 
 
 def _choose_runner(settings: Settings) -> TaskRunner[Any]:
-    """Threads (Polars and DuckDB release the interpreter), or Dask workers, which need the lake on a shared disk."""
+    """Return threads (Polars and DuckDB release the interpreter) or Dask workers (which need a shared disk)."""
     if settings.runner == "threads":
         return ThreadPoolTaskRunner(max_workers=settings.workers)
     try:
@@ -331,7 +333,7 @@ def _embed_server() -> str:
 
 
 def _mute_console() -> None:
-    """Take Prefect's lines off the terminal; its server still gets them, and the user gets ours."""
+    """Keep Prefect's lines off the terminal; its server still gets them, and the user gets ours."""
     for name in (None, "prefect", *logging.root.manager.loggerDict):
         logger = logging.getLogger(name)
         for handler in list(logger.handlers):

@@ -1,4 +1,4 @@
-"""How work is shown while it lasts: flows report here, the command line decides whether and how to draw it."""
+"""Progress of the work: flows report it here, and the command line decides whether and how to draw it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,30 +6,30 @@ from typing import Protocol
 
 
 class Reporter(Protocol):
-    """Told what is going on."""
+    """Receives reports of what is going on."""
 
     def begin(self, stage: str, total: int) -> None:
-        """A stage starts on so many recordings."""
+        """Report that a stage starts on a number of recordings."""
 
     def advance(self, stage: str, title: str) -> None:
-        """One of them is done."""
+        """Report that one of them is done."""
 
 
 class Silent:
-    """Shows nothing: for scripts, tests and workers."""
+    """Shows no progress: for scripts, tests and workers."""
 
     def begin(self, stage: str, total: int) -> None:
-        """Nothing."""
+        """Ignore that a stage starts."""
 
     def advance(self, stage: str, title: str) -> None:
-        """Nothing."""
+        """Ignore that a recording is done."""
 
 
 _current: Reporter = Silent()
 
 
 def reporter() -> Reporter:
-    """The reporter in use."""
+    """Return the reporter in use."""
     return _current
 
 

@@ -1,4 +1,4 @@
-"""What there is to do, decided from the manifest before any orchestrator is imported."""
+"""The plan of a run, made from the manifest before any orchestrator is imported."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,17 +23,17 @@ QUALITY_STEPS = ("validate", "repair", "assess", "report")
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a user asked for: plain values, fit to be a flow's parameters.
+    """The request of a user: plain values, fit to be a flow's parameters.
 
     Args:
         lake: folder of the lake.
-        steps: of ALL_STEPS, in order.
+        steps: names of ALL_STEPS, in order.
         source: raw file or folder; needed for ingest.
         dataset: read the source's files as this dataset's only.
-        settings: of `pipeline.settings.Settings`, as plain values.
+        settings: values of `pipeline.settings.Settings`, by name.
         replace: whether recordings may lose rows of files that the source does not hold.
-        prune: remove recordings whose files once stood in the source, a folder, and are gone from it.
-        rebuild: begin the lake anew, whatever schema version it is of.
+        prune: remove recordings whose files once stood in the source, a folder, and are missing from it now.
+        rebuild: make the whole lake again, whatever its schema version.
     """
 
     lake: str
@@ -52,7 +52,7 @@ class RunRequest:
 
     @property
     def origin(self) -> Path:
-        """The source with the links in its path followed: by this the lake remembers where files stood.
+        """The source with the links in its path followed: the lake remembers files by it.
 
         A file that is a link itself keeps the name it was given by.
         """
@@ -60,14 +60,14 @@ class RunRequest:
         return given.resolve() if given.is_dir() else given.parent.resolve() / given.name
 
     def get_settings(self) -> Settings:
-        """The settings, validated."""
+        """Return the settings, validated."""
         return Settings(**self.settings)
 
     def check(self) -> None:
-        """Refuse settings that only a later stage would stumble over.
+        """Refuse settings that would only fail in a later stage.
 
         Raises:
-            ThresholdError: a threshold of no such name.
+            ThresholdError: no rule has a threshold of that name.
         """
         resolve(RULES, self.get_settings().thresholds)
 
@@ -79,7 +79,7 @@ class RunRequest:
 
 @dataclass
 class RunResult:
-    """What a run did with a request.
+    """The result of a run.
 
     Args:
         built: recordings (or 1 for a stage over the whole lake) made, by step.
@@ -100,7 +100,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class IngestPlan:
-    """What a source means for the lake.
+    """The changes that a source means for the lake.
 
     Args:
         manifest: the lake that the source was compared with.
@@ -121,7 +121,7 @@ class IngestPlan:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What a command found out before it starts any work: it is handed on, so that nothing is found out twice.
+    """The findings of a command before it starts any work, handed on so that nothing is searched twice.
 
     Args:
         discovery: the source's raw files; None where nothing is ingested.
@@ -163,7 +163,7 @@ def plan_run(request: RunRequest, discovery: Discovery | None) -> RunPlan:
         return RunPlan(discovery)
     plan = None
     if discovery is not None:
-        if ingest.files_to_read(discovery, manifest):
+        if ingest.find_unread_files(discovery, manifest):
             return RunPlan(discovery)
         plan = plan_ingest(request, discovery, manifest)
         if plan.jobs or plan.superseded or (request.prune and plan.missing):
@@ -191,8 +191,8 @@ def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -
     folder = removal.Folder(request.origin, discovery)
     conflicts = {} if request.replace else ingest.find_replaced(jobs, manifest)
     for job in jobs:
-        if job.key in conflicts and all(map(folder.lost, ingest.find_lost(job, manifest.commits[job.key]))):
-            conflicts[job.key] += " So does --prune, where files are gone from SOURCE, as here."
+        if job.key in conflicts and all(map(folder.is_lost, ingest.find_lost(job, manifest.commits[job.key]))):
+            conflicts[job.key] += " So does --prune, where files are missing from SOURCE, as here."
             if request.prune:
                 del conflicts[job.key]
     superseded = removal.find_superseded(discovery, manifest)

@@ -1,1 +1,1 @@
-"""The stages: what each makes of a recording, planned from the manifest and free of any orchestrator."""
+"""The declared stages after ingestion, and the planner that runs them without any orchestrator."""

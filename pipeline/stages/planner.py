@@ -7,7 +7,7 @@ from typing import Any
 
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage, StageError, StageResult, make_commit, make_job
 
@@ -141,7 +141,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     return make_commit(job, files, {**info, "notes": notes}, started)
 
 
-def _open_readers(stage: Stage, root: Path, job: Job) -> Iterator[LakeReader | SubsetReader]:
+def _open_readers(stage: Stage, root: Path, job: Job) -> Iterator[LakeReader]:
     lake = LakeReader(root, load(root), stage.after, job)
     if stage.scope == "lake" or not stage.per_subset:
         yield lake

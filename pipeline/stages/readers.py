@@ -1,4 +1,4 @@
-"""What build functions read the lake with: the tables of one subset, or of all."""
+"""What build functions read the lake with: the tables of all recordings, or of one subset."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,29 +21,22 @@ class LakeReader:
         manifest: live files of the lake.
         after: stages whose tables may be read; None for all.
         job: the work that the tables are read for.
+        partition: values of the partition columns of what is read and made; none for the whole lake.
     """
 
     root: Path
     manifest: Manifest
     after: tuple[str, ...] | None = None
     job: Job = field(default_factory=lambda: Job("", ""))
-
-    @property
-    def partition(self) -> dict[str, Any]:
-        """Values of the partition columns of tables made with this reader: none, as they are over the whole lake."""
-        return {}
+    partition: dict[str, Any] = field(default_factory=dict)
 
     @property
     def title(self) -> str:
-        """Name of the work in messages."""
-        return self.job.title
+        """Name of the work in messages: the subset, or the stage where it is over the whole lake."""
+        return str(self.partition.get("subset", self.job.title))
 
-    def scan(self, table: Table, **values: str) -> pl.LazyFrame:
+    def scan(self, table: Table) -> pl.LazyFrame:
         """Return a table's rows lazily.
-
-        Args:
-            table: what to read.
-            values: values of partition columns, to read only those files.
 
         Raises:
             LookupError: the stage that made the table is not declared among those that this one comes after.
@@ -55,41 +48,27 @@ class LakeReader:
                     f"{self.job.key} reads `{table.name}`, which {', '.join(undeclared)} makes; expected that stage "
                     f"among those it comes after, got {', '.join(self.after) or 'none'}"
                 )
-        return scan(self.root, self.manifest, table, **values)
+        return scan(self.root, self.manifest, table, **self.partition)
 
-    def table(self, table: Table, *columns: str, **values: str) -> pl.DataFrame:
-        """Return a table's rows with some columns (all where none is named); arguments as for `scan`."""
-        rows = self.scan(table, **values)
+    def table(self, table: Table, *columns: str) -> pl.DataFrame:
+        """Return a table's rows with some columns (all where none is named); raises as `scan` does."""
+        rows = self.scan(table)
         return (rows.select(columns) if columns else rows).collect()
 
     def open_subset(self, dataset: str, subset: str) -> "SubsetReader":
         """Return the reader of one subset."""
-        return SubsetReader(self, dataset, subset)
+        partition = {"dataset": dataset, "subset": subset}
+        return SubsetReader(self.root, self.manifest, self.after, self.job, partition)
 
 
 @dataclass(frozen=True)
-class SubsetReader:
-    """The live tables of one subset.
-
-    Args:
-        lake: reader of the whole lake.
-        dataset: name of the dataset.
-        subset: name of the subset.
-    """
-
-    lake: LakeReader
-    dataset: str
-    subset: str
+class SubsetReader(LakeReader):
+    """The live tables of one subset, with the arguments of LakeReader; made by its `open_subset`."""
 
     @property
-    def partition(self) -> dict[str, Any]:
-        """Values of the partition columns of the subset's tables."""
-        return {"dataset": self.dataset, "subset": self.subset}
-
-    @property
-    def title(self) -> str:
-        """Name of the subset in messages."""
-        return self.subset
+    def subset(self) -> str:
+        """Name of the subset."""
+        return self.title
 
     @cached_property
     def facts(self) -> dict[str, Any]:
@@ -100,11 +79,3 @@ class SubsetReader:
     def clock(self) -> dict[str, Any]:
         """First frame and frame rate (Hz), as transforms take them."""
         return {name: self.facts[name] for name in ("first_frame", "frame_rate_hz")}
-
-    def scan(self, table: Table) -> pl.LazyFrame:
-        """Return the subset's rows of a table lazily."""
-        return self.lake.scan(table, **self.partition)
-
-    def table(self, table: Table, *columns: str) -> pl.DataFrame:
-        """Return the subset's rows of a table with some columns (all where none is named)."""
-        return self.lake.table(table, *columns, **self.partition)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake import Manifest, connect
-from tracklake.pipeline.lake.files import REPORTS, remove
+from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_report_file
@@ -97,7 +97,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
         (root / REPORTS / SPLITS_PAGE).unlink(missing_ok=True)
     # Pages of subsets that are no longer in the lake, which the overview does not link to.
     live = {root / file.path for commit in made for file in commit.files[REPORTS]}
-    remove(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
+    remove_files(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
         remove_unfinished(folder)
     return StageResult(files={REPORTS: files}, notes=notes)

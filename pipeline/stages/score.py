@@ -1,4 +1,4 @@
-"""Score: the error of the simplest model on the evaluation part, the first number for others to stand beside."""
+"""Score: the error of the simplest model on the evaluation part, the baseline for all others."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Split: which subsets train and which evaluate, by every recipe that is asked for, and what the parts share."""
+"""Split: which subsets train and which evaluate, by every requested recipe, and what the parts share."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import polars as pl
 
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.split_leakage import Leakage, measure, open_tables, refuse_leaks
+from tracklake.pipeline.stages.split_leakage import Leakage, measure_leakage, open_tables, refuse_leaks
 from tracklake.pipeline.stages.split_makers import SplitInputs, SplitResult, make_split
 from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
 from tracklake.schemas import (
@@ -79,7 +79,7 @@ def _measure_all(inputs: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> d
     places = inputs.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
     with open_tables(inputs.reader.root, inputs.reader.manifest) as connection:
         return {
-            recipe: measure(
+            recipe: measure_leakage(
                 connection,
                 split.allocation.splits,
                 split.left_out,
@@ -122,7 +122,7 @@ def _write_notes(recipe: SplitRecipe, made: SplitResult, measured: Leakage) -> l
         for dataset, vehicles, entries in counted.iter_rows()
     ]
     if measured.find_leaks(recipe.window_s):
-        notes.append(f"split {recipe.name}, made for comparison, leaks: {'; '.join(measured.sum_up())}")
+        notes.append(f"split {recipe.name}, made for comparison, leaks: {'; '.join(measured.summarise())}")
     return notes
 
 

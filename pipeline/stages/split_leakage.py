@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest
-from tracklake.pipeline.lake.catalog import fill, literally, quote
+from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS, Table
@@ -25,20 +25,23 @@ if TYPE_CHECKING:
     import duckdb
 
 PREPARATIONS = ("part_entries", "part_frames", "part_samples", "part_context", "distributions")
+"""Statements that create a table or view, in order."""
 SHARED = ("shared_vehicles", "shared_frames", "shared_scenes", "shared_context", "nearest")
+"""Statements that count what two parts share."""
 PAIR = ["dataset", "part", "other_part"]
+"""Columns that name two parts of a dataset."""
 SHARED_COLUMNS = {
     "vehicles_shared": "vehicles",
     "frames_shared": "frames",
     "scenes_shared": "scenes (moments with samples)",
     "context_shared": "neighbors",
 }
-"""Columns that must be 0 where nothing leaks, and what they count."""
+"""Columns that must be 0 where nothing leaks, and the things they count."""
 
 
 @dataclass(frozen=True)
 class Leakage:
-    """What was measured of one split.
+    """Figures of what the parts of one split share.
 
     Args:
         leakage: rows of `schemas.split_leakage.SPLIT_LEAKAGE`.
@@ -51,49 +54,49 @@ class Leakage:
     shifts: pl.DataFrame
 
     def find_leaks(self, window_s: float) -> list[str]:
-        """Say what the parts share, one sentence per pair of parts that shares anything.
+        """Return what the parts share, one sentence per pair of parts that shares anything.
 
         Args:
             window_s: history and future; parts that are nearer in time than this see the same moments.
         """
-        told = []
+        found_leaks = []
         for row in self.leakage.iter_rows(named=True):
             found = [f"{row[name]:,} {what}" for name, what in SHARED_COLUMNS.items() if row[name]]
             if row["nearest_s"] is not None and row["nearest_s"] < window_s:
                 found.append(f"entries {row['nearest_s']:g} s apart, expected at least {window_s:g} s")
             if found:
-                told.append(f"{row['dataset']}: {row['part']} and {row['other_part']} share {', '.join(found)}")
-        return told
+                found_leaks.append(f"{row['dataset']}: {row['part']} and {row['other_part']} share {', '.join(found)}")
+        return found_leaks
 
-    def sum_up(self) -> list[str]:
-        """Say per dataset what of the other parts is in train too, and what context their samples have lost."""
+    def summarise(self) -> list[str]:
+        """Return per dataset how much of the other parts is in train too, and the context their samples lack."""
         counted = self.leakage.filter(pl.col("part") == PARTS[0]).join(
             self.context.select("dataset", "neighbors", pl.col("^neighbors_.*$"), other_part="part"),
             on=["dataset", "other_part"],
             how="left",
         )
-        told: dict[str, list[str]] = {}
+        found_leaks: dict[str, list[str]] = {}
         for row in counted.sort("dataset", pl.col("other_part").cast(pl.Enum(PARTS))).iter_rows(named=True):
             cut = (row["neighbors_elsewhere"] or 0) + (row["neighbors_left_out"] or 0)
-            told.setdefault(row["dataset"], []).append(
+            found_leaks.setdefault(row["dataset"], []).append(
                 f"{row['frames_shared']:,} of {row['other_part']}'s {row['frames']:,} frames ({cut:,} of its "
                 f"{row['neighbors'] or 0:,} neighbors are cut off)"
             )
-        return [f"{dataset}: train has {' and '.join(parts)}" for dataset, parts in told.items()]
+        return [f"{dataset}: train has {' and '.join(parts)}" for dataset, parts in found_leaks.items()]
 
 
 def open_tables(root: Path, manifest: Manifest) -> "duckdb.DuckDBPyConnection":
-    """Open the lake's views for `measure`; what does not fit into memory goes to the lake's staging folder."""
+    """Open the lake's views for `measure_leakage`; what does not fit into memory goes to the lake's staging folder."""
     import duckdb
 
     connection = duckdb.connect(":memory:")
     (root / STAGING).mkdir(exist_ok=True)
     connection.execute(f"SET temp_directory = {quote(str(root.resolve() / STAGING / 'duckdb'))}")
-    fill(connection, root, manifest, locate=lambda path: literally(str(root.resolve() / path)))
+    create_views(connection, root, manifest, locate=lambda path: escape_pattern(str(root.resolve() / path)))
     return connection
 
 
-def measure(
+def measure_leakage(
     connection: "duckdb.DuckDBPyConnection",
     splits: pl.DataFrame,
     left_out: pl.DataFrame,
@@ -103,7 +106,7 @@ def measure(
     protocol: str,
     flows: pl.DataFrame | None = None,
 ) -> Leakage:
-    """Measure one split.
+    """Count what the parts of one split share.
 
     Args:
         connection: with the views tracks, samples and neighbors.
@@ -114,7 +117,7 @@ def measure(
         protocol: whose samples and neighbors are counted.
         flows: dataset, subset, block, flow, where a block's is not that of its subset.
     """
-    frames = _place(splits, subsets, recipe, flows)
+    frames = _locate_blocks(splits, subsets, recipe, flows)
     present = {str(name): set(rows["part"]) for (name,), rows in splits.group_by("dataset")}
     pairs = [
         (name, *pair) for name in sorted(present) for pair in combinations([p for p in PARTS if p in present[name]], 2)
@@ -123,13 +126,13 @@ def measure(
     connection.register("left_out", left_out.select("dataset", "subset", "vehicle_id"))
     connection.register("pairs", pl.DataFrame(pairs, schema=dict.fromkeys(PAIR, pl.String), orient="row"))
     for name in PREPARATIONS:
-        _run(connection, name, protocol)
-    found = [_run(connection, name, protocol).pl() for name in SHARED]
+        _run_statement(connection, name, protocol)
+    found = [_run_statement(connection, name, protocol).pl() for name in SHARED]
     joined = reduce(lambda left, right: left.join(right, on=PAIR, how="left"), found)
     measured = Leakage(
-        leakage=_conform(SPLIT_LEAKAGE, joined, recipe.name),
-        context=_conform(SPLIT_CONTEXT, _run(connection, "context", protocol).pl(), recipe.name),
-        shifts=_conform(SPLIT_SHIFTS, _run(connection, "shifts", protocol).pl(), recipe.name),
+        leakage=_conform_rows(SPLIT_LEAKAGE, joined, recipe.name),
+        context=_conform_rows(SPLIT_CONTEXT, _run_statement(connection, "context", protocol).pl(), recipe.name),
+        shifts=_conform_rows(SPLIT_SHIFTS, _run_statement(connection, "shifts", protocol).pl(), recipe.name),
     )
     for name in ("blocks", "left_out", "pairs"):
         connection.unregister(name)
@@ -148,14 +151,14 @@ def refuse_leaks(measured: Mapping[SplitRecipe, Leakage]) -> None:
             raise StageError(
                 f"split {recipe.name} claims that its parts share nothing, but {'; '.join(leaks)}. Expected 0 of each. "
                 "No split was written. Tracks that were changed by hand, or a fault of tracklake's: "
-                "`tracklake run SOURCE --rebuild` makes the lake anew; if it says so again, report it."
+                "`tracklake run SOURCE --rebuild` rebuilds the lake; if the same error comes again, report it."
             )
 
 
-def _place(
+def _locate_blocks(
     splits: pl.DataFrame, subsets: pl.DataFrame, recipe: SplitRecipe, flows: pl.DataFrame | None
 ) -> pl.DataFrame:
-    """The split's rows with what SQL needs to place ticks in them: `blocks`."""
+    """Return the split's rows with what SQL needs to place ticks in them: `blocks`."""
     at = pl.col("frame_rate_hz") / recipe.rate_hz
     history_ticks = round(recipe.history_s * recipe.rate_hz)
     placed = (
@@ -173,11 +176,11 @@ def _place(
     return placed.drop("flow").join(flows, on=["dataset", "subset", "block"], how="left")
 
 
-def _run(connection: "duckdb.DuckDBPyConnection", name: str, protocol: str) -> "duckdb.DuckDBPyConnection":
+def _run_statement(connection: "duckdb.DuckDBPyConnection", name: str, protocol: str) -> "duckdb.DuckDBPyConnection":
     text = (files("tracklake.pipeline.stages") / "split_sql" / f"{name}.sql").read_text(encoding="utf-8")
     return connection.execute(text, {"protocol": protocol} if "$protocol" in text else None)
 
 
-def _conform(table: Table, rows: pl.DataFrame, split: str) -> pl.DataFrame:
+def _conform_rows(table: Table, rows: pl.DataFrame, split: str) -> pl.DataFrame:
     named = rows.lazy().with_columns(split=pl.lit(split))
     return table.conform(named).collect().sort(table.key)

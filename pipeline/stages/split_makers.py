@@ -1,4 +1,4 @@
-"""How each split of `schemas.split_recipes` is made from what is in the lake."""
+"""The functions that make each split of `schemas.split_recipes` from the lake."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from tracklake.schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCE
 
 @dataclass(frozen=True)
 class SplitInputs:
-    """What splits are made from.
+    """The tables and subsets that splits are made from.
 
     Args:
         reader: tables of the lake.

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.lake import Manifest, free_path, write_folder
+from tracklake.pipeline.lake import Manifest, find_free_path, write_folder
 from tracklake.pipeline.lake.files import TENSORS
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.settings import Settings
@@ -24,7 +24,7 @@ SAMPLE_COLUMNS = ("protocol", "vehicle_id", "tick", "lateral_maneuver", "longitu
 NEIGHBOR_COLUMNS = ("protocol", "vehicle_id", "tick", "cell", "neighbor_id")
 VEHICLE_COLUMNS = ("vehicle_id", "length_m", "width_m")
 FINDING_COLUMNS = ("vehicle_id", "severity", "first_frame", "last_frame")
-"""Columns of `findings` that tensors are made of, as above those of the other tables, which may be wide."""
+"""Columns of `findings` that are read for tensors; those above are of the other tables, which may be wide."""
 
 
 def build(reader: LakeReader, settings: Settings) -> StageResult:
@@ -37,15 +37,15 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
 
     def build_all() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
         for subset in included:
-            here = (pl.col("dataset") == subset.dataset) & (pl.col("subset") == subset.subset)
-            vehicles = left_out.filter(here)["vehicle_id"]
-            yield subset.facts, build_subset(subset, splits.filter(here), vehicles, protocol, storage)
+            vehicles = left_out.filter(**subset.partition)["vehicle_id"]
+            blocks = splits.filter(**subset.partition)
+            yield subset.facts, build_subset(subset, blocks, vehicles, protocol, storage)
 
     def write(folder: Path) -> None:
         recipe = {**_describe_recipe(settings), "left_out_vehicles": left_out.height}
         write_tensors(folder, build_all(), splits, protocol, storage=storage, split_recipe=recipe)
 
-    path = free_path(root, f"{TENSORS}/{protocol.split}/{reader.job.fingerprint}")
+    path = find_free_path(root, f"{TENSORS}/{protocol.split}/{reader.job.fingerprint}")
     files = write_folder(root, path, write)
     index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}

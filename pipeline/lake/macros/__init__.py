@@ -39,7 +39,7 @@ class Macro:
 _HEADER = re.compile(r"\A-- (?P<meaning>[^\n]+)\n(?:--[^\n]*\n)*CREATE MACRO (?P<name>\w+)\((?P<parameters>[\w, ]+)\)")
 
 
-def _read(text: str) -> Macro:
+def _parse_macro(text: str) -> Macro:
     found = _HEADER.match(text)
     if found is None:
         raise ValueError(f"expected a line of meaning, comments and CREATE MACRO name(parameters); got {text[:80]!r}")
@@ -47,7 +47,7 @@ def _read(text: str) -> Macro:
 
 
 MACROS = tuple(
-    _read(file.read_text(encoding="utf-8"))
+    _parse_macro(file.read_text(encoding="utf-8"))
     for file in sorted(files(__name__).iterdir(), key=lambda file: file.name)
     if file.name.endswith(".sql")
 )

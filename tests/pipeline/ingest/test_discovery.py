@@ -1,4 +1,4 @@
-"""What a folder holds: recognised, refused with a next step, or passed by and named."""
+"""What a folder holds: recognised, refused with a next step, or skipped and named."""
 
 import gzip
 import hashlib

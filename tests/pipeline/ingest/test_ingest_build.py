@@ -18,7 +18,7 @@ def build(source, lake):
     """The entry of the only recording in a folder."""
     with open_for_writing(lake) as writer:
         found = discover(source, digest=hash_raw)
-        for dataset, file in ingest.files_to_read(found, writer.manifest):
+        for dataset, file in ingest.find_unread_files(found, writer.manifest):
             writer.remember_sources({file.sha256: ingest.read_file(lake, dataset.name, file)})
         (job,) = ingest.plan(found, writer.manifest)
         return ingest.build(lake, job)

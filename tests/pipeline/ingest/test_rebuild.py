@@ -148,8 +148,8 @@ def test_a_lake_of_this_version_is_redone_as_well_whatever_became_of_its_files(c
     after = load(root)
     assert after.lake_id != before.lake_id
     assert average_x(root) == pytest.approx(average_m, abs=1e-9)
-    assert not after.live_paths() & before.live_paths(), "every table was made anew"
-    assert damaged.read_bytes() == read, "whoever reads the old lake is not disturbed"
+    assert not after.live_paths() & before.live_paths(), "every table was made again"
+    assert damaged.read_bytes() == read, "readers of the old lake are not disturbed"
     assert counted(root) == {"01": ENTRIES, "02": ENTRIES}
 
 
@@ -190,7 +190,7 @@ def test_nothing_outside_the_lake_is_ever_retired(tmp_path):
     [{}, {"entries": []}, {"entries": {"a": []}}, {"entries": {"a": {"files": [1]}}}, {"retired": [1, {"path": 2}]},
      {"generation": -3, "ingested_from": "x"}, {"generation": None, "ingested_from": [1, None]}],
 )  # fmt: skip
-def test_manifests_of_any_shape_are_begun_anew(tmp_path, rest):
+def test_manifests_of_any_shape_are_rebuilt(tmp_path, rest):
     (tmp_path / "manifest.json").write_text(json.dumps({"schema_version": "next", "lake_id": "a", **rest}))
     with pytest.raises(LakeError, match=r"`tracklake run SOURCE --lake .* --rebuild`"):
         load(tmp_path)

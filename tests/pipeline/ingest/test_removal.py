@@ -1,4 +1,4 @@
-"""Raw files that are gone: their tables stay and are named, go on request, and come back with the files."""
+"""Raw files that are missing: their tables stay and are named, go on request, and come back with the files."""
 
 import json
 import shutil
@@ -107,7 +107,7 @@ def test_tables_of_removed_files_stay_and_are_named_in_one_note(command, ingest,
     assert counted(root) == dict.fromkeys(("01", "02", "03", "04", "05"), ENTRIES)
 
 
-def test_prune_removes_every_stages_tables_and_the_whole_lakes_are_made_anew(command, ingest, copy, monkeypatch):
+def test_prune_removes_every_stages_tables_and_the_whole_lakes_are_made_again(command, ingest, copy, monkeypatch):
     raw, root = copy
     drop(raw, "03")
     monkeypatch.chdir(root)
@@ -193,7 +193,7 @@ def test_a_moved_folder_redoes_nothing_and_is_known_at_its_new_place(command, in
     assert ingest(moved, root, prune=True)["removed"] == ["highd/01"]
 
 
-def test_a_file_moved_or_renamed_within_the_folder_is_not_gone(ingest, tmp_path):
+def test_a_file_moved_or_renamed_within_the_folder_is_not_missing(ingest, tmp_path):
     raw, root = tmp_path / "raw", tmp_path / "lake"
     write_highd(raw, "01")
     write_highd(raw, "02")
@@ -233,7 +233,7 @@ def test_only_what_stood_in_this_folder_is_pruned(ingest, tmp_path):
     ]
 
 
-def test_a_file_that_cannot_be_used_any_more_is_not_gone(ingest, tmp_path):
+def test_a_file_that_cannot_be_used_any_more_is_not_missing(ingest, tmp_path):
     raw, root = tmp_path / "raw", tmp_path / "lake"
     write_ngsim(raw / "a.csv", "us-101-0750")
     write_ngsim(raw / "b.csv", "us-101-0805")
@@ -281,7 +281,7 @@ def test_what_is_left_of_a_recordings_files_rebuilds_it(command, ingest, tmp_pat
     (raw / "b.csv").unlink()
     refused = command.here("ingest", raw, "--lake", root)
     assert refused.code == 3
-    assert "--replace. So does --prune, where files are gone from SOURCE" in refused.err
+    assert "--replace. So does --prune, where files are missing from SOURCE" in refused.err
     assert counted(root) == {"us-101-0750": 2 * ROWS}
     said = ingest(raw, root, prune=True)
     assert (said["built"], said["removed"]) == ({"ingest": 1}, [])
@@ -297,9 +297,9 @@ def test_a_mistyped_folder_prunes_nothing(command, ingest, tmp_path):
     for source in (raw, tmp_path / "rwa"):
         done = command.here("ingest", source, "--lake", root, "--prune", "--json")
         assert done.code == 1
-        told = json.loads(done.out)["error"]
-        assert "--prune removed nothing" in told
-        assert f"`tracklake remove RECORDING --lake {root}`" in told
+        message = json.loads(done.out)["error"]
+        assert "--prune removed nothing" in message
+        assert f"`tracklake remove RECORDING --lake {root}`" in message
     (raw / "bad.csv").write_text("date,value\n1,2\n")
     done = command.here("ingest", raw, "--lake", root, "--prune")
     assert done.code == 1
@@ -334,7 +334,7 @@ def test_remove_takes_recordings_by_name(command, ingest, copy, tmp_path):
     assert "the lake has no tensors" in stale.err
     with duckdb.connect(str(root / "catalog.duckdb"), read_only=True) as plain:
         assert "01-upper" not in str(plain.sql("SELECT sql FROM duckdb_views()").fetchall())
-    # Nothing says that the files are gone, for they are not; ingested again, the recordings are back.
+    # Nothing says that the files are missing, for they are not; ingested again, the recordings are back.
     assert ingest(raw, root)["built"] == {"ingest": 2}
     assert command.here("remove", "04", "--lake", tmp_path / "nowhere").code == 1
     assert not (tmp_path / "nowhere").exists()

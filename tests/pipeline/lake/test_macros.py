@@ -85,7 +85,7 @@ def test_near_is_within_the_radius_and_on_it(tmp_path: Path):
         counts = [
             connection.sql(f"FROM near('a', 1, 100, 2, {radius})").count() for radius in ("0", "-0.0", "-10", "NULL")
         ]
-        assert counts == [1, 1, 0, 0]  # only the one that is there; nobody is nearer than that
+        assert counts == [1, 1, 0, 0]  # only the one that is there; none is nearer than that
 
 
 def test_lane_changes_bridge_no_gaps(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Files that a rebuild found: left to those who read them, and to nobody else."""
+"""Files that a rebuild found: left to those who read them, and to no others."""
 
 import json
 from pathlib import Path

@@ -19,7 +19,7 @@ from small_recordings import write_highd
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import connect, load, open_for_writing
-from tracklake.pipeline.lake.manifest import Manifest, store
+from tracklake.pipeline.lake.manifest import Manifest, store_manifest
 from tracklake.pipeline.orchestration import flows, run_plan
 from tracklake.pipeline.sources import SourceError
 
@@ -122,7 +122,7 @@ def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(server
     assert calls == {"04": 1}
     # As if the process had died between the task's end and the commit: the files stay, and are committed.
     written = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
-    store(root, Manifest(lake_id=finished.lake_id))
+    store_manifest(root, Manifest(lake_id=finished.lake_id))
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 2}
     assert {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")} == written
@@ -252,7 +252,7 @@ def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
 @pytest.mark.parametrize(
     ("failure", "is_ours"),
     [
-        (httpx.ConnectError("nobody there"), False),
+        (httpx.ConnectError("no server there"), False),
         (httpx.ReadTimeout(""), False),
         (503, False),
         (403, False),
@@ -315,5 +315,5 @@ def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
     if children.exists():
         assert children.read_text().split() == []
     process.kill()
-    process.communicate(timeout=10)  # returns only when nobody holds the pipe any more
+    process.communicate(timeout=10)  # returns only when no process holds the pipe any more
     assert json.loads((tmp_path / "lake" / "manifest.json").read_text())["lake_id"]

@@ -1,4 +1,4 @@
-"""The report's stages in this process: which pages are drawn anew, what the overview leads to, thresholds it tells."""
+"""The report's stages in this process: which pages are written again, the overview's links, and the thresholds."""
 
 import json
 import re
@@ -20,7 +20,7 @@ from tracklake.schemas import SPLITS
 LOW = {"high_acceleration_mps2": 1.0}
 
 
-def ask(root: Path, stage: str, **settings) -> list[str]:
+def find_jobs(root: Path, stage: str, **settings) -> list[str]:
     """Keys of what the stage would make."""
     return find_outstanding(root, stage, Settings(**settings))
 
@@ -86,14 +86,14 @@ def thresholds(root: Path) -> tuple[float, dict, dict]:
 NAMES = {f"{number}-{way}.html" for number in ("01", "02") for way in ("lower", "upper")}
 
 
-def test_only_pages_whose_recording_changed_are_drawn_anew(lake: Path):
-    assert ask(lake, "pages") == ask(lake, "report") == []
+def test_only_pages_whose_recording_changed_are_written_again(lake: Path):
+    assert find_jobs(lake, "pages") == find_jobs(lake, "report") == []
     before = pages(lake)
     assert set(before) == links(lake) == NAMES
     # A model's run is news to the overview only.
     (lake / "models" / "mine").mkdir(parents=True)
     (lake / "models" / "mine" / "metrics.json").write_text("{}")
-    assert (ask(lake, "pages"), ask(lake, "report")) == ([], ["report"])
+    assert (find_jobs(lake, "pages"), find_jobs(lake, "report")) == ([], ["report"])
     # So is another part of the split to the pages that are not of it.
     put_split(lake, "eval")
     assert make(lake, "pages") == ["pages/highd/02"]
@@ -118,7 +118,7 @@ def test_a_page_is_of_its_own_subset(lake: Path):
 
 def test_the_overview_leads_to_pages_that_are_there_and_others_vanish(lake: Path):
     remove_recordings(lake, ["02"])
-    assert (ask(lake, "pages"), ask(lake, "report")) == ([], ["report"])
+    assert (find_jobs(lake, "pages"), find_jobs(lake, "report")) == ([], ["report"])
     (lake / "reports" / "subsets" / f".03-upper.html.{'a' * 32}.tmp").write_text("of a run that was killed")
     (lake / "reports" / "subsets" / "99-upper.html").write_text("of a subset that is not there")
     make(lake, "report")
@@ -129,13 +129,13 @@ def test_the_overview_leads_to_pages_that_are_there_and_others_vanish(lake: Path
     make(lake, "report")
     assert set(pages(lake)) == links(lake) == set()
     assert "01-lower" in (lake / "reports" / "index.html").read_text()
-    assert (ask(lake, "pages"), ask(lake, "report")) == (["pages/highd/01"], [])
+    assert (find_jobs(lake, "pages"), find_jobs(lake, "report")) == (["pages/highd/01"], [])
 
 
 def test_the_report_tells_the_thresholds_that_validation_used(lake: Path):
     assert thresholds(lake) == (3.05, {}, {})
     # Other settings without validation are not what was found with.
-    assert ask(lake, "report", thresholds=LOW) == []
+    assert find_jobs(lake, "report", thresholds=LOW) == []
     make(lake, "validate", "validate/highd/02", thresholds=LOW)
     make(lake, "report")
     assert thresholds(lake) == (3.05, {}, {"highd/02": LOW})

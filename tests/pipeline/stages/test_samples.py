@@ -73,11 +73,11 @@ def test_samples_around_findings_of_errors_are_dropped_on_request(lake, tmp_path
     named = pl.col("subset").is_in(job.inputs["subsets"]) & (pl.col("dataset") == job.inputs["dataset"])
     with connect(lake.root) as connection:
         before = connection.sql("FROM samples").pl().filter(named)
-        gone = connection.sql(OVERLAPS).pl().filter(named)
-    assert 0 < gone.height < before.height
+        missing = connection.sql(OVERLAPS).pl().filter(named)
+    assert 0 < missing.height < before.height
     kept = pl.concat(pl.read_parquet(root / file.path) for file in entry.files["samples"])
     dropped = pl.concat(pl.read_parquet(root / file.path) for file in entry.files["sample_drops"])
-    assert kept["nearest"].null_count() == kept.height == before.height - gone.height
-    assert dropped.filter(reason="error_finding")["entries"].sum() == gone.height
-    expected = before.join(gone, on=["dataset", "subset", "vehicle_id", "tick"], how="anti")
+    assert kept["nearest"].null_count() == kept.height == before.height - missing.height
+    assert dropped.filter(reason="error_finding")["entries"].sum() == missing.height
+    expected = before.join(missing, on=["dataset", "subset", "vehicle_id", "tick"], how="anti")
     assert set(kept.select("vehicle_id", "tick").rows()) == set(expected.select("vehicle_id", "tick").rows())

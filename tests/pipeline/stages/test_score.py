@@ -1,4 +1,4 @@
-"""What the report takes from the lake's runs: those that fit the live tensors; damaged ones are passed by and named."""
+"""What the report takes from the lake's runs: those that fit the live tensors; damaged ones are skipped and named."""
 
 import json
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ def test_runs_of_other_tensors_are_none(root):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "told"),
+    ("file", "content", "message"),
     [
         ("config.json", "{", "config.json: not readable as JSON"),
         ("config.json", '{"version": 1}', f"config.json: expected version {RUN_VERSION}, got 1; train it again"),
@@ -50,7 +50,7 @@ def test_runs_of_other_tensors_are_none(root):
         ("metrics.json", '{"evaluation": {"part": "eval"}}', "got KeyError('horizons'); train it again"),
     ],
 )
-def test_a_damaged_run_is_passed_by_and_named(root, file, content, told):
+def test_a_damaged_run_is_skipped_and_named(root, file, content, message):
     damaged = write_run(root, "damaged") / file
     damaged.unlink() if content is None else damaged.write_text(content)
     skipped = []
@@ -59,4 +59,4 @@ def test_a_damaged_run_is_passed_by_and_named(root, file, content, told):
     (note,) = skipped
     assert note.startswith("skipped a run: ")
     assert str(damaged) in note
-    assert told in note
+    assert message in note

@@ -77,7 +77,7 @@ JOB = Job("split", "1" * 16)
 
 
 @pytest.fixture(scope="module")
-def ask(root):
+def query(root):
     entry = build_one(root, JOB, SETTINGS)
     with open_for_writing(root) as writer:
         writer.commit(entry)
@@ -85,24 +85,24 @@ def ask(root):
         yield lambda query: connection.sql(query).fetchall()
 
 
-def test_every_split_is_there_by_name_with_its_parameters(ask):
+def test_every_split_is_there_by_name_with_its_parameters(query):
     recipes = {recipe.name: recipe for recipe in SETTINGS.get_split_recipes()}
-    assert {row[0] for row in ask("SELECT DISTINCT split FROM splits")} == set(SPLIT_NAMES) == set(recipes)
-    told = ask("SELECT split, digest, parameters, trains, claims_no_leakage, window_s FROM split_recipes")
-    for name, digest, parameters, trains, claims, window_s in told:
+    assert {row[0] for row in query("SELECT DISTINCT split FROM splits")} == set(SPLIT_NAMES) == set(recipes)
+    described = query("SELECT split, digest, parameters, trains, claims_no_leakage, window_s FROM split_recipes")
+    for name, digest, parameters, trains, claims, window_s in described:
         assert (digest, parameters) == (recipes[name].digest, recipes[name].parameters)
         assert (trains, claims, window_s) == (name == "flow-balanced", name != "csp-2018", 8.0)
-    assert len({digest for _, digest, *_ in told}) == 4
+    assert len({digest for _, digest, *_ in described}) == 4
 
 
-def test_excluded_subsets_stand_in_no_split(ask):
-    for (name,) in ask("SELECT DISTINCT split FROM splits"):
-        found = {row[0] for row in ask(f"SELECT DISTINCT subset FROM splits WHERE split = '{name}'")}
+def test_excluded_subsets_stand_in_no_split(query):
+    for (name,) in query("SELECT DISTINCT split FROM splits"):
+        found = {row[0] for row in query(f"SELECT DISTINCT subset FROM splits WHERE split = '{name}'")}
         assert found == {"01-upper", "01-lower", "02-lower"}, name
 
 
-def test_shares_add_up_in_every_split(ask):
-    rows = ask("SELECT split, sum(vehicle_share), sum(samples) FROM split_balance GROUP BY split ORDER BY split")
+def test_shares_add_up_in_every_split(query):
+    rows = query("SELECT split, sum(vehicle_share), sum(samples) FROM split_balance GROUP BY split ORDER BY split")
     assert [row[0] for row in rows] == sorted(SPLIT_NAMES)
     for name, share, samples in rows:
         assert share == pytest.approx(1.0)
@@ -110,29 +110,29 @@ def test_shares_add_up_in_every_split(ask):
         assert samples == 4 * 56 * 3 or (name == "time-blocks" and 0 < samples < 4 * 56 * 3)
 
 
-def test_time_blocks_are_apart_and_share_nothing(ask):
-    rows = ask("SELECT subset, block, first_frame, last_frame FROM splits WHERE split = 'time-blocks' ORDER BY ALL")
+def test_time_blocks_are_apart_and_share_nothing(query):
+    rows = query("SELECT subset, block, first_frame, last_frame FROM splits WHERE split = 'time-blocks' ORDER BY ALL")
     for one, other in itertools.pairwise(rows):
         assert one[0] != other[0] or other[2] - one[3] == 8 * RATE_HZ + 1
     assert len(rows) == 3 * 4
-    (measured,) = ask("SELECT vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
+    (measured,) = query("SELECT vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
                       "FROM split_leakage WHERE split = 'time-blocks'")  # fmt: skip
     assert measured[:4] == (0, 0, 0, 0)
     assert measured[4] is None or measured[4] >= 8
     # A vehicle stays for 4 s, half as long as a purge: none is in two parts.
-    assert ask("SELECT count(*) FROM split_left_out") == [(0,)]
+    assert query("SELECT count(*) FROM split_left_out") == [(0,)]
 
 
-def test_csp_2018_shares_the_frames_at_its_cuts(ask):
+def test_csp_2018_shares_the_frames_at_its_cuts(query):
     """Ids in order of appearance: the 39th of 56 still trains, the 45th is the last in val; each stays for 20 frames.
 
     The next one comes 5 frames later.
     """
-    rows = ask("SELECT part, first_vehicle_id, last_vehicle_id FROM splits WHERE split = 'csp-2018'"
+    rows = query("SELECT part, first_vehicle_id, last_vehicle_id FROM splits WHERE split = 'csp-2018'"
                " AND subset = '01-lower'"
                " ORDER BY block")  # fmt: skip
     assert rows == [("train", 1, 39), ("val", 40, 45), ("eval", 46, 56)]
-    found = ask("SELECT part, other_part, vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
+    found = query("SELECT part, other_part, vehicles_shared, frames_shared, scenes_shared, context_shared, nearest_s "
                 "FROM split_leakage WHERE split = 'csp-2018' ORDER BY ALL")  # fmt: skip
     # Train ends with 39 at frame 210, eval begins with 46 at 226, 16 frames later. Val's 40 begins at 196.
     # A sample's neighbor comes next: that of 39 is in val, that of 45 in eval, four samples each.
@@ -146,7 +146,7 @@ def test_csp_2018_shares_the_frames_at_its_cuts(ask):
 def test_notes_say_what_leaks_and_what_is_relaxed(root):
     notes = build_one(root, JOB, SETTINGS).info["notes"]
     # In three subsets each: frames 196 to 240 of 40 to 45, and 226 to 295 of 46 to 56; four samples of each but 56,
-    # whom nobody follows.
+    # which no vehicle follows.
     assert notes[-1] == (
         "split csp-2018, made for comparison, leaks: highd: train has 45 of val's 135 frames (12 of its 72 neighbors "
         "are cut off) and 0 of eval's 210 frames (0 of its 120 neighbors are cut off)"
@@ -166,12 +166,12 @@ def plant(monkeypatch, change):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "told"),
+    ("name", "change", "message"),
     [
         # A subset of train stands in eval as well.
         ("flow-balanced", lambda rows: pl.concat([rows.head(1).with_columns(block=pl.lit(1, pl.Int32), part=pl.lit(p))
                                                   for p in ("train", "eval")] + [rows.tail(-1)]), "56 vehicles"),
-        # The purges are gone: what follows a block of another part begins right behind it.
+        # The purges are missing: what follows a block of another part begins right behind it.
         ("time-blocks", lambda rows: rows.with_columns(
             first_frame=pl.when(pl.col("block") > 0).then(pl.col("first_frame") - 40).otherwise(pl.col("first_frame")),
             part=pl.when(pl.col("block") == 1).then(pl.lit("eval")).otherwise(pl.lit("train"))), "entries 0.2 s apart"),
@@ -180,10 +180,10 @@ def plant(monkeypatch, change):
             block=pl.lit(1, pl.Int32), first_frame=pl.lit(201, pl.Int32), part=pl.lit("train"))]), "frames"),
     ],
 )  # fmt: skip
-def test_a_planted_leak_stops_the_stage(monkeypatch, root, name, change, told):
+def test_a_planted_leak_stops_the_stage(monkeypatch, root, name, change, message):
     plant(monkeypatch, change)
     before = load(root).commits.keys()
-    with pytest.raises(StageError, match=f"split {name} claims that its parts share nothing, but highd: .*{told}"):
+    with pytest.raises(StageError, match=f"split {name} claims that its parts share nothing, but highd: .*{message}"):
         build_one(root, JOB, Settings(split=name, splits=[name], split_block_s=10))
     assert load(root).commits.keys() == before
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracklake.pipeline.stages.split_leakage import Leakage, measure, refuse_leaks
+from tracklake.pipeline.stages.split_leakage import Leakage, measure_leakage, refuse_leaks
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import (
     NEIGHBORS,
@@ -101,8 +101,8 @@ def expect(scene, split):
         for number, (name, _, first, last, first_id, last_id, part) in enumerate(rows):
             inside = first - 1e-9 <= begins and ends <= last + 1e-9
             known = (first_id is None or vehicle >= first_id) and (last_id is None or vehicle <= last_id)
-            gone = part != "train" and (subset, vehicle) in left_out
-            if name == subset and inside and known and not gone:
+            missing = part != "train" and (subset, vehicle) in left_out
+            if name == subset and inside and known and not missing:
                 return number, part
         return None, None
 
@@ -152,14 +152,14 @@ def cumulative_shift(one, other):
 def run(scene, split):
     (tracks, samples, neighbors), (rows, left_out) = scene, split
     splits = pl.DataFrame([("time-blocks", "highd", *row) for row in rows], schema=SPLITS.dtypes, orient="row")
-    gone = [("time-blocks", "highd", name, vehicle, "train, eval", 1) for name, vehicle in sorted(left_out)]
+    missing = [("time-blocks", "highd", name, vehicle, "train, eval", 1) for name, vehicle in sorted(left_out)]
     with duckdb.connect(":memory:") as connection:
         for table, given_rows in ((TRACKS, tracks), (SAMPLES, samples), (NEIGHBORS, neighbors)):
             connection.register(table.name, fill(table, given_rows))
-        found = measure(
+        found = measure_leakage(
             connection,
             splits,
-            pl.DataFrame(gone, schema=SPLIT_LEFT_OUT.dtypes, orient="row"),
+            pl.DataFrame(missing, schema=SPLIT_LEFT_OUT.dtypes, orient="row"),
             SUBSETS,
             recipe=RECIPE,
             protocol="p",
@@ -211,7 +211,7 @@ def a_row(**values):
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "message"),
     [
         ({"vehicles_shared": 3}, "train and eval share 3 vehicles"),
         ({"frames_shared": 1200}, "share 1,200 frames"),
@@ -220,9 +220,9 @@ def a_row(**values):
         ({"nearest_s": 7.96}, "share entries 7.96 s apart, expected at least 8 s"),
     ],
 )
-def test_whatever_is_shared_stops_a_split_that_claims_otherwise(values, told):
+def test_whatever_is_shared_stops_a_split_that_claims_otherwise(values, message):
     for name in ("flow-balanced", "time-blocks", "by-recording-random"):
-        with pytest.raises(StageError, match=f"split {name} claims .*{told}.*No split was written"):
+        with pytest.raises(StageError, match=f"split {name} claims .*{message}.*No split was written"):
             refuse_leaks({SplitRecipe(name): a_row(**values)})
     refuse_leaks({SplitRecipe("csp-2018"): a_row(**values)})
 

@@ -69,7 +69,7 @@ def test_sizes_and_findings_are_those_of_the_tables(remade):
     assert checked > 100
 
 
-def test_tensors_are_made_anew_where_findings_change(remade):
+def test_tensors_are_made_again_where_findings_change(remade):
     root, _ = remade
     settings = Settings(lake=root, protocol="grid-2021", splits=["by-recording-random"])
     (job,) = plan_stage(root, "tensors", settings)
