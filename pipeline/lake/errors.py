@@ -1,7 +1,9 @@
 """What can be wrong with a lake, as its user should read it."""
 
+from tracklake.schemas.errors import TracklakeError
 
-class LakeError(Exception):
+
+class LakeError(TracklakeError):
     """A lake cannot be used as asked; the message says why and what to do."""
 
 

@@ -9,10 +9,11 @@ from typing import Any
 from tracklake.pipeline.lake import Entry, LakeFile, Manifest, is_intact
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.hashing import hash_values
 
 
-class StageError(Exception):
+class StageError(TracklakeError):
     """A stage cannot run as things stand; the message says what to run first."""
 
 
