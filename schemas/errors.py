@@ -1,5 +1,11 @@
 """The root of all errors that a user sees as a message."""
 
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
 
 class TracklakeError(Exception):
     """Something the user can mend: the message says what, where, what was expected, what was found, and what to do.
@@ -18,3 +24,49 @@ class UsageError(TracklakeError):
 
 class MissingExtraError(TracklakeError):
     """A package is needed that only an extra of tracklake installs; the message names the extra."""
+
+
+class FileAccessError(TracklakeError):
+    """A file or folder cannot be read or written, for instance because the disk is full or rights are missing."""
+
+
+@contextmanager
+def explain_file_errors(path: Path, advice: str = "") -> Iterator[None]:
+    """Turn the operating system's errors on a file or folder into a message.
+
+    Args:
+        path: named in the message where the error names no file itself.
+        advice: a sentence that says what to do next.
+
+    Raises:
+        FileAccessError: the block raised an OSError, other than that of a closed pipe.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise FileAccessError(f"{error.filename or path}: {reason}. {advice}".rstrip()) from error
+
+
+def describe_error(error: BaseException) -> str:
+    """Return what a user should read of an error that stopped a part of the work."""
+    if isinstance(error, TracklakeError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{type(error).__name__}: {error}"
+    return describe_bug(error)
+
+
+def describe_bug(error: BaseException) -> str:
+    """Return the traceback of a bug and the paragraph that asks for a report."""
+    try:
+        release = version("tracklake")
+    except PackageNotFoundError:
+        release = "unknown version"
+    return (
+        f"{''.join(traceback.format_exception(error))}\n"
+        f"This is a bug in tracklake ({release}), not in your data or settings. Please report it on the issue tracker, "
+        "with the traceback above, this version and the command you ran."
+    )

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+from tracklake.schemas.errors import explain_file_errors
+
 _UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 """Names of files that are not whole yet; DuckDB writes its log beside a database."""
 
@@ -24,22 +26,23 @@ def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> N
         content: bytes, or a function that writes them to an open binary stream.
 
     Raises:
-        OSError: the folder is missing or full, or may not be written to.
+        FileAccessError: the folder is missing or full, or may not be written to.
     """
     unfinished = name_unfinished(target)
-    try:
-        with unfinished.open("wb") as stream:
-            if isinstance(content, bytes):
-                stream.write(content)
-            else:
-                content(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        unfinished.replace(target)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
-    sync(target.parent)
+    with explain_file_errors(target):
+        try:
+            with unfinished.open("wb") as stream:
+                if isinstance(content, bytes):
+                    stream.write(content)
+                else:
+                    content(stream)
+                stream.flush()
+                os.fsync(stream.fileno())
+            unfinished.replace(target)
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+        sync(target.parent)
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -1,10 +1,14 @@
 """The shape of the code, checked."""
 
 import ast
+import importlib
 import os
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
+
+from tracklake.schemas.errors import TracklakeError
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("schemas", "pipeline", "quality_reports", "training")
@@ -26,6 +30,28 @@ def test_the_import_rules_hold(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 broken" in done.stdout
+
+
+BUILT_ON_OTHERS = {
+    "SubsetOrderError": "only a programming error raises it",
+    "TrainingInterruptedError": "Ctrl-C: code that handles errors must not handle it",
+}
+"""Exceptions that do not derive from TracklakeError, with the reason."""
+
+
+def test_every_exception_has_one_root():
+    found: dict[str, type] = {}
+    for package in PACKAGES:
+        for module in pkgutil.walk_packages([str(ROOT / package)], f"tracklake.{package}."):
+            if not module.name.endswith((".__main__",)):
+                own = vars(importlib.import_module(module.name)).values()
+                found |= {
+                    each.__name__: each
+                    for each in own
+                    if isinstance(each, type) and issubclass(each, BaseException) and each.__module__ == module.name
+                }
+    assert len(found) > 15
+    assert {name for name, each in found.items() if not issubclass(each, TracklakeError)} == set(BUILT_ON_OTHERS)
 
 
 def test_help_imports_nothing_heavy():

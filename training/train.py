@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
@@ -39,7 +40,7 @@ BRIEF_S = 2.0
 """An epoch that ends so soon after a checkpoint writes none: writing it may take longer than doing the epoch again."""
 
 
-class DivergedError(ValueError):
+class DivergedError(TracklakeError):
     """The loss is no number any more; nothing good can come of going on."""
 
 
@@ -187,7 +188,7 @@ def _fit(
                     raise
 
             if state.step == 0:
-                raise ValueError(f"not one step was done within {config.seconds} s: give it more time")
+                raise TracklakeError(f"not one step was done within {config.seconds} s: give it more time")
             _log_steps(plan, state, optimizer, log_steps)
             if not state.epochs or state.epochs[-1]["step"] != state.step:
                 log_epoch(_end_epoch(plan, state, network, read))  # one that the budget cut short

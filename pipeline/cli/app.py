@@ -16,7 +16,7 @@ from tracklake.pipeline.cli.allocation import keep_freed_memory
 from tracklake.pipeline.cli.export import app as export_app
 from tracklake.pipeline.cli.generated_sample import provide_sample, refuse_mixing, write_generated
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
-from tracklake.pipeline.cli.session import DONE, FAILED, carry_out, command, conclude, read_settings
+from tracklake.pipeline.cli.session import DEBUG, DONE, FAILED, carry_out, command, conclude, read_settings
 
 app = typer.Typer(
     name="tracklake",
@@ -52,7 +52,10 @@ def main() -> None:
 @app.callback(invoke_without_command=True)
 def _version(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help=f"Show the traceback of every error (or {DEBUG}=1).")] = False,
 ) -> None:
+    if debug:
+        os.environ[DEBUG] = "1"
     if version:
         from importlib.metadata import version as version_of
 

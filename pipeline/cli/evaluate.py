@@ -71,6 +71,7 @@ def evaluate(
         from tracklake.pipeline.stages.score import BASELINE, finished_runs
         from tracklake.pipeline.stages.tensors import tensor_folder
         from tracklake.schemas.columns import PARTS
+        from tracklake.schemas.errors import explain_file_errors
         from tracklake.schemas.evaluations import EVALUATIONS
         from tracklake.training.evaluation.published import published_rows
         from tracklake.training.models.inputs import NEAREST
@@ -86,7 +87,8 @@ def evaluate(
         plain = part == "eval" and around == NEAREST and published and not every_tick
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
         if target is not None:
-            target.parent.mkdir(parents=True, exist_ok=True)  # now: what takes long would be lost afterwards
+            with explain_file_errors(target.parent):
+                target.parent.mkdir(parents=True, exist_ok=True)  # now: what takes long would be lost afterwards
         names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
@@ -120,7 +122,7 @@ def _evaluate_all(
     strict: bool,
 ) -> list["Evaluation"]:
     """Score one after the other; runs that do not fit, or not any more, are passed by, unless asked for by name."""
-    from tracklake.training.data.observed import FutureInputError
+    from tracklake.schemas.errors import MissingExtraError
     from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
     from tracklake.training.models.prediction import NotFiniteError
     from tracklake.training.runs.run_folder import StaleRunError
@@ -131,12 +133,10 @@ def _evaluate_all(
             found.append(
                 evaluate_model(name, tensors, models, part, nearest=nearest, with_latency=True, every_tick=every_tick)
             )
-        except (StaleRunError, NotFiniteError, ImportError) as unfit:
+        except (StaleRunError, NotFiniteError, MissingExtraError) as unfit:
             if strict:
                 raise
             terminal.complain(str(unfit), label="passed by")
-        except FutureInputError as leak:
-            raise ValueError(str(leak)) from leak
     return found
 
 

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tracklake.pipeline.cli.session import failure
-
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
     from tracklake.pipeline.ingest.discovery import Discovery
@@ -52,12 +50,13 @@ def refuse_mixing(lake: Path, discovery: "Discovery") -> None:
 def write_generated(
     out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
 ) -> "SampleSummary":
-    """Write the sample, and turn what a user can mend into a message."""
-    from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SumoError, write_sample
+    """Write the generated sample into a folder."""
+    from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, write_sample
+    from tracklake.schemas.errors import explain_file_errors
 
     if unknown := [name for name in formats or () if name not in ALL_FORMATS]:
         raise typer.BadParameter(f"--format is one of {', '.join(ALL_FORMATS)}; got {', '.join(unknown)}")
-    try:
+    with explain_file_errors(out):
         return write_sample(
             out,
             formats=tuple(formats) if formats else DEFAULT_FORMATS,
@@ -65,7 +64,3 @@ def write_generated(
             seed=1 if seed is None else seed,
             progress=lambda text: terminal.say(text, style="dim"),
         )
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
-    except SumoError as error:
-        raise failure(terminal, str(error)) from None

@@ -68,7 +68,7 @@ def lane_forest(
         from tracklake.pipeline.lake import load
         from tracklake.pipeline.lake.files import MODELS
         from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.training.data.observed import FutureInputError
+        from tracklake.schemas.errors import TracklakeError, explain_file_errors
         from tracklake.training.data.tensor_folder import TensorFolder
         from tracklake.training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
 
@@ -83,9 +83,10 @@ def lane_forest(
             asked = LaneForestSettings.read(forest.facts["settings"])
         else:
             forest = fit_lane_forest(folder, seed or 0, asked)
-            out.mkdir(parents=True, exist_ok=True)
-            (out / SCORES).unlink(missing_ok=True)  # of another forest
-            forest.save(out / FOREST)
+            with explain_file_errors(out):
+                out.mkdir(parents=True, exist_ok=True)
+                (out / SCORES).unlink(missing_ok=True)  # of another forest
+                forest.save(out / FOREST)
         passed_by: dict[str, str] = {}
 
         def pass_by(name: str, why: str) -> None:
@@ -93,10 +94,7 @@ def lane_forest(
             terminal.complain(f"{name}: {why}", label="passed by")
 
         predictors, reads = _find_predictors(settings.lake / MODELS, folder, runs or [], pass_by)
-        try:
-            scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
-        except FutureInputError as leak:
-            raise ValueError(str(leak)) from leak
+        scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
         record = {
             "forest": forest.facts,
             "features": list(forest.names),
@@ -110,7 +108,7 @@ def lane_forest(
         if learning_curve:
             try:
                 curve = learn_curve(folder, settings=asked)
-            except ValueError as impossible:
+            except TracklakeError as impossible:
                 no_curve = str(impossible)
             else:
                 record["learning_curve"] = [point.to_dict() for point in curve]
@@ -127,6 +125,7 @@ def _read_settings(examples: int | None, augment: bool | None, pairs: list[str])
     """What was said of the forest; the rest is as it is by itself."""
     from dataclasses import asdict
 
+    from tracklake.schemas.errors import UsageError
     from tracklake.training.lane_changes import LaneForestSettings
 
     known = {name: value for name, value in asdict(LaneForestSettings()).items() if name not in OPTIONS_OF_THEIR_OWN}
@@ -137,8 +136,8 @@ def _read_settings(examples: int | None, augment: bool | None, pairs: list[str])
         given["augmentation"] = ()
     try:
         return LaneForestSettings(**given)
-    except ValueError as wrong:
-        raise typer.BadParameter(f"--set {wrong}") from None
+    except UsageError as wrong:
+        raise UsageError(f"--set {wrong}") from None
 
 
 def _open_forest(file: Path, folder: "TensorFolder") -> "LaneForest":
@@ -171,6 +170,7 @@ def _find_predictors(
     was asked for by name.
     """
     from tracklake.pipeline.stages.score import finished_runs
+    from tracklake.schemas.errors import TracklakeError
     from tracklake.training.models import MODELS
     from tracklake.training.runs.forecasters import open_forecaster
 
@@ -181,7 +181,7 @@ def _find_predictors(
             continue
         try:
             own = open_forecaster(name, folder, models, frozenset({"eval"}))
-        except (ValueError, OSError, ImportError) as refused:
+        except TracklakeError as refused:
             if runs:
                 raise
             pass_by(name, str(refused))

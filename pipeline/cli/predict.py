@@ -80,6 +80,7 @@ def predict(
         from tracklake.pipeline.lake import load
         from tracklake.pipeline.lake.files import MODELS
         from tracklake.pipeline.stages.tensors import tensor_folder
+        from tracklake.schemas.errors import explain_file_errors
         from tracklake.schemas.files import write_file
         from tracklake.training.data.tensor_folder import TensorFolder
         from tracklake.training.plots.drawing import draw_picture
@@ -100,7 +101,8 @@ def predict(
         for number in samples:
             picture = _ask(folder, number, asked, all_vehicles=all_vehicles)
             file = _name_file(out, root / FOLDER, picture, all_vehicles=all_vehicles)
-            file.parent.mkdir(parents=True, exist_ok=True)
+            with explain_file_errors(file.parent):
+                file.parent.mkdir(parents=True, exist_ok=True)
             write_file(file, draw_picture(picture).render(file.suffix))
             _tell(terminal, picture, file)
             drawn.append({"file": file, **picture.to_dict()})
@@ -177,6 +179,7 @@ def _open_all(
         parts: that they are asked about.
         alone: no constant velocity beside others.
     """
+    from tracklake.schemas.errors import MissingExtraError
     from tracklake.training.runs.forecasters import open_forecaster
     from tracklake.training.runs.run_folder import StaleRunError
 
@@ -192,7 +195,7 @@ def _open_all(
                 break
             try:
                 found.append(open_forecaster(name, folder, models, parts))
-            except (StaleRunError, ImportError) as unfit:
+            except (StaleRunError, MissingExtraError) as unfit:
                 terminal.complain(str(unfit), label="passed by")
     named = {own.name for own in found}
     if BASELINE not in named and len(found) < MOST_MODELS and not (alone and found):
@@ -224,18 +227,14 @@ def _pick(
 
 def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_vehicles: bool) -> "Picture":
     """Let models predict, then look up what came."""
-    from tracklake.training.data.observed import FutureInputError
     from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
     from tracklake.training.plots.picture import take_picture
 
-    try:
-        if all_vehicles:
-            return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
-        run = folder.runs_of(folder.sample_row[[sample]])
-        own = int(folder.run_vehicle_id[run[0]])
-        return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})
-    except FutureInputError as leak:
-        raise ValueError(str(leak)) from leak
+    if all_vehicles:
+        return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
+    run = folder.runs_of(folder.sample_row[[sample]])
+    own = int(folder.run_vehicle_id[run[0]])
+    return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})
 
 
 def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_vehicles: bool) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
 from tracklake.pipeline.cli.console import Terminal, show_relation
+from tracklake.schemas.errors import FileAccessError, TracklakeError
 
 if TYPE_CHECKING:
     from io import IOBase
@@ -27,13 +28,14 @@ def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: 
         terminal: for tables, and to say how many rows went to the file.
 
     Raises:
-        ValueError: Parquet, which is no text, was asked for on a terminal.
+        TracklakeError: Parquet, which is no text, was asked for on a terminal.
+        FileAccessError: the file cannot be written.
     """
     if form == "table" and out is None:
         show_relation(relation, terminal)
         return
     if form == "parquet" and out is None and sys.stdout.isatty():
-        raise ValueError("Parquet is no text: give --out FILE, or redirect standard output to a file")
+        raise TracklakeError("Parquet is no text: give --out FILE, or redirect standard output to a file")
     try:
         frame = _flat(relation).pl() if form == "csv" else relation.pl()
         _write(frame, form, out or sys.stdout.buffer)
@@ -41,7 +43,7 @@ def write_result(relation: "LakeResult", form: str, out: Path | None, terminal: 
         # Polars raises the system's error without its number.
         if f"(os error {errno.EPIPE})" in str(error):
             raise BrokenPipeError from error
-        raise
+        raise FileAccessError(f"{out or 'standard output'}: {error}") from error
     if out is None:
         sys.stdout.buffer.flush()
     else:
@@ -76,7 +78,7 @@ def _write(frame: "pl.DataFrame", form: str, target: Path | IO[bytes]) -> None:
     elif form == "parquet":
         frame.write_parquet(target)
     else:
-        raise ValueError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
+        raise TracklakeError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
 
 
 def _flat(relation: "LakeResult") -> "LakeResult":

@@ -5,9 +5,11 @@ Like the commands, it imports heavy libraries where they are used.
 
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tomllib import TOMLDecodeError
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -21,28 +23,31 @@ if TYPE_CHECKING:
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
 
 
+DEBUG = "TRACKLAKE_DEBUG"
+"""Variable of the environment: where it is set, every error shows its traceback, as the option --debug has it."""
+
+
 @contextmanager
 def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
-    """Give a command its terminal, and turn what a user can mend into a message and an exit code."""
-    from tomllib import TOMLDecodeError
+    """Give a command its terminal, and turn errors into messages and exit codes.
 
+    An error that the user can mend becomes one message. A bug shows its traceback and asks for a report.
+    """
     from pydantic import ValidationError
 
     from tracklake.pipeline.cli.console import Terminal
-    from tracklake.pipeline.lake import LakeError
-    from tracklake.pipeline.sources import SourceError
-    from tracklake.pipeline.stages.stage import StageError
-    from tracklake.quality_reports.rules.registry import ThresholdError
+    from tracklake.schemas.errors import TracklakeError, describe_bug
 
     terminal = Terminal(quiet=quiet, as_json=json)
     try:
         yield terminal
-    except (LakeError, SourceError, StageError) as error:
-        raise failure(terminal, str(error)) from None
-    except (ThresholdError, TOMLDecodeError) as error:
-        where = "tracklake.toml: " if isinstance(error, TOMLDecodeError) else ""
-        raise failure(terminal, f"{where}{error}", USAGE) from None
+    except (typer.Exit, typer.Abort, typer.TyperException):
+        raise
+    except TracklakeError as error:
+        _show_traceback_if_debugging(error)
+        raise failure(terminal, str(error), error.exit_code) from None
     except ValidationError as error:
+        _show_traceback_if_debugging(error)
         for problem in error.errors():
             where = ".".join(str(part) for part in problem["loc"])
             terminal.complain(
@@ -50,28 +55,48 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
             )
         raise failure(terminal, "the settings are not valid", USAGE) from None
     except BrokenPipeError:
-        # Whoever read our output has seen enough; Python must not complain about it once more at exit.
+        # The reader of our output has closed it; without this, Python would report the broken pipe again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError, ImportError) as error:
-        raise failure(terminal, str(error)) from None
-    except KeyboardInterrupt:
-        told = "interrupted; what was committed stays; run the same command again"
-        raise failure(terminal, told) from None
+    except KeyboardInterrupt as error:
+        _show_traceback_if_debugging(error)
+        message = "interrupted; what was committed stays; run the same command again"
+        raise failure(terminal, message) from None
+    except Exception as bug:  # noqa: BLE001  (the outermost: nothing is hidden, the traceback is shown)
+        terminal.err.print(describe_bug(bug), markup=False)
+        terminal.give({"error": f"{type(bug).__name__}: {bug}", "bug": True})
+        raise typer.Exit(FAILED) from None
+
+
+def _show_traceback_if_debugging(error: BaseException) -> None:
+    if os.environ.get(DEBUG, "0") not in ("", "0"):
+        sys.stderr.write("".join(traceback.format_exception(error)))
 
 
 def failure(terminal: "Terminal", message: str, code: int = FAILED) -> typer.Exit:
-    """Say what went wrong, to people and to programs, and give the exit to raise."""
+    """Print what went wrong, for people and for programs, and return the exit to raise."""
     terminal.complain(message)
     terminal.give({"error": message})
     return typer.Exit(code)
 
 
 def read_settings(*, lake: Path | None = None, workers: int | None = None, protocol: str | None = None) -> "Settings":
-    """The settings, with the flags that were given on top."""
+    """Read the settings, with the flags that were given on top.
+
+    Raises:
+        UsageError: tracklake.toml or a variable of the environment cannot be read.
+    """
+    from pydantic_settings import SettingsError
+
     from tracklake.pipeline.settings import Settings
+    from tracklake.schemas.errors import UsageError
 
     flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
-    return Settings(**{name: value for name, value in flags.items() if value is not None})
+    try:
+        return Settings(**{name: value for name, value in flags.items() if value is not None})
+    except (TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise UsageError(f"tracklake.toml: {error}") from error
+    except SettingsError as error:
+        raise UsageError(f"environment: {error}. See TRACKLAKE_* in the documentation of the settings.") from error
 
 
 def carry_out(

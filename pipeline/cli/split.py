@@ -114,7 +114,10 @@ def _show(terminal: "Terminal", parts: "pl.DataFrame", allocation: "Allocation",
         if out is None:
             sys.stdout.write(text)
             return
-        out.write_text(text, encoding="utf-8")
+        from tracklake.schemas.errors import explain_file_errors
+
+        with explain_file_errors(out):
+            out.write_text(text, encoding="utf-8")
         terminal.say(f"{parts.height:,} subsets in {out}")
     elif terminal.talks:
         _print_rows(terminal, parts)

@@ -60,7 +60,6 @@ def train(
         from tracklake.pipeline.lake import load
         from tracklake.pipeline.lake.files import MODELS
         from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.training.data.observed import FutureInputError
         from tracklake.training.models import MODELS as MODELS_KNOWN
 
         if model not in MODELS_KNOWN:
@@ -90,8 +89,6 @@ def train(
         try:
             with terminal.measuring(f"train {model}") as tell:
                 metrics = train_model(model, tensors, out, config, tell, resume=resume)
-        except FutureInputError as leak:
-            raise ValueError(str(leak)) from leak
         except TrainingInterruptedError as stopped:
             again = [command_here(), "train", model, "--resume", *(["--name", name] if name is not None else [])]
             again += ["--lake", str(lake)] if lake is not None else []
@@ -141,7 +138,4 @@ def _make_config(given: dict[str, Any], *, resume: bool | None) -> "TrainConfig 
 
     if resume and not given:
         return None
-    try:
-        return TrainConfig(**given)
-    except ValueError as wrong:
-        raise typer.BadParameter(str(wrong)) from None
+    return TrainConfig(**given)

@@ -6,10 +6,11 @@ import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tracklake.schemas.errors import TracklakeError, explain_file_errors
 from tracklake.schemas.files import sync
 
 
-class ExportError(ValueError):
+class ExportError(TracklakeError):
     """An export cannot be made as asked; the message says why and what to do."""
 
 
@@ -51,7 +52,15 @@ def write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) 
         out: the folder, made where it is missing.
         names: of the files that `write` makes.
         write: fills the folder it is given.
+
+    Raises:
+        FileAccessError: the disk is full, or rights are missing.
     """
+    with explain_file_errors(out, "Free space there, or name another folder with --out."):
+        _write_files(out, names, write)
+
+
+def _write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) -> None:
     out = out.resolve()
     there = out.is_dir()
     if not there:

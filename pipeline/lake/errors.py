@@ -1,7 +1,9 @@
 """The errors of a lake, with messages for its user."""
 
+from tracklake.schemas.errors import TracklakeError
 
-class LakeError(Exception):
+
+class LakeError(TracklakeError):
     """A lake cannot be used as asked; the message says why and what to do."""
 
 

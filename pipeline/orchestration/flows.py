@@ -16,6 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from tracklake.schemas.errors import FileAccessError, MissingExtraError, TracklakeError, describe_error
+
 # Prefect reads these on import. Its telemetry shares the embedded server's database and locks it.
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
@@ -72,7 +74,7 @@ Results = Iterable[tuple[str, Any]]
 
 def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
     """Retry what a busy disk or a network share may cause; nothing else becomes right by a retry."""
-    return isinstance(state.result(raise_on_failure=False), OSError)
+    return isinstance(state.result(raise_on_failure=False), OSError | FileAccessError)
 
 
 TASK: dict[str, Any] = {
@@ -113,7 +115,7 @@ def _record_error(title: str, error: BaseException, result: RunResult) -> None:
     if isinstance(error, SourceError | StructureError):
         result.refused.append(str(error))
     else:
-        result.failed.append(f"{title}: {type(error).__name__}: {error}")
+        result.failed.append(f"{title}: {describe_error(error)}")
 
 
 def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult) -> None:
@@ -298,7 +300,9 @@ def _choose_runner(settings: Settings) -> TaskRunner[Any]:
     try:
         from prefect_dask.task_runners import DaskTaskRunner
     except ImportError:
-        raise ImportError('the setting runner = "dask" needs Dask: `pip install "tracklake[distributed]"`') from None
+        raise MissingExtraError(
+            'the setting runner = "dask" needs Dask: `pip install "tracklake[distributed]"`'
+        ) from None
     if settings.dask_address is not None:
         return DaskTaskRunner(address=settings.dask_address)
     cluster = {"n_workers": settings.workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
@@ -324,7 +328,7 @@ def _embed_server() -> str:
     limit = time.monotonic() + SERVER_START_S
     while not server.started:
         if not thread.is_alive() or time.monotonic() > limit:
-            raise RuntimeError(
+            raise TracklakeError(
                 "Prefect's embedded server did not start. Look at PREFECT_HOME (its database may be of another "
                 "version: `prefect server database reset`), or set PREFECT_API_URL to a running server."
             )

@@ -8,9 +8,10 @@ from typing import Any
 import polars as pl
 
 from tracklake.schemas.columns import Dataset
+from tracklake.schemas.errors import TracklakeError
 
 
-class SourceError(Exception):
+class SourceError(TracklakeError):
     """Raw input that cannot be used; the message says where, what was expected, what was found and what to do."""
 
 

@@ -13,6 +13,7 @@ from tracklake.pipeline.synthetic.build import README_FILE, TRUTH_FILE, build
 from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
 from tracklake.pipeline.synthetic.sumo import SumoError
 from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
+from tracklake.schemas.errors import UsageError
 
 ALL_FORMATS = FORMATS
 DEFAULT_MINUTES = 1.0
@@ -57,16 +58,16 @@ def write_sample(
         progress: is told about each step.
 
     Raises:
-        ValueError: an argument makes no sense, or `out` holds something else.
+        UsageError: an argument makes no sense, or `out` holds something else.
         SumoError: SUMO is not installed, or failed.
     """
     unknown = [name for name in formats if name not in ALL_FORMATS]
     if unknown or not formats:
-        raise ValueError(f"formats: expected some of {', '.join(ALL_FORMATS)}, got {', '.join(unknown) or 'none'}")
+        raise UsageError(f"formats: expected some of {', '.join(ALL_FORMATS)}, got {', '.join(unknown) or 'none'}")
     if not LEAST_MINUTES <= minutes <= MOST_MINUTES:
-        raise ValueError(f"minutes: expected {LEAST_MINUTES:g} to {MOST_MINUTES:g}, got {minutes}")
+        raise UsageError(f"minutes: expected {LEAST_MINUTES:g} to {MOST_MINUTES:g}, got {minutes}")
     if seed < 0:
-        raise ValueError(f"seed: expected a whole number from 0, got {seed}")
+        raise UsageError(f"seed: expected a whole number from 0, got {seed}")
     out = Path(out).absolute()
     _require_replaceable(out)
     began = time.perf_counter()
@@ -98,20 +99,20 @@ def _require_replaceable(out: Path) -> None:
     if not out.exists():
         return
     if not out.is_dir():
-        raise ValueError(f"{out} is a file; expected a folder that is absent or empty. Name another one with --out.")
+        raise UsageError(f"{out} is a file; expected a folder that is absent or empty. Name another one with --out.")
     present = {path.name for path in out.iterdir()}
     if not present:
         return
     advice = "Name another folder with --out, or empty this one."
     truth = out / TRUTH_FILE
     if not truth.is_file():
-        raise ValueError(f"{out} is not empty and holds no sample ({TRUTH_FILE} is missing). {advice}")
+        raise UsageError(f"{out} is not empty and holds no sample ({TRUTH_FILE} is missing). {advice}")
     try:
         table = pl.read_parquet(truth)
     except pl.exceptions.ComputeError as error:
-        raise ValueError(f"{truth} cannot be read, so {out} is not known to be a sample. {advice}") from error
+        raise UsageError(f"{truth} cannot be read, so {out} is not known to be a sample. {advice}") from error
     if table.schema != pl.Schema(TRUTH_SCHEMA):
-        raise ValueError(f"{truth} is not that of a sample of this version. {advice}")
+        raise UsageError(f"{truth} is not that of a sample of this version. {advice}")
     foreign = sorted(present - set(table["file"].drop_nulls()) - {TRUTH_FILE, README_FILE})
     if foreign:
-        raise ValueError(f"{out} holds a sample, but also {foreign[0]}, which would be lost. {advice}")
+        raise UsageError(f"{out} holds a sample, but also {foreign[0]}, which would be lost. {advice}")

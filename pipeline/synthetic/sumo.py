@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic.scenarios import RAMP_VISIBLE_M, WEAVE_BEGINS_M, WEAVE_ENDS_M, Road, Traffic
+from tracklake.schemas.errors import TracklakeError
 
 APPROACH_M = 500.0
 MARGIN_M = 40.0
@@ -80,7 +81,7 @@ TRACK_SCHEMA = {
 the left edge to the right, m/s and m/s2 along the direction of travel, lane 1 leftmost; sorted by vehicle, frame."""
 
 
-class SumoError(RuntimeError):
+class SumoError(TracklakeError):
     """SUMO is not installed, or a run of it failed."""
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from tracklake.schemas.errors import TracklakeError
+
 CLOCK_DTYPES: dict[str, pl.DataType] = {
     "vehicle_id": pl.Int32(),
     "tick": pl.Int32(),
@@ -23,11 +25,12 @@ def find_stride(*, frame_rate_hz: float, rate_hz: int) -> Fraction:
     """Frames of the source per tick of the clock, exactly (25 Hz to 10 Hz: 5/2).
 
     Raises:
-        ValueError: the clock is faster than the source; positions between frames are interpolated, never multiplied.
+        TracklakeError: the clock is faster than the source; positions between frames are interpolated, never
+            multiplied.
     """
     stride = Fraction(frame_rate_hz).limit_denominator(1001) / rate_hz
     if stride < 1:
-        raise ValueError(
+        raise TracklakeError(
             f"cannot put {frame_rate_hz:g} Hz tracks on a {rate_hz} Hz clock: expected a protocol rate of at most "
             f"{frame_rate_hz:g} Hz; choose a protocol with a lower rate_hz"
         )
@@ -54,7 +57,7 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
         segment. A track that skips a frame starts a new segment even if the clock would not have used that frame.
 
     Raises:
-        ValueError: the clock is faster than the source.
+        TracklakeError: the clock is faster than the source.
     """
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
     frames, ticks = stride.numerator, stride.denominator

@@ -29,6 +29,7 @@ from tracklake.quality_reports.rules.place import (
     OVERLAP,
 )
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
+from tracklake.schemas.errors import UsageError
 
 __all__ = [
     "RULES",
@@ -66,7 +67,7 @@ RULES: tuple[Rule, ...] = (
 """The rules in use, in the order of the report."""
 
 
-class ThresholdError(ValueError):
+class ThresholdError(UsageError):
     """A threshold's name is unknown or its value is no number."""
 
 

@@ -13,6 +13,7 @@ from tensor_tables import drive as drive_vehicles
 from tiny_network import PARTS, RECIPE, Forgetful, read_log, register, write_tiny
 
 import tracklake.training.train
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import evaluate
@@ -265,7 +266,7 @@ def test_the_time_budget_ends_the_training_and_is_shared_by_the_phases(tensors, 
 
 
 def test_no_time_for_one_step(tensors, tmp_path):
-    with pytest.raises(ValueError, match="not one step was done"):
+    with pytest.raises(TracklakeError, match="not one step was done"):
         train("lstm", tensors, tmp_path / "run", TrainConfig(seconds=1e-9))
     assert list(tmp_path.iterdir()) == []
 
@@ -339,14 +340,16 @@ def test_without_an_evaluation_part_there_is_no_score(tmp_path):
 
 def test_without_a_training_part_there_is_nothing_to_learn_from(tmp_path):
     folder = write_tiny(tmp_path / "tensors", split_row("b", "eval"), subsets="b")
-    with pytest.raises(ValueError, match="the split `mine` has no samples in `train`"):
+    with pytest.raises(TracklakeError, match="the split `mine` has no samples in `train`"):
         train("lstm", folder, tmp_path / "run", FEW)
     assert [path.name for path in tmp_path.iterdir()] == ["tensors"]
 
 
 def test_patience_needs_a_validation_part(tmp_path):
     folder = write_tiny(tmp_path / "tensors", PARTS.filter(pl.col("part") != "val"), subsets="ab")
-    with pytest.raises(ValueError, match=r"patience 3 needs samples in `val` .* `mine` has none: set `validation_part"):
+    with pytest.raises(
+        TracklakeError, match=r"patience 3 needs samples in `val` .* `mine` has none: set `validation_part"
+    ):
         train("lstm", folder, tmp_path / "run", TrainConfig(patience=3))
 
 
@@ -384,14 +387,14 @@ def test_a_last_step_that_explodes_leaves_nothing_to_go_on_from(tensors, tmp_pat
     ],
 )
 def test_settings_that_cannot_train_are_refused(bad, told):
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(UsageError, match=told):
         TrainConfig(**bad)
 
 
 def test_what_a_model_or_this_machine_lacks_is_refused(tensors, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="model `lstm` has no parameter heads: expected hidden"):
+    with pytest.raises(UsageError, match="model `lstm` has no parameter heads: expected hidden"):
         train("lstm", tensors, tmp_path / "run", TrainConfig(steps=1, parameters={"heads": 2}))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match="expected device `cpu`, or `cuda` where torch finds one, got `cuda`"):
+    with pytest.raises(TracklakeError, match="expected device `cpu`, or `cuda` where torch finds one, got `cuda`"):
         train("lstm", tensors, tmp_path / "run", TrainConfig(steps=1, device="cuda"))
     assert list(tmp_path.iterdir()) == []

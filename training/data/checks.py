@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, SUBSET_KEYS
 
 AGAIN = "run `tracklake tensors` again"
 
 
-class TensorError(ValueError):
+class TensorError(TracklakeError):
     """A tensor folder is absent, unfinished or not what its index says."""
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import Field, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, Self, TypeVar
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Batch
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ Array = TypeVar("Array")
 """NumPy's arrays or torch's tensors; shapes, units and order are the same."""
 
 
-class FutureInputError(AttributeError):
+class FutureInputError(TracklakeError, AttributeError):
     """A model asked for what is known only after the moment at which it predicts."""
 
 

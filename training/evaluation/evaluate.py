@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -90,7 +91,7 @@ class Evaluation:
         return EVALUATIONS.empty() if not rows else pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
 
 
-class EmptyPartError(ValueError):
+class EmptyPartError(TracklakeError):
     """The part asked for has no samples."""
 
 
@@ -120,10 +121,9 @@ def evaluate(
         EmptyPartError: the part has no samples.
         StaleRunError: the run was trained for another protocol, or on subsets that stand in this part now; or it is
             unfinished or damaged.
-        ValueError: neither a run nor a model of that name; the runs and models that there are.
-        FileNotFoundError: a model that learns, and no run of that name.
+        UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
         FutureInputError: the model sees what comes after the moment at which it predicts.
-        ImportError: torch is needed and missing.
+        MissingExtraError: torch is needed and missing.
     """
     folder = TensorFolder.open(tensors)
     own = open_forecaster(name, folder, models, frozenset({part}))

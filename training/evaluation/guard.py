@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, SEVERITIES
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.batches import Integers
 from tracklake.training.data.observed import FutureInputError
@@ -107,7 +108,7 @@ def refuse_future(
 
     Raises:
         FutureInputError: a prediction changes, or already what the model is given.
-        ValueError: the model predicts otherwise each time it is asked, so that nothing can be said of it.
+        TracklakeError: the model predicts otherwise each time it is asked, so that nothing can be said of it.
     """
     rows = {array: getattr(folder, array).copy() for array in OF_ROWS}
     changed = {array: change(getattr(folder, array)) for array, change in OF_SAMPLES.items()}
@@ -140,7 +141,7 @@ def refuse_future(
         if differs is None:
             continue
         if _find_difference(said, predict()[1]) is not None:
-            raise ValueError(
+            raise TracklakeError(
                 f"`{name}` predicts otherwise each time it is asked ({where}): fix its seed, so that its scores mean "
                 "something and it can be checked that it does not see the future"
             )

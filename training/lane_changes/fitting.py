@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Bytes, Floats
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.choice import choose_features
@@ -35,7 +36,7 @@ def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSetting
         settings: None: as they are by themselves.
 
     Raises:
-        ValueError: the training part has no sample that keeps its lane, or none that changes it.
+        TracklakeError: the training part has no sample that keeps its lane, or none that changes it.
     """
     settings = settings or LaneForestSettings()
     judged = judge_samples(folder, "train", settings)
@@ -52,7 +53,7 @@ def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSetting
         "drawn_by_stratum": dict(zip(STRATA, drawn.count_strata().tolist(), strict=True)),
     }
     if len(np.unique(drawn.maneuver)) < 2:
-        raise ValueError(
+        raise TracklakeError(
             f"{folder.path}: a lane-change forest needs samples of the training part that keep their lane and some "
             f"that change it; got {facts['samples_by_stratum']} ({judged.changes} lane changes in all). It needs "
             "recordings with lanes, longer or more of them"
@@ -86,7 +87,7 @@ def grow(
         facts: kept with the forest, beside the settings, the seed and the coefficients.
 
     Raises:
-        ValueError: no feature correlates enough with the maneuver.
+        TracklakeError: no feature correlates enough with the maneuver.
     """
     augmented = augment(examples, settings, np.random.default_rng([seed, 1]))
     table = choose_features(
@@ -97,7 +98,7 @@ def grow(
     )
     names = tuple(row.feature for row in table if row.chosen)
     if not names:
-        raise ValueError(
+        raise TracklakeError(
             f"no feature correlates with the maneuver by {settings.least_correlation:g} or more (the best, "
             f"{table[0].feature}, by {table[0].strength:.3f}): set `least_correlation` lower"
         )

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.batches import Bytes, Floats
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.features import NAMES, NUMBER, describe_targets
@@ -35,7 +36,7 @@ NEEDED_FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subse
 WALKED_AT_ONCE = 4096
 
 
-class ForestError(ValueError):
+class ForestError(TracklakeError):
     """A file is no forest of this version, or not a whole one."""
 
 
@@ -154,7 +155,7 @@ class LaneForest:
             )
         try:
             LaneForestSettings.read(facts["settings"])
-        except ValueError as wrong:
+        except UsageError as wrong:
             raise ForestError(f"{file}: {wrong}{AGAIN}") from None
         _check_trees(file, arrays, len(names), len(horizons))
         return cls(tuple(names), int(rate_hz[0]), horizons, facts, **arrays)

@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Flags, Floats, Integers
 from tracklake.training.data.nearest_vehicles import gather_surroundings
-from tracklake.training.data.observed import FutureInputError, Observed, ObservedScene, part_batch
+from tracklake.training.data.observed import Observed, ObservedScene, part_batch
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.guard import refuse_future
@@ -159,9 +160,9 @@ def evaluate_grid(
 
     Raises:
         FutureInputError: the forest or a model is found to see the future.
-        ValueError: no such part; the forest has learned from subsets of this part; or it was fitted at another rate or
-            for horizons that the folder does not score; or a model predicts places that are not finite numbers, or not
-            of the horizon's shape.
+        TracklakeError: no such part; the forest has learned from subsets of this part; or it was fitted at another rate
+            or for horizons that the folder does not score; or a model predicts places that are not finite numbers, or
+            not of the horizon's shape.
     """
     ticks = _find_ticks(folder, forest)
     refuse_leak(forest.facts, folder, part)
@@ -213,7 +214,7 @@ def _passing_by(name: str, asked: dict[str, Predictor], pass_by: Callable[[str, 
     """Leave a model out that is refused, where somebody is told of it."""
     try:
         yield
-    except (FutureInputError, ValueError) as refused:
+    except TracklakeError as refused:
         if pass_by is None:
             raise
         del asked[name]
@@ -251,11 +252,11 @@ def _ask(name: str, predictor: Predictor, seen: _Seen, reads: Reads) -> Floats:
 
     Raises:
         NotFiniteError: they are not finite numbers.
-        ValueError: they are not of the horizon's shape.
+        TracklakeError: they are not of the horizon's shape.
     """
     place_m = predictor.predict(seen.scene if reads == "scene" else seen.grid).position_m
     if place_m.shape != seen.future.shape:
-        raise ValueError(f"`{name}`: expected places of shape {seen.future.shape}, got {place_m.shape}")
+        raise TracklakeError(f"`{name}`: expected places of shape {seen.future.shape}, got {place_m.shape}")
     if not np.isfinite(place_m).all():
         raise NotFiniteError(name, "positions")
     return place_m
@@ -350,7 +351,7 @@ def _find_ticks(folder: TensorFolder, forest: LaneForest) -> npt.NDArray[np.intp
     protocol = folder.protocol
     scored = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
     if forest.rate_hz != protocol.rate_hz or not set(forest.horizons_s) <= set(scored):
-        raise ValueError(
+        raise TracklakeError(
             f"the forest was fitted at {forest.rate_hz} Hz for horizons of {forest.horizons_s} s; {folder.path} is of "
             f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
         )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Bytes
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import Examples, Judged, draw_balanced, gather_examples, judge_samples
@@ -67,20 +68,20 @@ def learn_curve(
         settings: of the forests; `examples` is taken from `sizes`, and augmentation is on (as it is set) and off.
 
     Raises:
-        ValueError: one of the parts has no samples, or none whose maneuver is known; or see `fitting.grow`.
+        TracklakeError: one of the parts has no samples, or none whose maneuver is known; or see `fitting.grow`.
     """
     settings = settings or LaneForestSettings()
     pools = {part: judge_samples(folder, part, settings) for part in ("train", "eval")}
     empty = [part for part, pool in pools.items() if not len(pool.sample)]
     without = [part for part in empty if not len(folder.samples_of(part))]
     if without:
-        raise ValueError(
+        raise TracklakeError(
             f"{folder.path}: a learning curve is fitted on `train` and scored on `eval`, and the split "
             f"`{folder.split}` has no samples in {' and '.join(f'`{part}`' for part in without)}; with a single "
             "recording everything trains: add recordings and run `tracklake split`"
         )
     if empty:
-        raise ValueError(
+        raise TracklakeError(
             f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
             f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
         )

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
+from tracklake.schemas.errors import UsageError
 from tracklake.training.lane_changes.labels import START_S, TOLERANCE_M
 
 AUGMENTATIONS = ("mirror", "shift")
@@ -40,33 +41,33 @@ class LaneForestSettings:
         """Refuse what cannot be.
 
         Raises:
-            ValueError: saying what.
+            UsageError: saying what.
         """
         unknown = sorted(set(self.augmentation) - set(AUGMENTATIONS))
         if unknown:
-            raise ValueError(f"augmentation is of {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
+            raise UsageError(f"augmentation is of {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
         for name in ("start_s", "examples", "trees", "leaf"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
+                raise UsageError(f"{name}: expected more than 0, got {getattr(self, name)}")
         for name in ("tolerance_m", "shift_m", "least_correlation", "most_correlation"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+                raise UsageError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
     @classmethod
     def read(cls, stored: object) -> Self:
         """What a forest's facts hold; a setting that they lack is as it is by itself.
 
         Raises:
-            ValueError: it is no object, or a value is none of these, of another kind, or cannot be.
+            UsageError: it is no object, or a value is none of these, of another kind, or cannot be.
         """
         if not isinstance(stored, Mapping):
-            raise ValueError(f"expected settings by name, got {type(stored).__name__}")
+            raise UsageError(f"expected settings by name, got {type(stored).__name__}")
         known = {own.name: own.default for own in fields(cls)}
         read: dict[str, Any] = {}
         for name, value in stored.items():
             given = tuple(value) if isinstance(value, list) else value
             given = float(given) if type(given) is int and isinstance(known.get(name), float) else given
             if name not in known or type(given) is not type(known[name]):
-                raise ValueError(f"expected settings of {', '.join(known)}, each as by itself; got {name} = {value!r}")
+                raise UsageError(f"expected settings of {', '.join(known)}, each as by itself; got {name} = {value!r}")
             read[name] = given
         return cls(**read)

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from typing import Any, Literal
 from typing import Protocol as Interface
 
+from tracklake.schemas.errors import MissingExtraError, UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.models.recipes import Phase, Recipe
@@ -56,13 +57,13 @@ class Model:
         """Make it for a protocol.
 
         Raises:
-            ValueError: a parameter that it does not have.
-            ImportError: it needs torch, which is missing.
+            UsageError: a parameter that it does not have.
+            MissingExtraError: it needs torch, which is missing.
         """
         unknown = sorted(set(parameters) - set(self.parameters))
         if unknown:
             known = ", ".join(self.parameters) or "none"
-            raise ValueError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
+            raise UsageError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
         if self.learns:
             require_torch(self.name)
         make: Callable[..., Any] = getattr(import_module(f"tracklake.training.models.{self.module}"), self.builder)
@@ -185,10 +186,10 @@ def find_model(name: str) -> Model:
     """Look a model up.
 
     Raises:
-        ValueError: no such model.
+        UsageError: no such model.
     """
     if name not in MODELS:
-        raise ValueError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}")
+        raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}")
     return MODELS[name]
 
 
@@ -196,7 +197,9 @@ def require_torch(model: str) -> None:
     """Say what to install where torch is missing.
 
     Raises:
-        ImportError: torch cannot be imported.
+        MissingExtraError: torch cannot be imported.
     """
     if find_spec("torch") is None:
-        raise ImportError(f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"')
+        raise MissingExtraError(
+            f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"'
+        )

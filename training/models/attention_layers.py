@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from tracklake.schemas.errors import UsageError
+
 
 def masked_softmax(scores: Tensor, present: Tensor) -> Tensor:
     """Weights that sum to 1 over the keys that are there and are 0 elsewhere; all 0 where no key is there.
@@ -45,7 +47,7 @@ class MultiHeadAttention(nn.Module):
         """
         super().__init__()
         if heads < 1:
-            raise ValueError(f"attention with {heads} heads: expected at least 1")
+            raise UsageError(f"attention with {heads} heads: expected at least 1")
         self.heads, self.head_width = heads, head_width
         self.query = nn.Linear(query_width, heads * head_width)
         self.key = nn.Linear(key_width, heads * head_width)

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Floats
 
 
-class NotFiniteError(ValueError):
+class NotFiniteError(TracklakeError):
     """A model predicts what is no number.
 
     Args:

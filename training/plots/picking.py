@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Flags, Integers
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples, truth_of_ego
@@ -19,7 +20,7 @@ MOST_LOOKED_AT = 20_000
 BATCH_SIZE = 2048
 
 
-class NoSampleError(ValueError):
+class NoSampleError(TracklakeError):
     """There is no sample of the kind, vehicle or time asked for."""
 
 
@@ -32,12 +33,12 @@ def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
         time_s: since the recording began.
 
     Raises:
-        NoSampleError: no such subset, vehicle or time; the nearest are named.
-        ValueError: the vehicle is not written so.
+        NoSampleError: no such subset, vehicle or time, of which the nearest are named; or the vehicle is not written
+            so.
     """
     name, colon, number = vehicle.rpartition(":")
     if not colon or not name or not number.isascii() or not number.isdigit():
-        raise ValueError(f"expected a vehicle as SUBSET:ID, for instance 02-lower:21, got `{vehicle}`")
+        raise NoSampleError(f"expected a vehicle as SUBSET:ID, for instance 02-lower:21, got `{vehicle}`")
     full = [f"{subset['dataset']}/{subset['subset']}" for subset in folder.index["subsets"]]
     subsets = [at for at, known in enumerate(full) if name in (known, known.partition("/")[2])]
     if not subsets:

@@ -4,6 +4,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tracklake.schemas.errors import UsageError
 from tracklake.training.runs.config import TrainConfig
 from tracklake.training.runs.state import TrainingState
 from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file, write_torch_file
@@ -93,7 +94,7 @@ def find_config(path: Path, content: dict[str, Any]) -> TrainConfig:
         )
     try:
         return TrainConfig(**settings)
-    except (TypeError, ValueError) as wrong:
+    except (TypeError, UsageError) as wrong:
         raise DamagedFileError(f"{path}: expected the settings of a training, got others ({wrong}); {ANEW}") from None
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.batches import Integers
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Model
@@ -76,26 +77,26 @@ class TrainConfig:
         """Refuse values that cannot train anything.
 
         Raises:
-            ValueError: naming the value.
+            UsageError: naming the value.
         """
         for own in fields(self):
             value = getattr(self, own.name)
             if own.name in WHOLE_NUMBERS and not isinstance(value, int | None):
-                raise ValueError(f"training: expected a whole number for `{own.name}`, got {value!r}")
+                raise UsageError(f"training: expected a whole number for `{own.name}`, got {value!r}")
             if own.name in NUMBERS and not isinstance(value, int | float | None):
-                raise ValueError(f"training: expected a number for `{own.name}`, got {value!r}")
+                raise UsageError(f"training: expected a number for `{own.name}`, got {value!r}")
             if own.name != "seed" and isinstance(value, int | float) and not value > 0:
-                raise ValueError(f"training: expected `{own.name}` above 0, got {value}")
+                raise UsageError(f"training: expected `{own.name}` above 0, got {value}")
         if not isinstance(self.parameters, Mapping):
-            raise ValueError(f"training: expected `parameters` by name, got {self.parameters!r}")
+            raise UsageError(f"training: expected `parameters` by name, got {self.parameters!r}")
         if self.seed < 0:
-            raise ValueError(f"training: expected `seed` 0 or above, got {self.seed}")
+            raise UsageError(f"training: expected `seed` 0 or above, got {self.seed}")
         given = [f"{name} {getattr(self, name)}" for name in BUDGETS if getattr(self, name) is not None]
         if len(given) > 1:
-            raise ValueError(f"training: expected one of {', '.join(BUDGETS)} at most, got {' and '.join(given)}")
+            raise UsageError(f"training: expected one of {', '.join(BUDGETS)} at most, got {' and '.join(given)}")
         for name, known in (("optimizer", get_args(OptimizerName)), ("schedule", get_args(ScheduleName))):
             if getattr(self, name) not in (None, *known):
-                raise ValueError(f"training: expected `{name}` {' or '.join(known)}, got {getattr(self, name)!r}")
+                raise UsageError(f"training: expected `{name}` {' or '.join(known)}, got {getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)
@@ -164,26 +165,26 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
     """Put a model, what it learns from and how together.
 
     Raises:
-        ValueError: the model does not learn; there are no samples to train on, or none to validate with and `patience`
-            is given; or there is no such device.
+        TracklakeError: the model does not learn; there are no samples to train on, or none to validate with and
+            `patience` is given; or there is no such device.
     """
     import torch
 
     if entry.recipe is None:
-        raise ValueError(f"model `{entry.name}` does not learn; `tracklake evaluate {entry.name}` scores it")
+        raise UsageError(f"model `{entry.name}` does not learn; `tracklake evaluate {entry.name}` scores it")
     train, val = folder.samples_of("train"), folder.samples_of("val")
     if len(train) == 0:
-        raise ValueError(
+        raise TracklakeError(
             f"{folder.path}: the split `{folder.split}` has no samples in `train`: nothing to learn from; see "
             '`sample_drops` for why (`tracklake sql "FROM sample_drops"`)'
         )
     if config.patience is not None and len(val) == 0:
-        raise ValueError(
+        raise TracklakeError(
             f"{folder.path}: patience {config.patience} needs samples in `val` to judge by, and the split "
             f"`{folder.split}` has none: set `validation_part = true` and run `tracklake run`, or train without it"
         )
     if config.device != "cpu" and not (config.device == "cuda" and torch.cuda.is_available()):
-        raise ValueError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
+        raise TracklakeError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
     device = (
         torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device(config.device)
     )

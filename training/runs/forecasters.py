@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, Reads, find_model
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
@@ -23,6 +24,10 @@ class Forecaster:
     reads: Reads
 
 
+class UnknownRunError(TracklakeError):
+    """There is no run, and no model that needs no training, of this name."""
+
+
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
     """Open a trained run, or a model that needs no training: that one as it is, whether or not it was written as a run.
 
@@ -35,9 +40,8 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
     Raises:
         StaleRunError: the run was trained for another protocol, or on subsets that stand in these parts now (but for
             `train`); or it is unfinished or damaged.
-        ValueError: neither a run nor a model of that name.
-        FileNotFoundError: a model that learns, and no run of that name.
-        ImportError: torch is needed and missing.
+        UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
+        MissingExtraError: torch is needed and missing.
     """
     if name in MODELS and not MODELS[name].learns:
         return Forecaster(name, MODELS[name].build(folder.protocol), MODELS[name].reads)
@@ -51,10 +55,10 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
     if Path(name).name == name and (models / name / "metrics.json").is_file():
         raise StaleRunError(f"{models / name}: a run without its config.json; train it again")
     if name in MODELS:
-        raise FileNotFoundError(f"{models / name}: no trained run; run `tracklake train {name}` first")
+        raise UnknownRunError(f"{models / name}: no trained run; run `tracklake train {name}` first")
     runs = sorted(path.parent.name for path in models.glob("[!.]*/config.json"))
     known = [own for own, model in MODELS.items() if not model.learns]
-    raise ValueError(
+    raise UnknownRunError(
         f"no run or model `{name}`: expected one of the runs {', '.join(runs) or '(none yet)'}, or of the models that "
         f"need no training, {', '.join(known)}; `tracklake train MODEL --name {name}` trains one"
     )

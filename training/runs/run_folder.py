@@ -12,6 +12,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -33,7 +34,7 @@ HASHED_BYTES = 1 << 22
 """At a time: Ctrl-C does not wait for a whole array."""
 
 
-class StaleRunError(ValueError):
+class StaleRunError(TracklakeError):
     """A run cannot be judged on these tensors: it was made for others, is unfinished, or is damaged."""
 
 
@@ -166,7 +167,7 @@ def load_run(path: Path, protocol: Protocol) -> Run:
     try:
         model = find_model(config["model"])
         predictor = model.build(protocol, **config["parameters"])
-    except (ValueError, TypeError) as wrong:
+    except (UsageError, ValueError, TypeError) as wrong:
         raise StaleRunError(f"{path}: {wrong}; {AGAIN}") from None
     if model.learns:
         require_torch(model.name)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 from zipfile import BadZipFile, ZipFile
 
+from tracklake.schemas.errors import TracklakeError
+
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
@@ -18,7 +20,7 @@ SHOWN = 3
 """Differences that a message names."""
 
 
-class DamagedFileError(ValueError):
+class DamagedFileError(TracklakeError):
     """A file is not what was written, or not what is expected there."""
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.training.runs.torch_files import PARTIAL
 
 CHECKPOINT_FILE = "checkpoint.pt"
@@ -14,7 +15,7 @@ LOCK_FILE = "lock"
 ANEW = "begin anew (`--anew`)"
 
 
-class UnfinishedError(ValueError):
+class UnfinishedError(TracklakeError):
     """A training cannot begin, or go on, as it stands on disk."""
 
 

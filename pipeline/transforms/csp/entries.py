@@ -10,6 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.schemas.columns import FOOT_M
+from tracklake.schemas.errors import TracklakeError
 
 LARGEST_WHOLE = 1 << 24
 """Whole numbers beyond this cannot be told apart in single precision."""
@@ -57,12 +58,12 @@ def to_csp_entries(clock: pl.DataFrame, *, last_lane: int | None) -> CspEntries:
         last_lane: lanes with higher numbers count as this one (the script's 6 on US-101); None: all stay.
 
     Raises:
-        ValueError: an id or a frame that single precision does not hold.
+        TracklakeError: an id or a frame that single precision does not hold.
     """
     for name in ("track_id", "frame"):
         highest = clock[name].max()
         if isinstance(highest, int) and highest > LARGEST_WHOLE:
-            raise ValueError(
+            raise TracklakeError(
                 f"{name} {highest}: the .mat files hold ids and frames in single precision, which tells whole numbers "
                 f"apart up to {LARGEST_WHOLE:,}; correct the ids of this recording, or leave it out"
             )

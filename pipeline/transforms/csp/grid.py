@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tracklake.pipeline.transforms.csp.entries import CspEntries, Ints, Singles
 from tracklake.pipeline.transforms.csp.parts import Parts
 from tracklake.pipeline.transforms.samples.neighbors import find_neighbors
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.samples import CELLS
 
 ROWS = 13
@@ -31,7 +32,7 @@ class OverwritingGrid:
         entries: of one subset.
 
     Raises:
-        ValueError: frames and lanes span more than 31 bits hold.
+        TracklakeError: frames and lanes span more than 31 bits hold.
     """
 
     def __init__(self, entries: CspEntries) -> None:
@@ -180,7 +181,7 @@ def _group_by_lane(entries: CspEntries) -> NDArray[np.int32]:
     lanes = int(lane.max() - lane.min()) + 2
     group = (frame - frame.min()) * lanes + (lane - lane.min())
     if int(group.max()) >= (1 << 31) - 2:
-        raise ValueError(
+        raise TracklakeError(
             f"frames {frame.min()} to {frame.max()} and lanes {lane.min()} to {lane.max()} are too wide a span to "
             "search for neighbors; correct this recording, or leave it out"
         )

@@ -7,6 +7,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.samples.threads import map_in_threads
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.samples import CELLS
 
 ROWS = 13
@@ -86,7 +87,7 @@ def find_neighbors(clock: pl.DataFrame, origins: NDArray[np.bool_] | None = None
         origins: (N,) rows of the clock whose neighbors are wanted; None = all. Every row can be a neighbor.
 
     Raises:
-        ValueError: ticks, lanes and positions span more than 64 bits hold.
+        TracklakeError: ticks, lanes and positions span more than 64 bits hold.
     """
     has_lane = clock["lane"].is_not_null()
     if not has_lane.all():
@@ -131,7 +132,7 @@ def _lay_out(clock: pl.DataFrame) -> _Line:
     lanes = int(lane.max()) - int(lane.min()) + 3
     stretch = round((float(x_m.max()) - float(x_m.min())) * UNITS_PER_M) + REACH_UNITS + 2
     if (int(tick.max()) - int(tick.min()) + 1) * lanes * stretch >= 1 << 62:
-        raise ValueError(
+        raise TracklakeError(
             f"ticks {tick.min()} to {tick.max()}, lanes {lane.min()} to {lane.max()} and x_m {x_m.min()} to "
             f"{x_m.max()} are too wide a span to search for neighbors: pass the entries of one recording at a time"
         )

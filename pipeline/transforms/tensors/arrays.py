@@ -16,6 +16,7 @@ from tracklake.pipeline.transforms.tensors.positions import store_positions
 from tracklake.pipeline.transforms.tensors.scenes import find_scenes
 from tracklake.pipeline.transforms.tensors.vehicle_facts import find_sizes, mark_findings
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS, MOST_TICKS, POSITION_STORAGES, Array
 
@@ -225,11 +226,11 @@ def join_after(arrays: Arrays, before: Mapping[str, int], subset_index: int) -> 
         out where the ones before end with it (unless this is the first subset).
 
     Raises:
-        ValueError: rows, samples or pairs are too many for their numbers.
+        TracklakeError: rows, samples or pairs are too many for their numbers.
     """
     sizes = count_sizes(arrays)
     if max(before["N"] + sizes["N"], before["S"] + sizes["S"]) > MOST_ROWS:
-        raise ValueError(f"more than {MOST_ROWS:,} rows or samples in one split: exclude recordings from it")
+        raise TracklakeError(f"more than {MOST_ROWS:,} rows or samples in one split: exclude recordings from it")
     return {array.name: _shift(array, arrays[array.name], before, subset_index) for array in ARRAYS}
 
 

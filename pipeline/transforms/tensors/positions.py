@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import STEPS_M
 
 REACH = 2**15 - 1
@@ -40,7 +41,7 @@ def store_positions(x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64], 
         where: the subset, for messages.
 
     Raises:
-        ValueError: a position lies farther from the median than int16 reaches in the storage's steps.
+        TracklakeError: a position lies farther from the median than int16 reaches in the storage's steps.
 
     Source: DESIGN section 9 (decimetres around the median; centimetres only where they fit, else refused).
     """
@@ -57,7 +58,7 @@ def store_positions(x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64], 
         for axis, name in enumerate((_ALONG, _ACROSS)):
             farthest = float(np.abs(counted[:, axis]).max(initial=0.0))
             if farthest > REACH:
-                raise ValueError(
+                raise TracklakeError(
                     f"{where}: positions {name} reach {farthest * step[axis]:.2f} m from the median; int16 in steps of "
                     f"{step[axis]:g} m reaches {REACH * step[axis]:.2f} m. Set `tensor_positions` to int16-decimetres "
                     "or float32."

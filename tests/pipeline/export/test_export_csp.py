@@ -17,6 +17,7 @@ from tracklake.pipeline.lake import LakeMissingError, load, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import SAMPLES, VEHICLES
+from tracklake.schemas.errors import FileAccessError
 
 NEEDED_BY_CLEAN = ("validate", "repair", "samples", "split")
 
@@ -241,7 +242,7 @@ def test_a_failure_leaves_nothing(ngsim, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(csp, "write_card", fail)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(FileAccessError, match="No space left"):
         export_csp(Settings(lake=ngsim), tmp_path / "out", CspOptions())
     assert list(tmp_path.iterdir()) == []
 

@@ -21,6 +21,7 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SPLITS, TRACKS
+from tracklake.schemas.errors import FileAccessError
 
 STAGES = ("validate", "repair", "samples", "split", "tensors")
 NAMES = {"train.parquet", "val.parquet", "eval.parquet", "README.md"}
@@ -218,7 +219,7 @@ def test_a_failure_leaves_nothing(lake, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("tracklake.pipeline.export.windows.card.write_card", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(FileAccessError, match="disk full"):
         export_windows(Settings(lake=lake), tmp_path / "out", "npz")
     assert list(tmp_path.iterdir()) == []
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tracklake.pipeline.export.folder import ExportError, refuse_taken, write_files
+from tracklake.schemas.errors import FileAccessError
 
 NAMES = ("a", "b", "c")
 
@@ -75,7 +76,7 @@ def test_a_rename_that_fails_undoes_the_others(tmp_path, monkeypatch, step, afte
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Path, "replace", fail)
-    with pytest.raises((OSError, KeyboardInterrupt)):
+    with pytest.raises((FileAccessError, KeyboardInterrupt)):
         write_files(tmp_path, NAMES, write_new)
     assert contents(tmp_path) == old
     monkeypatch.setattr(Path, "replace", real)

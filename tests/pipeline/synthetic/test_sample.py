@@ -9,6 +9,7 @@ import pytest
 from tracklake.pipeline import synthetic as sample
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
+from tracklake.schemas.errors import UsageError
 
 MINUTES = 0.25
 
@@ -233,25 +234,25 @@ def test_traffic_is_lively(written):
     ],
 )
 def test_bad_arguments(tmp_path, arguments, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises(UsageError, match=re.escape(message)):
         write_sample(tmp_path / "out", **arguments)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, written):
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"is not empty and holds no sample \(truth.parquet is missing\)"):
+    with pytest.raises(UsageError, match=r"is not empty and holds no sample \(truth.parquet is missing\)"):
         write_sample(tmp_path)
     (tmp_path / "truth.parquet").write_bytes((written[0] / "truth.parquet").read_bytes())
-    with pytest.raises(ValueError, match=r"but also thesis\.txt, which would be lost"):
+    with pytest.raises(UsageError, match=r"but also thesis\.txt, which would be lost"):
         write_sample(tmp_path)
     (tmp_path / "truth.parquet").write_text("no parquet")
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(UsageError, match="cannot be read"):
         write_sample(tmp_path)
     pl.DataFrame({"a": [1]}).write_parquet(tmp_path / "truth.parquet")
-    with pytest.raises(ValueError, match="not that of a sample"):
+    with pytest.raises(UsageError, match="not that of a sample"):
         write_sample(tmp_path)
-    with pytest.raises(ValueError, match="is a file"):
+    with pytest.raises(UsageError, match="is a file"):
         write_sample(tmp_path / "thesis.txt")
     assert (tmp_path / "thesis.txt").read_text() == "mine"
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tracklake.pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, cut_runs, find_stride, put_on_clock
+from tracklake.schemas.errors import TracklakeError
 
 INT32_MAX = 2**31 - 1
 
@@ -105,7 +106,7 @@ def test_no_tracks():
 
 
 def test_clock_faster_than_the_source_is_refused():
-    with pytest.raises(ValueError, match=r"10 Hz tracks on a 25 Hz clock.*at most 10 Hz"):
+    with pytest.raises(TracklakeError, match=r"10 Hz tracks on a 25 Hz clock.*at most 10 Hz"):
         put_on_clock(make_tracks([]), first_frame=1, frame_rate_hz=10.0, rate_hz=25)
 
 

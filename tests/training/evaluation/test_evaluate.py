@@ -16,7 +16,8 @@ from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import EmptyPartError, evaluate, measure_errors
 from tracklake.training.models.constant_velocity import ConstantVelocity
-from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
+from tracklake.training.runs.forecasters import UnknownRunError
 
 BOTH = pl.concat([split_row("a", "train"), split_row("b", "eval")])
 
@@ -220,7 +221,7 @@ def test_a_density_that_is_none_is_refused(tmp_path):
         return Density(ones[:, :, 0], np.zeros((*ones.shape, 2)), np.zeros((*ones.shape, 2)), 0.0 * ones)
 
     folder = TensorFolder.open(two_samples(tmp_path))
-    with pytest.raises(ValueError, match="`flat` predicts densities that are not finite"):
+    with pytest.raises(NotFiniteError, match="`flat` predicts densities that are not finite"):
         measure_errors(Says(density=flat), folder, "eval", name="flat")
 
 
@@ -271,7 +272,7 @@ def test_an_empty_part_is_explained(tmp_path):
 
 def test_predictions_that_are_not_numbers_are_refused(tmp_path):
     folder = TensorFolder.open(two_samples(tmp_path))
-    with pytest.raises(ValueError, match="`nan` predicts positions that are not finite"):
+    with pytest.raises(NotFiniteError, match="`nan` predicts positions that are not finite"):
         measure_errors(Says(np.nan), folder, "eval", name="nan")
 
 
@@ -279,9 +280,11 @@ def test_unknown_and_untrained_models(tmp_path):
     tensors = two_samples(tmp_path / "tensors")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").touch()
-    with pytest.raises(ValueError, match=r"no run or model `cv`: expected one of the runs mine, .*constant-velocity"):
+    with pytest.raises(
+        UnknownRunError, match=r"no run or model `cv`: expected one of the runs mine, .*constant-velocity"
+    ):
         evaluate("cv", tensors, tmp_path)
-    with pytest.raises(FileNotFoundError, match="no trained run; run `tracklake train lstm` first"):
+    with pytest.raises(UnknownRunError, match="no trained run; run `tracklake train lstm` first"):
         evaluate("lstm", tensors, tmp_path)
 
 
@@ -290,12 +293,13 @@ import sys
 sys.modules["torch"] = None  # importing it now fails as if it were not installed
 from pathlib import Path
 from tracklake.training.evaluation.evaluate import evaluate
+from tracklake.schemas.errors import MissingExtraError
 from tracklake.training.train import train
 tensors, models = map(Path, sys.argv[1:])
 print(evaluate("constant-velocity", tensors, models).samples)
 try:
     train("lstm", tensors, models / "lstm")
-except ImportError as error:
+except MissingExtraError as error:
     print(error)
 """
 

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from tensor_tables import TINY, drive, random_clock, sample_everything, split_row, write
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS, MOST_TICKS
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -249,7 +250,7 @@ def test_a_model_that_never_says_the_same_cannot_be_checked(folder):
             said = super().predict(observed).position_m
             return Prediction(said + np.random.default_rng().normal(size=said.shape))
 
-    with pytest.raises(ValueError, match=r"`dreams` predicts otherwise each time it is asked .*fix its seed"):
+    with pytest.raises(TracklakeError, match=r"`dreams` predicts otherwise each time it is asked .*fix its seed"):
         measure_errors(Dreams(), folder, "eval", name="dreams")
 
 

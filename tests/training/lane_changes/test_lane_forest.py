@@ -12,6 +12,7 @@ from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, random_examples, tr
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.nearest_vehicles import gather_surroundings
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
@@ -310,13 +311,13 @@ def test_without_evaluation_recordings_the_forest_stays_and_the_curve_is_explain
 
 def test_what_cannot_be_learned_from_is_refused(tmp_path):
     still = open_tracks(tmp_path / "still", {"a": track(1, [2.0] * 30)})
-    with pytest.raises(ValueError, match=r"needs samples .* some that change it; got .*\(0 lane changes in all\)"):
+    with pytest.raises(TracklakeError, match=r"needs samples .* some that change it; got .*\(0 lane changes in all\)"):
         fit_lane_forest(still, 0, FEW)
     short = open_tracks(tmp_path / "short", {"a": track(1, [2.0, 6.0] * 3)})
-    with pytest.raises(ValueError, match=r"needs samples .*5 lane changes in all"):
+    with pytest.raises(TracklakeError, match=r"needs samples .*5 lane changes in all"):
         fit_lane_forest(short, 0, FEW)
     nothing = Examples(np.zeros((9, len(FEATURES)), np.float32), np.zeros(9, np.uint8), np.zeros((9, 2), np.uint8))
-    with pytest.raises(ValueError, match=r"no feature correlates with the maneuver by 0\.05 or more"):
+    with pytest.raises(TracklakeError, match=r"no feature correlates with the maneuver by 0\.05 or more"):
         grow(nothing, FEW, 0, rate_hz=10, horizons_s=HORIZONS_S)
 
 
@@ -331,7 +332,7 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path):
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UsageError, match=message):
         LaneForestSettings(**wrong)
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lane_tracks import CODES, SHORT, open_tracks, track
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
@@ -18,6 +19,7 @@ from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, judge_sam
 from tracklake.training.lane_changes.forest import LaneForest
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
+from tracklake.training.runs.run_folder import StaleRunError
 
 LANES = np.array([[[-3.5, 3.0, 1], [0.5, 4.0, 1], [4.5, 4.0, 1]]], np.float32)
 """The own lane reaches from -1.5 to 2.5 m; so one lane's width to the left ends at -5.5 m, to the right at 6.5 m."""
@@ -172,7 +174,7 @@ class Short:
 def test_places_that_are_none_are_refused_or_their_model_is_passed_by(one_change, model, message):
     """A cell of NaN would be the middle one."""
     forest, straight = constant_forest("k", "k", "k", "k"), {"straight": ConstantVelocity(SHORT)}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(TracklakeError, match=message):
         evaluate_grid(one_change, {"wrong": model}, forest)
     told = []
     scores = evaluate_grid(
@@ -206,11 +208,11 @@ def test_a_forest_that_sees_the_future_is_found_out(one_change):
 
 
 def test_a_forest_for_others_is_refused(one_change):
-    with pytest.raises(ValueError, match=r"fitted at 2 Hz for horizons of \(0.5, 1.0, 3.0\) s; .* Fit it again"):
+    with pytest.raises(TracklakeError, match=r"fitted at 2 Hz for horizons of \(0.5, 1.0, 3.0\) s; .* Fit it again"):
         evaluate_grid(one_change, {}, constant_forest("k", "k", "k", "k", horizons_s=(0.5, 1.0, 3.0)))
     knows = constant_forest("k", "k", "k", "k")
     knows.facts["train_subsets"] = ["highd/a"]
-    with pytest.raises(ValueError, match=r"highd/a\) were in its training part"):
+    with pytest.raises(StaleRunError, match=r"highd/a\) were in its training part"):
         evaluate_grid(one_change, {}, knows)
 
 
@@ -268,9 +270,11 @@ def test_the_learning_curve(busy):
 
 def test_no_curve_without_an_evaluation_part(tmp_path):
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2.0] * 20)})
-    with pytest.raises(ValueError, match=r"split `mine` has no samples in `eval`; with a single recording everything"):
+    with pytest.raises(
+        TracklakeError, match=r"split `mine` has no samples in `eval`; with a single recording everything"
+    ):
         learn_curve(folder, settings=SMALL)
     brief = {"a": track(1, [2.0] * 20), "b": track(1, [2.0] * 5)}
     folder = open_tracks(tmp_path / "brief", brief, parts={"b": "eval"})
-    with pytest.raises(ValueError, match=r"no sample of eval has a lane and a track"):
+    with pytest.raises(TracklakeError, match=r"no sample of eval has a lane and a track"):
         learn_curve(folder, settings=SMALL)

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from slow_attention import restate
 from wandering_scenes import change, pad, reorder, wander
 
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.models.attention_layers import MultiHeadAttention
@@ -328,5 +329,5 @@ def test_what_makes_no_sense_is_refused():
     observed, truth = (to_tensors(arrays) for arrays in wander(1, 1, 2))
     with pytest.raises(ValueError, match="unknown phase `mse`"):
         build().loss(observed, truth, "mse")
-    with pytest.raises(ValueError, match="0 heads"):
+    with pytest.raises(UsageError, match="0 heads"):
         find_model("attention-h4").build(CSP, heads=0)

@@ -62,7 +62,7 @@ def test_every_sample_is_found_where_it_is(many):
     ],
 )
 def test_what_is_not_there_is_told_with_what_is(folder, vehicle, time_s, told):
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(NoSampleError, match=told):
         find_sample(folder, vehicle, time_s)
 
 

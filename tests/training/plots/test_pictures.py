@@ -9,10 +9,10 @@ from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M
 from lane_tracks import open_tracks, track
 
 from tracklake.training.data.observed import FutureInputError, ObservedScene
-from tracklake.training.models.prediction import Prediction
+from tracklake.training.models.prediction import NotFiniteError, Prediction
 from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
 from tracklake.training.plots.picture import take_picture
-from tracklake.training.runs.forecasters import Forecaster, open_forecaster
+from tracklake.training.runs.forecasters import Forecaster, UnknownRunError, open_forecaster
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def test_models_are_not_shown_what_came(folder):
 
 
 def test_places_that_are_no_numbers_are_refused(folder):
-    with pytest.raises(ValueError, match="`nan` predicts positions that are not finite numbers"):
+    with pytest.raises(NotFiniteError, match="`nan` predicts positions that are not finite numbers"):
         forecast_samples(folder, [OWN_SAMPLE], [Forecaster("nan", Nowhere(), "grid")])
 
 
@@ -187,8 +187,8 @@ def test_names_of_no_model_or_run_are_told_what_there_is(folder, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").touch()
     with pytest.raises(
-        ValueError, match=r"no run or model `cv`: expected one of the runs mine, or of .*constant-velocity"
+        UnknownRunError, match=r"no run or model `cv`: expected one of the runs mine, or of .*constant-velocity"
     ):
         open_forecaster("cv", folder, tmp_path, frozenset({"eval"}))
-    with pytest.raises(FileNotFoundError, match="run `tracklake train lstm` first"):
+    with pytest.raises(UnknownRunError, match="run `tracklake train lstm` first"):
         open_forecaster("lstm", folder, tmp_path, frozenset({"eval"}))

@@ -14,6 +14,7 @@ from tracklake.pipeline.transforms.csp.grid import CHUNK_ROWS
 from tracklake.pipeline.transforms.csp.parts import TEST, TRAIN, VAL, count_rows, number_datasets, part_by_id
 from tracklake.pipeline.transforms.csp.subset import Recorded, prepare_as_original, put_on_csp_clock, stack_tracks
 from tracklake.schemas.columns import FOOT_M
+from tracklake.schemas.errors import TracklakeError
 
 DTYPES = {
     "vehicle_id": pl.Int32, "frame": pl.Int32, "x_m": pl.Float64, "y_m": pl.Float64, "lane": pl.Int16,
@@ -263,9 +264,9 @@ def test_nobody_is_called_zero():
 
 
 def test_what_single_precision_cannot_tell_apart_is_refused():
-    with pytest.raises(ValueError, match=r"track_id 16777217.*up to 16,777,216"):
+    with pytest.raises(TracklakeError, match=r"track_id 16777217.*up to 16,777,216"):
         prepare(drive((1 << 24) + 1, range(3)))
-    with pytest.raises(ValueError, match="frame 2147483647"):
+    with pytest.raises(TracklakeError, match="frame 2147483647"):
         prepare(drive(1, [2**31 - 2, 2**31 - 1]))
 
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.samples import neighbors as module
 from tracklake.pipeline.transforms.samples.neighbors import NEIGHBOR_DTYPES, find_neighbors
+from tracklake.schemas.errors import TracklakeError
 
 CELL_M = Fraction("4.572")
 REACH_M = Fraction("27.432")
@@ -163,7 +164,9 @@ def test_no_entries_and_one_entry():
 
 def test_too_wide_a_span_is_refused():
     clock = make_clock([(1, 0, 0.0, 1), (2, INT32_MAX, 20_000.0, 1)])
-    with pytest.raises(ValueError, match="too wide a span to search for neighbors: pass the entries of one recording"):
+    with pytest.raises(
+        TracklakeError, match="too wide a span to search for neighbors: pass the entries of one recording"
+    ):
         find_neighbors(clock)
 
 

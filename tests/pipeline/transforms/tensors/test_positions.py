@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.tensors.positions import store_positions
+from tracklake.schemas.errors import TracklakeError
 
 STEPS = {"int16-decimetres": 0.1, "int16-centimetres": 0.01}
 
@@ -43,10 +44,10 @@ def test_what_is_read_back_errs_by_half_a_step_at_most(x_m, y_m, storage):
 
 def test_roads_that_centimetres_do_not_reach_are_refused():
     x_m = np.array([0.0, 400.0, 800.0])
-    with pytest.raises(ValueError, match=r"a/b: positions along the road reach 400.00 m from the median; int16 in"):
+    with pytest.raises(TracklakeError, match=r"a/b: positions along the road reach 400.00 m from the median; int16 in"):
         store_positions(x_m, np.zeros(3), storage="int16-centimetres", where="a/b")
     assert store_positions(x_m, np.zeros(3), storage="int16-decimetres", where="a/b").max_error_m == (0, 0)
-    with pytest.raises(ValueError, match=r"positions across it reach 40.00 m .* of 0.001 m reaches 32.77 m"):
+    with pytest.raises(TracklakeError, match=r"positions across it reach 40.00 m .* of 0.001 m reaches 32.77 m"):
         store_positions(np.zeros(3), np.array([0.0, 0.0, 40.0]), storage="int16-decimetres", where="a/b")
 
 

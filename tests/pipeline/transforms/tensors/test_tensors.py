@@ -9,6 +9,7 @@ import pytest
 
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.transforms.tensors.arrays import build_subset_tensors, count_sizes, join_after
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.findings import FINDINGS
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
@@ -202,7 +203,7 @@ def test_joined_subsets_shift_rows_and_offsets():
 
 
 def test_more_rows_than_their_numbers_hold_are_refused():
-    with pytest.raises(ValueError, match="more than 2,147,483,647 rows or samples"):
+    with pytest.raises(TracklakeError, match="more than 2,147,483,647 rows or samples"):
         join_after(build(), dict.fromkeys("NRSKCM", 2**31 - 5), 1)
 
 
