@@ -10,6 +10,7 @@ import typer
 
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
 from tracklake.pipeline.cli.session import REFUSED, command, read_settings
+from tracklake.schemas.errors import TracklakeError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 FOLDER = "lane-forest"
 """Of the lake's models."""
-FOREST, SCORES = "forest.npz", "lane_forest.json"
+FOREST, SCORES = "forest.skops", "lane_forest.json"
 """The scores are not called as those of a run: they are of cells, and the report's are of places."""
 MODELS_BESIDE = ("constant-velocity", "ctrv")
 """They need no training."""
@@ -94,7 +95,7 @@ def lane_forest(
 
         predictors, reads = _find_predictors(settings.lake / MODELS, folder, runs or [], pass_by)
         try:
-            scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
+            scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=pass_by)
         except FutureInputError as leak:
             raise ValueError(str(leak)) from leak
         record = {
@@ -110,7 +111,7 @@ def lane_forest(
         if learning_curve:
             try:
                 curve = learn_curve(folder, settings=asked)
-            except ValueError as impossible:
+            except TracklakeError as impossible:
                 no_curve = str(impossible)
             else:
                 record["learning_curve"] = [point.to_dict() for point in curve]
@@ -137,7 +138,7 @@ def _read_settings(examples: int | None, augment: bool | None, pairs: list[str])
         given["augmentation"] = ()
     try:
         return LaneForestSettings(**given)
-    except ValueError as wrong:
+    except UsageError as wrong:
         raise typer.BadParameter(f"--set {wrong}") from None
 
 
@@ -235,7 +236,7 @@ def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
 
 def _show_cells(terminal: "Terminal", cells: "list[CellScore]", protocol: str) -> None:
     from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-    from tracklake.training.lane_changes.grid import ALL
+    from tracklake.training.lane_changes.examples import ALL
 
     horizons = sorted({own.seconds for own in cells})
     strata = list(dict.fromkeys(own.stratum for own in cells))

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from tracklake.schemas.errors import TracklakeError
+
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
     from tracklake.pipeline.ingest.discovery import Discovery
@@ -52,7 +54,7 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
     except BrokenPipeError:
         # Whoever read our output has seen enough; Python must not complain about it once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError, ImportError) as error:
+    except (TracklakeError, ValueError, OSError, ImportError) as error:
         raise failure(terminal, str(error)) from None
     except KeyboardInterrupt:
         told = "interrupted; what was committed stays; run the same command again"
