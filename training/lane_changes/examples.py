@@ -102,7 +102,7 @@ class Examples:
         return Examples(self.feature[which], self.maneuver[which], self.ahead[which])
 
     def augment(self, settings: LaneForestSettings, random: np.random.Generator) -> "Examples":
-        """Append a mirrored and a shifted copy of all examples, as the settings say."""
+        """Append a mirrored and a shifted copy of all examples, as set."""
         copies = [self]
         if "mirror" in settings.augmentation:
             swapped = SWAPPED.astype(np.uint8)  # left is right on the mirrored road

@@ -37,7 +37,7 @@ TRUSTED = ("sklearn.tree._tree.Tree",)
 """Types a file may hold besides those skops trusts by itself. skops does not trust trees, because scikit-learn follows
 their node numbers unchecked; `_check_classifier` checks them."""
 FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
-"""Facts every forest holds, and their types: they say what it may be scored on."""
+"""Facts every forest holds, by type: they determine what it may be scored on."""
 AGAIN = "; run `tracklake lane-forest` again"
 """End of every message about a file that cannot be used."""
 

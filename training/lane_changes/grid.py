@@ -139,15 +139,15 @@ def evaluate_grid(
 ) -> GridScores:
     """Score models by the cells of their predicted places, at every horizon of the forest.
 
-    Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those whose
-    maneuver and whole future are known (`examples.label_samples`, with the forest's T_d).
+    Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
+    `examples.label_samples`, with the forest's T_d.
 
     Args:
         folder: tensors of the protocol that forest and models were made for.
         predictors: models by name.
         forest: fitted forest.
         part: train, val or eval.
-        reads: input of each model; where a name is missing, the registry's, or else `grid`.
+        reads: input of each model; by default as in the registry, or else `grid`.
         most: largest number of samples.
         seed: seed of the draw where there are more.
         on_skip: called with the name of a model that cannot be scored, and the reason. None: the first one is raised.
@@ -155,8 +155,7 @@ def evaluate_grid(
     Raises:
         FutureInputError: the forest or a model sees the future.
         TracklakeError: the forest was fitted on subsets of this part, at another rate, or for horizons that the folder
-            does not score; or a model predicts places that are not finite, or not of the horizon's shape.
-        ValueError: no such part.
+            does not score; or see `predict_places`.
     """
     ticks = _find_ticks(folder, forest)
     refuse_leak(forest.facts, folder, part)
@@ -170,22 +169,21 @@ def evaluate_grid(
     decided = decide_classes(forest.predict_proba(targets.feature))  # (S, 1 + T)
     forest_column = COLUMNS[decided[:, 1:]]
     strata = samples.find_strata()
+    inputs = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
     cells: list[CellScore] = []
     for name, predictor in predictors.items() if len(samples) else ():
-        default: Reads = MODELS[name].reads if name in MODELS else "grid"
-        own_reads = (reads or {}).get(name, default)
         try:
-            refuse_future(predictor, folder, part, name=name, reads=own_reads)
-            place_m = predict_places(folder, samples.sample, predictor, ticks, name=name, reads=own_reads)
+            refuse_future(predictor, folder, part, name=name, reads=inputs[name])
+            place_m = predict_places(folder, samples.sample, predictor, ticks, name=name, reads=inputs[name])
         except (TracklakeError, FutureInputError, ValueError) as refused:
             if on_skip is None:
                 raise
             on_skip(name, str(refused))
             continue
         own = find_cells(place_m, straight_m, targets)
-        cells += _score_cells(name, "place", own, true, forest.horizons_s, strata)
         joined = np.stack([forest_column, own[..., 1]], axis=-1)
-        cells += _score_cells(name, "forest", joined, true, forest.horizons_s, strata)
+        for source, predicted in (("place", own), ("forest", joined)):
+            cells += _score_cells(name, source, predicted, true, forest.horizons_s, strata)
     maneuvers = [score_maneuvers(name, decided[of, 0], samples.maneuver[of]) for name, of in strata.items()]
     return GridScores(cells, maneuvers, found.left_out, found.reasons)
 

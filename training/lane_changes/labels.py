@@ -94,8 +94,8 @@ def label_rows(folder: TensorFolder, maneuvers: Maneuvers) -> Bytes:
 def find_labelled(folder: TensorFolder, row: npt.NDArray[np.integer], *, start_s: float = START_S) -> Flags:
     """Find rows (B,) whose label can be known: their run goes on for T_d, so that a change would have been recorded.
 
-    Nearer to a track's end, keeping cannot be told from a change that is recorded too late. Such rows are left out
-    whatever their label, or changes would be too frequent among them.
+    Nearer to a track's end, keeping looks the same as a change that comes too late to be recorded. Such rows are left
+    out whatever their label, or changes would be too frequent among them.
     """
     last = folder.run_first_row[folder.runs_of(row) + 1] - 1
     labelled: Flags = last - row >= _count_start_ticks(folder, start_s)
