@@ -10,6 +10,7 @@ import typer
 
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
 from tracklake.pipeline.cli.session import REFUSED, command, read_settings
+from tracklake.schemas.errors import TracklakeError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 FOLDER = "lane-forest"
 """Of the lake's models."""
-FOREST, SCORES = "forest.npz", "lane_forest.json"
+FOREST, SCORES = "forest.skops", "lane_forest.json"
 """The scores are not called as those of a run: they are of cells, and the report's are of places."""
 MODELS_BESIDE = ("constant-velocity", "ctrv")
 """They need no training."""
@@ -94,7 +95,7 @@ def lane_forest(
             terminal.complain(f"{name}: {why}", label="passed by")
 
         predictors, reads = _find_predictors(settings.lake / MODELS, folder, runs or [], pass_by)
-        scores = evaluate_grid(folder, predictors, forest, reads=reads, pass_by=pass_by)
+        scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=pass_by)
         record = {
             "forest": forest.facts,
             "features": list(forest.names),
@@ -125,7 +126,6 @@ def _read_settings(examples: int | None, augment: bool | None, pairs: list[str])
     """What was said of the forest; the rest is as it is by itself."""
     from dataclasses import asdict
 
-    from tracklake.schemas.errors import UsageError
     from tracklake.training.lane_changes import LaneForestSettings
 
     known = {name: value for name, value in asdict(LaneForestSettings()).items() if name not in OPTIONS_OF_THEIR_OWN}
@@ -170,7 +170,6 @@ def _find_predictors(
     was asked for by name.
     """
     from tracklake.pipeline.stages.score import finished_runs
-    from tracklake.schemas.errors import TracklakeError
     from tracklake.training.models import MODELS
     from tracklake.training.runs.forecasters import open_forecaster
 
@@ -235,7 +234,7 @@ def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
 
 def _show_cells(terminal: "Terminal", cells: "list[CellScore]", protocol: str) -> None:
     from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-    from tracklake.training.lane_changes.grid import ALL
+    from tracklake.training.lane_changes.examples import ALL
 
     horizons = sorted({own.seconds for own in cells})
     strata = list(dict.fromkeys(own.stratum for own in cells))

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from tracklake.schemas.errors import TracklakeError
+
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
     from tracklake.pipeline.ingest.discovery import Discovery
@@ -36,7 +38,7 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator["Terminal"]:
     from pydantic import ValidationError
 
     from tracklake.pipeline.cli.console import Terminal
-    from tracklake.schemas.errors import TracklakeError, describe_bug
+    from tracklake.schemas.errors import describe_bug
 
     terminal = Terminal(quiet=quiet, as_json=json)
     try:

@@ -9,7 +9,7 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import Examples
-from tracklake.training.lane_changes.features import FEATURES, NUMBER
+from tracklake.training.lane_changes.features import FEATURE_NUMBER, FEATURES
 
 SHORT = Protocol(
     name="short", rate_hz=2, history_s=1.0, horizon_s=2.0, min_future_s=0.5, scored_s=(0.5, 1.0, 2.0), split="mine"
@@ -66,7 +66,7 @@ def random_examples(seed, count, *, horizons=2):
     """Examples whose lateral speed tells their class, most of the time."""
     draw = np.random.default_rng(seed)
     feature = draw.normal(size=(count, len(FEATURES))).astype(np.float32)
-    lateral = feature[:, NUMBER["lateral_speed_mps"]]
+    lateral = feature[:, FEATURE_NUMBER["lateral_speed_mps"]]
     noisy = lateral + draw.normal(scale=0.3, size=count)
     maneuver = np.where(noisy < -0.7, CODES["l"], np.where(noisy > 0.7, CODES["r"], CODES["k"])).astype(np.uint8)
     ahead = np.repeat(maneuver[:, None], horizons, axis=1)

@@ -1,1 +1,1 @@
-"""How good predictions are: errors and densities summed up, the guard before them, and what others published."""
+"""Scores of predictions: errors and NLL, the check that comes before them, latency, and published figures."""

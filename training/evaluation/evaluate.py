@@ -1,4 +1,4 @@
-"""How a model or a trained run does on one part of a split, and with what evidence: samples and vehicles behind it."""
+"""Scores of a model or a trained run on one part of a split, and the samples and vehicles behind them."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,23 +21,23 @@ from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import open_forecaster
 
 BATCH_SIZE = 256
-"""Samples predicted at once; the errors do not depend on it. With 2,048, what the largest network computes leaves the
-cache, and it takes nearly twice as long."""
+"""Number of samples predicted at once; the errors do not depend on it. With 2,048, the largest network's values leave
+the cache, and it takes nearly twice as long."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a model does on one part of a split.
+    """Scores of a model on one part of a split.
 
     Args:
-        model: the run's or model's name.
+        model: name of the run or model.
         part: train, val or eval.
-        split: the split's name.
-        protocol: the protocol of the tensors.
-        samples: in the part.
-        vehicles: that they are of.
-        scores: by dataset, group, average and horizon.
-        nearest: vehicles around the ego that the model was shown, at most; None where it reads the grid.
+        split: name of the split.
+        protocol: protocol of the tensors.
+        samples: number of samples in the part.
+        vehicles: number of their vehicles.
+        scores: scores by dataset, group, average and horizon.
+        nearest: largest number of vehicles around the ego in the model's input; None where it reads the grid.
         latency: None where it was not measured.
     """
 
@@ -53,15 +53,15 @@ class Evaluation:
 
     @property
     def horizons(self) -> tuple[Score, ...]:
-        """Of everything, every sample counting the same: by increasing seconds."""
+        """Scores over all samples, each counting the same, by increasing seconds."""
         return tuple(
             own for own in self.scores if (own.dataset, own.group, own.average) == (EVERYTHING, EVERYTHING, "samples")
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON: `horizons` alone of the scores, without what is the same in all of them."""
-        same = ("dataset", "group", "average")
-        rows = [{name: value for name, value in asdict(own).items() if name not in same} for own in self.horizons]
+        """Convert to plain values for JSON; of the scores `horizons` alone, without the keys they share."""
+        shared = ("dataset", "group", "average")
+        rows = [{name: value for name, value in asdict(own).items() if name not in shared} for own in self.horizons]
         return {
             "model": self.model,
             "part": self.part,
@@ -73,8 +73,8 @@ class Evaluation:
         }
 
     def to_table(self) -> pl.DataFrame:
-        """As rows of `schemas.evaluations.EVALUATIONS`."""
-        of_all = {
+        """Convert to rows of `schemas.evaluations.EVALUATIONS`."""
+        shared = {
             "protocol": self.protocol.name,
             "protocol_digest": self.protocol.digest,
             "split": self.split,
@@ -86,13 +86,13 @@ class Evaluation:
         }
         latency = asdict(self.latency) if self.latency is not None else {}
         rows = [
-            of_all | asdict(own) | (latency if own.dataset == own.group == EVERYTHING else {}) for own in self.scores
+            shared | asdict(own) | (latency if own.dataset == own.group == EVERYTHING else {}) for own in self.scores
         ]
         return EVALUATIONS.empty() if not rows else pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
 
 
 class EmptyPartError(TracklakeError):
-    """The part asked for has no samples."""
+    """The part to evaluate has no samples."""
 
 
 def evaluate(
@@ -112,14 +112,14 @@ def evaluate(
         tensors: the tensor folder.
         models: the folder of the runs.
         part: train, val or eval.
-        nearest: vehicles around the ego that models of scenes are shown, at most.
-        with_latency: also measure how long a prediction takes.
-        every_tick: score at every tick of the horizon, not at the protocol's seconds alone.
+        nearest: largest number of vehicles around the ego in the input of models of scenes.
+        with_latency: whether to measure how long a prediction takes.
+        every_tick: whether to score every tick of the horizon, not the protocol's seconds alone.
 
     Raises:
-        TensorError: the tensors are absent or broken.
+        TensorError: the tensors are missing or damaged.
         EmptyPartError: the part has no samples.
-        StaleRunError: the run was trained for another protocol, or on subsets that stand in this part now; or it is
+        StaleRunError: the run was trained for another protocol, or on subsets that are in this part now; or it is
             unfinished or damaged.
         UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
         FutureInputError: the model sees what comes after the moment at which it predicts.
@@ -150,26 +150,26 @@ def measure_errors(
     """Predict every sample of a part and sum up the errors, after `training.evaluation.guard.refuse_future`.
 
     Args:
-        predictor: given what may be seen of the samples, and nothing else.
-        folder: the tensors.
+        predictor: model to score.
+        folder: tensors of the samples.
         part: train, val or eval.
-        name: what the model is called.
-        reads: what it is given.
-        nearest: of scenes: vehicles around the ego, at most.
-        seconds: horizons to score; None: the protocol's.
+        name: name of the model.
+        reads: input of the model.
+        nearest: largest number of vehicles around the ego in a scene.
+        seconds: horizons to score, s; None for the protocol's.
 
     Raises:
         EmptyPartError: the part has no samples.
         FutureInputError: the model sees what comes after the moment at which it predicts.
         NotFiniteError: a prediction is not a finite number.
-        ValueError: it is not of the horizon's shape.
+        TracklakeError: a prediction is not of the horizon's shape.
     """
     samples = folder.samples_of(part)
     if len(samples) == 0:
         counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in ("train", "val", "eval"))
         raise EmptyPartError(
             f"{folder.path}: the split `{folder.split}` has no samples in `{part}` (samples: {counts}); with a single "
-            "subset everything trains, and nothing honest can be evaluated: add recordings and run `tracklake split`"
+            "subset everything trains, and nothing is left to evaluate on: add recordings and run `tracklake split`"
         )
     refuse_future(predictor, folder, part, name=name, reads=reads, nearest=nearest)
     strata, protocol = find_strata(folder, samples), folder.protocol
@@ -180,8 +180,7 @@ def measure_errors(
         tally.add(strata.of_sample[chosen], predictor.predict(observed), truth_of_ego(truth))
     for what, sums in tally.sums.items():
         if not np.isfinite(sums).all():
-            said = "densities" if what == "nll" else "positions"
-            raise NotFiniteError(name, said)
+            raise NotFiniteError(name, "densities" if what == "nll" else "positions")
     at = seconds if seconds is not None else [tick / protocol.rate_hz for tick in protocol.scored_ticks]
     return Evaluation(
         model=name,

@@ -1,4 +1,4 @@
-"""How long a model takes to predict one moment."""
+"""Time a model takes to predict one moment."""
 
 import sys
 import time
@@ -9,21 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.guard import choose_moments, samples_of_scene
+from tracklake.training.evaluation.guard import choose_moments, find_scene_samples
 from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.inputs import NEAREST, read_samples
 
 MOMENTS = 20
-"""Of which the median is taken."""
+"""Number of moments that the median is taken of."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """How long one moment takes, on one thread.
+    """Time per moment on one thread.
 
     Args:
-        latency_ms: median time to predict all samples of a moment at once; reading them is not counted.
-        latency_samples: median number of them.
+        latency_ms: median time to predict all samples of a moment at once, without reading them, ms.
+        latency_samples: median number of these samples.
     """
 
     latency_ms: float
@@ -33,18 +33,11 @@ class Latency:
 def measure_latency(
     predictor: Predictor, folder: TensorFolder, part: str, *, reads: Reads = "grid", nearest: int = NEAREST
 ) -> Latency:
-    """Predict some moments of a part, evenly spread over it, each by itself. The first one is predicted twice.
-
-    Raises:
-        ValueError: the part has no samples.
-    """
-    scenes = choose_moments(folder, part, MOMENTS)
-    if len(scenes) == 0:
-        raise ValueError(f"{folder.path}: no moment of `{part}` to measure")
+    """Predict some moments of a part, evenly spread over it, each by itself; the part has samples."""
     spent, counts = [], []
-    with _one_thread():
-        for number, scene in enumerate(scenes):
-            samples = samples_of_scene(folder, scene)
+    with _use_one_thread():
+        for number, scene in enumerate(choose_moments(folder, part, MOMENTS)):
+            samples = find_scene_samples(folder, scene)
             observed, _ = read_samples(folder, samples, reads, nearest=nearest)
             if number == 0:
                 predictor.predict(observed)  # the first call prepares what later ones use
@@ -56,8 +49,8 @@ def measure_latency(
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch computes on one thread meanwhile, where it is in use at all."""
+def _use_one_thread() -> Iterator[None]:
+    """Let torch compute on one thread for a while, if it is in use at all."""
     torch = sys.modules.get("torch")
     if torch is None:
         yield

@@ -1,7 +1,7 @@
-"""Figures that others published, to stand beside measured ones and never among them.
+"""Figures that others published, shown beside measured ones and never among them.
 
-They are of other data, other splits and other ways to count, and are copied here as printed. What a publication does
-not say (how many samples, likelihoods in our unit) stays null.
+They come from other data, other splits and other ways to count, and are copied as printed. What a publication does not
+state (the number of samples, NLL in our unit) stays null.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ CHOI_2021 = (
 )
 
 OWN_DATA = "own"
-"""The dataset of figures on recordings that only their authors have."""
+"""Name of the dataset of figures on recordings that only their authors have."""
 
 _SECONDS = (1.0, 2.0, 3.0, 4.0, 5.0)
 _HALVES = (0.5, 1.0, 1.5, 2.0)
@@ -48,12 +48,12 @@ class Published:
     """One line of a published table.
 
     Args:
-        model: the registry's name of it; the publication's where the registry has none.
-        reference: where it stands.
+        model: name in the registry, or in the publication where the registry has no such model.
+        reference: publication.
         dataset: ngsim, highd, or own (the authors').
-        protocols: that it is put beside.
-        seconds: horizons.
-        figures: by column of `schemas.evaluations.FIGURES`, a value for each horizon.
+        protocols: protocols whose figures it is shown beside.
+        seconds: horizons, s.
+        figures: a value for each horizon, by column of `schemas.evaluations.FIGURES`.
     """
 
     model: str
@@ -65,19 +65,19 @@ class Published:
 
 
 def _rmse(model: str, reference: str, dataset: str, *rmse_m: float) -> Published:
-    """Radial errors at 1 to 5 s; on NGSIM by the ids' split, on highD by flow."""
+    """Make a line of radial errors at 1 to 5 s; on NGSIM split by ids, on highD by flow."""
     protocol = "csp-2018" if dataset == "ngsim" else "highd-flow-balanced"
     return Published(model, reference, dataset, ("csp", protocol), _SECONDS, {"rmse_m": rmse_m})
 
 
 def _both_axes(model: str, longitudinal: tuple[float, ...], lateral: tuple[float, ...]) -> Published:
-    """Errors along and across the road at 1 to 3 s."""
+    """Make a line of errors along and across the road at 1 to 3 s."""
     figures = {"rmse_longitudinal_m": longitudinal, "rmse_lateral_m": lateral}
     return Published(model, KIM_2020, "highd", ("mha-2020",), _SECONDS[:3], figures)
 
 
 def _mae(model: str, *mae_m: float) -> Published:
-    """Mean errors every half second."""
+    """Make a line of mean errors every half second."""
     return Published(model, CHOI_2021, OWN_DATA, ("grid-2021",), _HALVES, {"mae_m": mae_m})
 
 
@@ -101,26 +101,27 @@ PUBLISHED = (
     _mae("stacked-lstm", 0.62, 1.19, 1.42, 1.81),
     _mae("lstm-encoder-decoder", 0.58, 0.82, 1.23, 1.47),
 )
-"""Line by line. The validating study's own line is of the model with maneuvers: it gives braking accuracies as well."""
+"""Published lines. The validating study's own line is the model with maneuvers: it gives braking accuracies as well."""
 
 BRAKING_ACCURACY = {"ngsim": 0.8929, "highd": 0.9994}
-"""Of the validating study (longitudinal maneuvers), by dataset: put into its lines, the same at every horizon."""
+"""Accuracy of longitudinal maneuvers in the validating study, by dataset; the same at every horizon of its lines."""
 
 CELL_ACCURACY_S = _HALVES
+"""Horizons of CELL_ACCURACY, s."""
 CELL_ACCURACY: dict[str, tuple[float, ...]] = {
     "ctrv": (0.8721, 0.8832, 0.8224, 0.8093),
     "stacked-lstm": (0.8674, 0.8881, 0.8701, 0.8684),
     "lstm-encoder-decoder + forest": (0.8718, 0.8946, 0.9183, 0.9087),
 }
-"""Share of instances put into the right one of nine cells, at CELL_ACCURACY_S (Choi et al. 2021)."""
+"""Share of instances in the predicted one of nine cells, by horizon (Choi et al. 2021)."""
 
 
 def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
-    """What was published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
+    """List the figures published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
 
     Args:
-        protocol: its name; one that nothing was published for has no rows.
-        datasets: those of the part that is evaluated: figures of other public recordings are left out. None: all.
+        protocol: name of the protocol; one without published figures has no rows.
+        datasets: datasets of the part that is evaluated: figures on other public recordings are left out. None: all.
     """
     rows: list[dict[str, Any]] = []
     for line in PUBLISHED:
@@ -128,19 +129,14 @@ def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl
             continue
         braking = BRAKING_ACCURACY[line.dataset] if line.reference == VALIDATION_2020 else None
         for at, seconds in enumerate(line.seconds):
-            rows.append(
-                {
-                    "protocol": protocol,
-                    "origin": "published",
-                    "model": line.model,
-                    "reference": line.reference,
-                    "dataset": line.dataset,
-                    "group": EVERYTHING,
-                    "average": "samples",
-                    "seconds": seconds,
-                    "longitudinal_accuracy": braking,
-                }
-                | {name: values[at] for name, values in line.figures.items()}
-            )
+            row: dict[str, Any] = {
+                "protocol": protocol,
+                "origin": "published",
+                "model": line.model,
+                "reference": line.reference,
+            }
+            row |= {"dataset": line.dataset, "group": EVERYTHING, "average": "samples", "seconds": seconds}
+            row |= {"longitudinal_accuracy": braking} | {name: values[at] for name, values in line.figures.items()}
+            rows.append(row)
     found = pl.DataFrame(rows, schema=EVALUATIONS.dtypes) if rows else EVALUATIONS.empty()
     return found.sort(EVALUATIONS.key)

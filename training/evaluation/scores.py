@@ -1,4 +1,4 @@
-"""Errors summed up over batches, and the figures made of the sums: by vehicle and maneuver, and over everything.
+"""Floats of errors over batches, and the figures made of the sums: by vehicle and maneuver, and over all samples.
 
 Samples are summed by stratum: those of one vehicle, with the same maneuvers and equally severe findings. Every group is
 a union of strata, so that one pass over the samples serves all of them.
@@ -9,31 +9,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
-from tracklake.training.data.batches import Flags, Integers
 from tracklake.training.data.findings import touched
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.densities import find_nll
 from tracklake.training.models.prediction import Prediction
 
-Sums = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Score:
-    """One row of figures; see `schemas.evaluations` for what they mean. None where there is nothing to measure.
+    """One row of figures as `schemas.evaluations` defines them; None where there is nothing to measure.
 
     Args:
-        dataset: `all`, or one.
-        group: `all`, or for instance `lateral=left`.
+        dataset: name of a dataset, or `all`.
+        group: name of a group, for instance `lateral=left`, or `all`.
         average: `samples` or `vehicles`.
-        seconds: ahead of the sample.
-        n: samples whose position is known then.
-        vehicles: that these are of.
+        seconds: horizon, s.
+        n: number of samples whose position is known then.
+        vehicles: number of their vehicles.
     """
 
     dataset: str
@@ -59,16 +57,16 @@ class Score:
 
 @dataclass(frozen=True)
 class Strata:
-    """Which samples are summed together: P strata of the vehicles of a part.
+    """Strata of a part, P of them: samples of one stratum are summed together.
 
     Args:
-        of_sample: (S_part,) the stratum of each of the part's samples, in their order.
-        vehicle: (P,) the vehicle of each stratum, never falling.
+        of_sample: (S_part,) stratum of each of the part's samples, in their order.
+        vehicle: (P,) vehicle of each stratum, never falling.
         dataset: (P,) position in `datasets`.
         lateral: (P,) true maneuver, position in LATERAL_MANEUVERS.
-        longitudinal: (P,) likewise.
-        findings: (P,) how many of the severities of FINDING_GROUPS the samples' worst finding reaches; 0 has none.
-        datasets: of the part, sorted.
+        longitudinal: (P,) true maneuver, position in LONGITUDINAL_MANEUVERS.
+        findings: (P,) number of severities of FINDING_GROUPS that the samples' worst finding reaches; 0: no finding.
+        datasets: names of the part's datasets, sorted.
     """
 
     of_sample: Integers
@@ -80,11 +78,11 @@ class Strata:
     datasets: tuple[str, ...]
 
     def __len__(self) -> int:
-        """P."""
+        """Count the strata."""
         return len(self.vehicle)
 
-    def groups(self) -> Iterator[tuple[str, str, Flags]]:
-        """Dataset, group, and (P,) the strata in both."""
+    def list_groups(self) -> Iterator[tuple[str, str, Flags]]:
+        """List datasets and groups, with the strata (P,) in both."""
         groups = {EVERYTHING: np.ones(len(self), dtype=np.bool_)}
         groups |= {f"lateral={name}": self.lateral == code for code, name in enumerate(LATERAL_MANEUVERS)}
         groups |= {
@@ -99,7 +97,7 @@ class Strata:
 
 
 def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
-    """Part samples (S_part,) by vehicle, maneuvers and findings. A vehicle in several runs is one."""
+    """Group samples (S_part,) by vehicle, maneuvers and findings; a vehicle in several runs counts once."""
     run = folder.runs_of(folder.sample_row[samples])
     subset = folder.run_subset[run].astype(np.int64)
     vehicle = np.unique((subset << 32) | folder.run_vehicle_id[run], return_inverse=True)[1].astype(np.int64)
@@ -124,14 +122,14 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     )
 
 
-def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Sums]:
-    """What is summed, of each sample and tick: (B, F); 0 where the position is not known.
+def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Floats]:
+    """Compute the summands of each sample and tick, (B, F) each; 0 where the position is not known.
 
     Raises:
-        ValueError: places of another shape than the truth's.
+        TracklakeError: places are not of the truth's shape.
     """
     if prediction.position_m.shape != truth.future.shape:
-        raise ValueError(f"expected places of shape {truth.future.shape}, got {prediction.position_m.shape}")
+        raise TracklakeError(f"expected places of shape {truth.future.shape}, got {prediction.position_m.shape}")
     known = truth.future_mask
     error = np.where(known[..., None], prediction.position_m.astype(np.float64) - truth.future, 0.0)
     squares = error**2
@@ -149,69 +147,66 @@ def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Sums
     if prediction.density is not None:
         sums["nll"] = np.where(known, find_nll(prediction.density, truth.future), 0.0)
     for name in ("lateral", "longitudinal"):
-        said = getattr(prediction, name)
-        if said is not None:
-            sums[f"{name}_right"] = known * (said.argmax(axis=1) == getattr(truth, name))[:, None].astype(np.float64)
+        probability = getattr(prediction, name)
+        if probability is not None:
+            right = probability.argmax(axis=1) == getattr(truth, name)
+            sums[f"{name}_right"] = known * right[:, None].astype(np.float64)
     return sums
 
 
 class Tally:
-    """Sums of `measure_samples` by stratum and tick, (P, F) each.
+    """Floats of `measure_samples` by stratum and tick, (P, F) each.
 
     Args:
-        strata: P of them.
-        ticks: F.
+        strata: P strata of the part.
+        ticks: number of ticks of the horizon, F.
     """
 
     def __init__(self, strata: Strata, ticks: int) -> None:
         self.strata, self._shape = strata, (len(strata), ticks)
-        self.sums: dict[str, Sums] = {}
+        self.sums: dict[str, Floats] = {}
 
     def add(self, stratum: Integers, prediction: Prediction, truth: Truth[Any]) -> None:
-        """Add B samples, each to its stratum (B,).
-
-        Raises:
-            ValueError: places of another shape than the truth's.
-        """
+        """Add B samples, each to its stratum (B,)."""
         if len(stratum) == 0:
             return
         order = np.argsort(stratum, kind="stable")
-        mine, first = np.unique(stratum[order], return_index=True)
+        present, first = np.unique(stratum[order], return_index=True)
         for name, values in measure_samples(prediction, truth).items():
             total = self.sums.setdefault(name, np.zeros(self._shape))
-            total[mine] += np.add.reduceat(values[order], first, axis=0)
+            total[present] += np.add.reduceat(values[order], first, axis=0)
 
     def score(self, seconds: Sequence[float], rate_hz: int) -> tuple[Score, ...]:
-        """Figures of every dataset, group and average, so many seconds ahead.
+        """Compute the figures of every dataset, group and average at some horizons.
 
         Raises:
-            ValueError: seconds that are no tick of the horizon.
+            UsageError: the horizon has no tick at these seconds.
         """
-        ticks = [_tick_at(own, rate_hz, self._shape[1]) for own in seconds]
+        ticks = [_find_tick(own, rate_hz, self._shape[1]) for own in seconds]
         sums = {name: total[:, ticks] for name, total in self.sums.items()}
         rows: list[Score] = []
-        for dataset, group, members in self.strata.groups():
+        for dataset, group, members in self.strata.list_groups():
             if group == EVERYTHING:
                 sums |= self._count_majority(members, sums["n"])
             rows += _score_group(dataset, group, members, sums, self.strata.vehicle, seconds)
         return tuple(rows)
 
-    def _count_majority(self, members: Flags, n: Sums) -> dict[str, Sums]:
-        """Samples whose maneuver is the commonest of a dataset: (P, T); of equally common ones the first."""
+    def _count_majority(self, members: Flags, n: Floats) -> dict[str, Floats]:
+        """Count samples whose maneuver is a dataset's most frequent one: (P, T); of equally frequent ones the first."""
         samples = np.bincount(self.strata.of_sample, minlength=len(self.strata)) * members
         counts = {}
         for name in ("lateral", "longitudinal"):
             code = getattr(self.strata, name)
-            commonest = np.bincount(code, weights=samples).argmax()
-            counts[f"majority_{name}"] = n * (code == commonest)[:, None]
+            most_frequent = np.bincount(code, weights=samples).argmax()
+            counts[f"majority_{name}"] = n * (code == most_frequent)[:, None]
         return counts
 
 
-def _tick_at(seconds: float, rate_hz: int, ticks: int) -> int:
-    """The position among the future's ticks that lies so many seconds ahead."""
+def _find_tick(seconds: float, rate_hz: int, ticks: int) -> int:
+    """Find the position among the future's ticks that lies so many seconds ahead."""
     tick = round(seconds * rate_hz)
     if abs(tick - seconds * rate_hz) > 1e-6 or not 1 <= tick <= ticks:
-        raise ValueError(
+        raise UsageError(
             f"no tick lies {seconds:g} s ahead: expected multiples of {1 / rate_hz:g} s up to {ticks / rate_hz:g}"
         )
     return tick - 1
@@ -222,7 +217,7 @@ ROOTS = {
     "rmse_longitudinal_m": ("longitudinal2",),
     "rmse_lateral_m": ("lateral2",),
 }
-"""Figures that are roots of means, and what is summed for them."""
+"""Figures that are roots of means, and the summands behind each."""
 MEANS = {
     "mae_m": "distance",
     "mae_longitudinal_m": "longitudinal",
@@ -235,13 +230,13 @@ MEANS = {
     "majority_lateral_share": "majority_lateral",
     "majority_longitudinal_share": "majority_longitudinal",
 }
-"""Figures that are means, likewise."""
+"""Figures that are means, and the summand behind each."""
 
 
 def _score_group(
-    dataset: str, group: str, members: Flags, sums: dict[str, Sums], vehicle: Integers, seconds: Sequence[float]
+    dataset: str, group: str, members: Flags, sums: dict[str, Floats], vehicle: Integers, seconds: Sequence[float]
 ) -> Iterator[Score]:
-    """The rows of one group: by average and horizon."""
+    """Compute the rows of one group, by average and horizon."""
     chosen = np.flatnonzero(members)
     if len(chosen):
         starts = np.unique(vehicle[chosen], return_index=True)[1]
@@ -260,9 +255,9 @@ def _score_group(
             yield Score(dataset, group, average, float(ahead), int(total_n[at]), int(vehicles[at]), **figures)
 
 
-def _average(total: Sums, n: Sums, average: str) -> Sums:
-    """(T,) of sums (V, T) over n (V, T) samples of each vehicle; 0 where there are none."""
+def _average(total: Floats, n: Floats, average: str) -> Floats:
+    """Average sums (V, T) over n (V, T) samples of each vehicle: (T,); 0 where there are none."""
     if average == "vehicles":
         total, n = np.divide(total, n, out=np.zeros_like(total), where=n > 0), (n > 0).astype(np.float64)
-    averaged: Sums = total.sum(axis=0) / np.maximum(n.sum(axis=0), 1.0)
+    averaged: Floats = total.sum(axis=0) / np.maximum(n.sum(axis=0), 1.0)
     return averaged

@@ -1,37 +1,38 @@
-"""What a lane change is foretold by: the target vehicle's motion and place, and its relation to the vehicle behind.
+"""Features of a lane change: the target's motion and place, and its relation to the vehicle behind.
 
-The target is the sample. The publication's ego, the car with the sensors, is the vehicle behind it: the nearest behind
-in the target's own lane, or where there is none, the nearest behind in a lane beside. Only what may be seen at the
-moment of prediction goes in (`ObservedScene`).
+The target is the sample. The publication's ego, the car with the sensors, is the vehicle behind it: the nearest one
+behind in the target's own lane or, if there is none, the nearest one behind in a lane beside. Features come from
+`ObservedScene` alone, which holds what is known at the moment of prediction.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.batches import Floats, Integers
+from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
+from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.cells import find_columns
 
 FIT_S = 1.0
-"""Speeds and accelerations are those of a parabola fitted to this much history."""
+"""Length of the history to which the parabola for speeds and accelerations is fitted, s."""
 LEAST_SPEED_MPS = 1.0
-"""Headings and yaw rates are computed as if nobody drove slower: at standstill they would be noise."""
+"""Lowest speed used for headings and yaw rates, m/s: at standstill they would be noise."""
 LEAST_KNOWN = 2
-"""Positions that must be known of a vehicle behind for it to be the ego."""
+"""Smallest number of known positions of an ego."""
 SAME, NEGATED = "same", "negated"
 
 
 @dataclass(frozen=True)
 class Feature:
-    """One number of a target.
+    """One number that describes a target.
 
     Args:
-        name: unit included.
-        meaning: sign included; lateral ones are positive to the right.
-        mirrored: what it is on the mirrored road: the same, negated, or the feature of this name.
+        name: column name with its unit.
+        meaning: definition with its sign; lateral values are positive to the right.
+        mirrored: value on the mirrored road: SAME, NEGATED, or the name of another feature.
     """
 
     name: str
@@ -53,26 +54,27 @@ FEATURES = (
     Feature("left_lane", "1 where there is a lane to the left", "right_lane"),
     Feature("right_lane", "1 where there is a lane to the right", "left_lane"),
     Feature("ego", "1 where there is a vehicle behind; where there is none, all that follows is 0"),
-    Feature("ego_column", "the lane of the vehicle behind: -1 left, 0 own, 1 right", NEGATED),
-    Feature("gap_m", "how far the target is ahead of it, front to front"),
-    Feature("side_m", "how far the target is to the right of it", NEGATED),
-    Feature("relative_speed_mps", "the target's speed less the ego's; the following likewise"),
+    Feature("ego_column", "lane of the vehicle behind: -1 left, 0 own, 1 right", NEGATED),
+    Feature("gap_m", "distance from the ego's front to the target's front"),
+    Feature("side_m", "distance of the target to the right of the ego", NEGATED),
+    Feature("relative_speed_mps", "the target's speed minus the ego's; the following likewise"),
     Feature("relative_accel_mps2", "along the road"),
     Feature("relative_lateral_speed_mps", "across the road", NEGATED),
     Feature("relative_heading_rad", "of the velocities", NEGATED),
     Feature("relative_yaw_rate_radps", "of the headings' changes", NEGATED),
 )
-"""All candidates; which of them a forest uses is chosen when it is fitted."""
+"""All candidates; a fit chooses which of them its forest reads."""
 
-NAMES = tuple(feature.name for feature in FEATURES)
-NUMBER = {name: number for number, name in enumerate(NAMES)}
+FEATURE_NAMES = tuple(feature.name for feature in FEATURES)
+FEATURE_NUMBER = {name: number for number, name in enumerate(FEATURE_NAMES)}
+"""Position of each feature in FEATURES."""
 
 
-def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Floats:
-    """(B, features) the candidates of B targets, in the order of FEATURES, float32.
+def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:
+    """Compute all candidates of B targets: (B, features) in the order of FEATURES.
 
     Args:
-        observed: of NumPy arrays.
+        observed: NumPy arrays of B scenes.
         rate_hz: ticks per second of the histories.
     """
     scenes = np.arange(len(observed.history))
@@ -81,7 +83,7 @@ def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Floats:
     target_motion = _Motion.fit(observed.history[:, 0], known[:, 0], rate_hz)
     ego_motion = _Motion.fit(observed.history[scenes, ego], known[scenes, ego], rate_hz)
     ego_at = observed.history[scenes, ego, -1].astype(np.float64)
-    centre, width = _read_own_lane(observed)
+    centre, width = observed.lanes[:, 1, 0].astype(np.float64), observed.lanes[:, 1, 1].astype(np.float64)
     relative = (
         found,
         find_columns(ego_at[:, 1], observed.lanes),
@@ -93,86 +95,80 @@ def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Floats:
         target_motion.heading - ego_motion.heading,
         target_motion.yaw_rate - ego_motion.yaw_rate,
     )
-    described = np.stack(
-        [
-            target_motion.speed,
-            target_motion.accel,
-            target_motion.lateral_speed,
-            target_motion.lateral_accel,
-            target_motion.heading,
-            target_motion.yaw_rate,
-            -observed.history[:, 0, 0, 1].astype(np.float64),
-            -centre,
-            width / 2 - centre,
-            width / 2 + centre,
-            observed.lanes[:, 0, 2],
-            observed.lanes[:, 2, 2],
-            *(np.where(found, value, 0.0) for value in relative),
-        ],
-        axis=1,
+    columns = (
+        *target_motion,
+        -observed.history[:, 0, 0, 1].astype(np.float64),
+        -centre,
+        width / 2 - centre,
+        width / 2 + centre,
+        observed.lanes[:, 0, 2],
+        observed.lanes[:, 2, 2],
+        *(np.where(found, value, 0.0) for value in relative),
     )
-    return described.astype(np.float32)
+    return np.stack(columns, axis=1).astype(np.float32)
 
 
-def find_egos(observed: ObservedScene[Any], known: npt.NDArray[np.integer]) -> tuple[Integers, npt.NDArray[np.bool_]]:
-    """The vehicle behind each target: (B,) its place in the scene, and (B,) whether there is one (else 0, the target).
+def find_egos(observed: ObservedScene[Any], known: npt.NDArray[np.integer]) -> tuple[Integers, Flags]:
+    """Find the vehicle behind each target.
 
     Args:
-        observed: scenes.
-        known: (B, V) positions known of each vehicle.
+        observed: B scenes with V vehicles each.
+        known: (B, V) number of known positions of each vehicle.
+
+    Returns:
+        Position in the scene, (B,), 0 where there is no ego; and whether there is one, (B,).
     """
     ahead, side = observed.history[:, :, -1, 0], observed.history[:, :, -1, 1]
     column = find_columns(side, observed.lanes)
     behind = observed.vehicle_mask & (known >= LEAST_KNOWN) & (ahead < 0) & (np.abs(column) <= 1)
     behind[:, 0] = False
-    own, beside = (np.where(behind & of, -ahead, np.inf) for of in (column == 0, column != 0))
+    own, beside = (np.where(behind & lanes, -ahead, np.inf) for lanes in (column == 0, column != 0))
     own_found, found = np.isfinite(own).any(axis=1), behind.any(axis=1)
     ego = np.where(own_found, own.argmin(axis=1), beside.argmin(axis=1))
     return np.where(found, ego, 0), found
 
 
-def mirror_targets(features: Floats) -> Floats:
-    """(B, features) of the same targets on a road mirrored sideways."""
+def mirror_targets(features: Singles) -> Singles:
+    """Compute the features (B, features) of the same targets on a road mirrored sideways."""
     mirrored = features.copy()
     for number, feature in enumerate(FEATURES):
         if feature.mirrored == NEGATED:
             mirrored[:, number] = -features[:, number]
         elif feature.mirrored != SAME:
-            mirrored[:, number] = features[:, NUMBER[feature.mirrored]]
+            mirrored[:, number] = features[:, FEATURE_NUMBER[feature.mirrored]]
     return mirrored
 
 
-def shift_targets(features: Floats, shift_m: npt.NDArray[np.floating]) -> Floats:
-    """(B, features) with the ego moved along the road, and nothing else.
+def shift_targets(features: Singles, shift_m: npt.NDArray[np.floating]) -> Singles:
+    """Compute the features (B, features) with the ego moved along the road, and nothing else.
 
     All features are relative, so that moving target and ego together would change none of them. Moved alone, the ego
-    follows at another distance; it stays behind: no gap becomes smaller than half of what it was.
+    follows at another distance; it stays behind: no gap shrinks to less than half.
 
     Args:
-        features: all candidates.
-        shift_m: (B,) what is added to the gap, m; of no effect where there is no ego.
+        features: all candidates of B targets.
+        shift_m: (B,) length added to the gap, m; ignored where there is no ego.
     """
     shifted = features.copy()
-    gap = features[:, NUMBER["gap_m"]]
+    gap = features[:, FEATURE_NUMBER["gap_m"]]
     moved = np.maximum(gap + shift_m, gap / 2)
-    shifted[:, NUMBER["gap_m"]] = np.where(features[:, NUMBER["ego"]] > 0, moved, gap)
+    shifted[:, FEATURE_NUMBER["gap_m"]] = np.where(features[:, FEATURE_NUMBER["ego"]] > 0, moved, gap)
     return shifted
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """(M,) each, float64: along and across the road, and of the heading."""
+class _Motion(NamedTuple):
+    """Motion of M vehicles along and across the road, and of their headings: (M,) each."""
 
-    speed: npt.NDArray[np.float64]
-    accel: npt.NDArray[np.float64]
-    lateral_speed: npt.NDArray[np.float64]
-    lateral_accel: npt.NDArray[np.float64]
-    heading: npt.NDArray[np.float64]
-    yaw_rate: npt.NDArray[np.float64]
+    speed: Floats
+    accel: Floats
+    lateral_speed: Floats
+    lateral_accel: Floats
+    heading: Floats
+    yaw_rate: Floats
 
     @classmethod
-    def fit(cls, history: Floats, known: npt.NDArray[np.integer], rate_hz: int) -> "_Motion":
-        """By least squares over the last FIT_S of histories (M, H, 2) of which the last `known` (M,) are known."""
+    def fit(cls, history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> "_Motion":
+        """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known."""
         ticks = min(history.shape[1], round(FIT_S * rate_hz) + 1)
         weights = weigh_positions(ticks, rate_hz)[np.minimum(known, ticks)]  # (M, 2, ticks)
         (speed, lateral_speed), (accel, lateral_accel) = np.einsum(
@@ -183,10 +179,11 @@ class _Motion:
         return cls(speed, accel, lateral_speed, lateral_accel, np.arctan2(lateral_speed, floored), yaw_rate)
 
 
-def weigh_positions(ticks: int, rate_hz: int) -> npt.NDArray[np.float64]:
-    """(ticks + 1, 2, ticks) weights of the last positions that give speed and acceleration now, by how many are known.
+def weigh_positions(ticks: int, rate_hz: int) -> Floats:
+    """Compute the weights of the last positions that give speed and acceleration now: (ticks + 1, 2, ticks).
 
-    The parabola of least squares; with two known, a line (no acceleration); with fewer, no motion.
+    The first axis counts the known positions. The fit is a least-squares parabola; with two known positions, a line
+    (no acceleration); with fewer, no motion.
     """
     weights = np.zeros((ticks + 1, 2, ticks))
     for known in range(2, ticks + 1):
@@ -197,7 +194,74 @@ def weigh_positions(ticks: int, rate_hz: int) -> npt.NDArray[np.float64]:
     return weights
 
 
-def _read_own_lane(observed: ObservedScene[Any]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(B,) the centre's offset from the target and the width of the target's own lane; 0 where it is unknown."""
-    own = observed.lanes[:, 1].astype(np.float64)
-    return own[:, 0], own[:, 1]
+@dataclass(frozen=True)
+class Coefficient:
+    """Correlation of a feature with each class, and whether the forest reads the feature.
+
+    Args:
+        feature: name of the feature.
+        keep: Pearson's coefficient of the feature with 1 where the class is this one, else 0 (point-biserial); 0 where
+            either does not vary.
+        left: the same for changes to the left.
+        right: the same for changes to the right.
+        chosen: whether the forest reads the feature.
+        reason: why not; empty where it does.
+    """
+
+    feature: str
+    keep: float
+    left: float
+    right: float
+    chosen: bool
+    reason: str
+
+    @property
+    def strength(self) -> float:
+        """Largest of the three coefficients' absolute values."""
+        return max(abs(self.keep), abs(self.left), abs(self.right))
+
+
+def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: float) -> list[Coefficient]:
+    """Choose features that correlate with the classes and not with each other.
+
+    Args:
+        feature: (B, features) in the order of FEATURES.
+        maneuver: (B,) position in LATERAL_MANEUVERS.
+        least: smallest strength of a chosen feature.
+        most: largest absolute correlation between two chosen features; of two that exceed it, the stronger is chosen.
+
+    Returns:
+        All candidates from the strongest to the weakest, equally strong ones in the order of FEATURES.
+    """
+    classes = (maneuver[:, None] == np.arange(len(LATERAL_MANEUVERS))).astype(np.float64)
+    values = feature.astype(np.float64)
+    coefficient, between = _correlate_columns(values, classes), np.abs(_correlate_columns(values, values))
+    strength = np.abs(coefficient).max(axis=1)
+    chosen: list[int] = []
+    table = []
+    for number in np.argsort(-strength, kind="stable"):
+        reason = ""
+        if strength[number] < least:
+            reason = f"below {least:g}"
+        elif twins := [other for other in chosen if between[number, other] > most]:
+            reason = f"as {FEATURE_NAMES[twins[0]]} ({between[number, twins[0]]:.3f})"
+        else:
+            chosen.append(int(number))
+        keep, left, right = map(float, coefficient[number])
+        table.append(Coefficient(FEATURE_NAMES[number], keep, left, right, chosen=not reason, reason=reason))
+    return table
+
+
+def _correlate_columns(left: Floats, right: Floats) -> Floats:
+    """Compute Pearson's coefficients of columns (B, P) with columns (B, Q): (P, Q); 0 where one does not vary."""
+    return np.clip(_standardise_columns(left).T @ _standardise_columns(right), -1, 1)
+
+
+def _standardise_columns(columns: Floats) -> Floats:
+    """Scale columns to mean 0 and length 1; columns that do not vary become zeros."""
+    if not len(columns):
+        return columns
+    centred = columns - columns.mean(axis=0)
+    length = np.sqrt((centred**2).sum(axis=0))
+    varies = length > 1e-9 * np.sqrt(len(columns)) * np.maximum(1.0, np.abs(columns).max(axis=0))
+    return np.where(varies, centred, 0.0) / np.where(varies, length, 1.0)

@@ -1,235 +1,283 @@
-"""A lane-change forest as plain arrays: evaluated by walking all trees at once, stored without pickle."""
+"""Random forest that predicts lane changes: fitted by scikit-learn, stored by skops without pickle."""
 
 import json
-import os
-import zipfile
-import zlib
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
-from uuid import uuid4
+from zipfile import ZIP_DEFLATED
 
 import numpy as np
-import numpy.typing as npt
+import skops.io
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.exceptions import InconsistentVersionWarning
 
+from tracklake.schemas.arrays import Bytes, Floats, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.data.batches import Bytes, Floats
+from tracklake.schemas.files import write_file
+from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene
-from tracklake.training.lane_changes.features import NAMES, NUMBER, describe_targets
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.lane_changes.examples import (
+    STRATA,
+    Examples,
+    draw_balanced,
+    gather_examples,
+    label_samples,
+    list_horizons,
+)
+from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER, choose_features, describe_targets
 from tracklake.training.lane_changes.settings import LaneForestSettings
 
-VERSION = 1
-"""Counts changes of the file that older readers cannot read."""
-HEADER = "header"
-ARRAYS = {
-    "root": np.dtype(np.int32),
-    "left": np.dtype(np.int32),
-    "right": np.dtype(np.int32),
-    "feature": np.dtype(np.int32),
-    "threshold": np.dtype(np.float64),
-    "leaf_odds": np.dtype(np.float64),
-}
-NEEDED_FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
-"""Without these nobody can say what a forest may be scored on."""
-WALKED_AT_ONCE = 4096
+VERSION = 2
+"""Version of the file; a change that older readers cannot read raises it."""
+TRUSTED = ("sklearn.tree._tree.Tree",)
+"""Types a file may hold besides those skops trusts by itself. skops does not trust trees, because scikit-learn follows
+their node numbers unchecked; `_check_classifier` checks them."""
+FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
+"""Facts every forest holds, by type: they determine what it may be scored on."""
+AGAIN = "; run `tracklake lane-forest` again"
+"""End of every message about a file that cannot be used."""
 
 
 class ForestError(TracklakeError):
-    """A file is no forest of this version, or not a whole one."""
+    """A file is not a lane forest of this version, or is damaged."""
 
 
 @dataclass(frozen=True)
 class LaneForest:
-    """A random forest that says which maneuver is under way, and in which lane the vehicle is at each horizon.
-
-    M nodes of all trees, each tree's one after the other; A leaves, in the order of nodes.
+    """Random forest that predicts the maneuver under way, and the vehicle's lane at each of T horizons.
 
     Args:
-        names: the features it is given, in their order.
-        rate_hz: of the histories it was fitted on.
-        horizons_s: (T of them) the horizons.
+        classifier: 1 + T outputs, the maneuver and the lane at each horizon; classes are positions in
+            LATERAL_MANEUVERS.
+        names: features the classifier reads, in its order.
+        rate_hz: ticks per second of the histories it was fitted on.
+        horizons_s: (T,) horizons, s.
         facts: how it was fitted: settings, seed, protocol, examples, coefficients; plain values.
-        root: (trees,) the first node of each tree.
-        left: (M,) the node to go to where the feature is at most the threshold; -1: a leaf.
-        right: (M,) the node to go to where it is greater; -1: a leaf.
-        feature: (M,) which of the features; -1: a leaf.
-        threshold: (M,) compared with.
-        leaf_odds: (A, 1 + T, 3) of the examples in the leaf, the shares of LATERAL_MANEUVERS: of the maneuver, and of
-            the lanes at each horizon.
     """
 
+    classifier: RandomForestClassifier
     names: tuple[str, ...]
     rate_hz: int
     horizons_s: tuple[float, ...]
     facts: dict[str, Any]
-    root: npt.NDArray[np.int32]
-    left: npt.NDArray[np.int32]
-    right: npt.NDArray[np.int32]
-    feature: npt.NDArray[np.int32]
-    threshold: npt.NDArray[np.float64]
-    leaf_odds: npt.NDArray[np.float64]
 
-    def predict(self, observed: ObservedScene[Any]) -> Floats:
-        """(B, 1 + T, 3) odds of B targets from what may be seen of them; see `predict_proba`."""
+    @property
+    def settings(self) -> LaneForestSettings:
+        """Settings it was fitted with."""
+        return LaneForestSettings.read(self.facts["settings"])
+
+    def predict(self, observed: ObservedScene[Any]) -> Singles:
+        """Predict B targets from what is observed of them: (B, 1 + T, 3), see `predict_proba`."""
         return self.predict_proba(describe_targets(observed, self.rate_hz))
 
-    def predict_proba(self, described: Floats) -> Floats:
-        """(B, 1 + T, 3) probabilities of keep, left and right: of the maneuver, then of the lane at each horizon.
+    def predict_proba(self, described: Singles) -> Singles:
+        """Predict the probabilities of keep, left and right, of the maneuver and then of the lane at each horizon.
 
-        They hold for the mix that the forest was fitted on, in which changes of lanes are drawn far more often than
-        they occur on the road: there, the probabilities of changes are lower.
+        They hold for the mix of examples that the forest was fitted on, in which lane changes are far more frequent
+        than on the road: there, the probabilities of changes are lower.
 
         Args:
             described: (B, candidates) in the order of `features.FEATURES`.
-        """
-        given = np.ascontiguousarray(described[:, [NUMBER[name] for name in self.names]], dtype=np.float32)
-        leaf_of_node = np.cumsum(self.left < 0) - 1
-        odds = np.empty((len(given), *self.leaf_odds.shape[1:]), dtype=np.float32)
-        for start in range(0, len(given), WALKED_AT_ONCE):
-            part = slice(start, start + WALKED_AT_ONCE)
-            odds[part] = self.leaf_odds[leaf_of_node[self._walk(given[part])]].mean(axis=1)
-        return odds
 
-    def _walk(self, given: Floats) -> npt.NDArray[np.int32]:
-        """(B, trees) the leaf's node that each target ends in, in each tree; one step of all of them at a time."""
-        node = np.broadcast_to(self.root, (len(given), len(self.root))).reshape(-1).copy()
-        target = np.repeat(np.arange(len(given)), len(self.root))
-        going = np.flatnonzero(self.left[node] >= 0)
-        while len(going):
-            at = node[going]
-            stays_left = given[target[going], self.feature[at]] <= self.threshold[at]
-            at = np.where(stays_left, self.left[at], self.right[at])
-            node[going] = at
-            going = going[self.left[at] >= 0]
-        return node.reshape(len(given), len(self.root))
+        Returns:
+            (B, 1 + T, 3) in the order of LATERAL_MANEUVERS.
+        """
+        probability = np.zeros((len(described), 1 + len(self.horizons_s), len(LATERAL_MANEUVERS)), dtype=np.float32)
+        if len(described):
+            given = described[:, [FEATURE_NUMBER[name] for name in self.names]]
+            outputs: list[Floats] = self.classifier.predict_proba(given)
+            for output, classes in enumerate(self.classifier.classes_):  # those seen in the examples
+                probability[:, output, classes.astype(np.intp)] = outputs[output]
+        return probability
 
     def save(self, file: Path) -> None:
-        """Write it aside and put it in place at once."""
+        """Write the forest to a file, whole or not at all."""
         header = {
-            "format": "tracklake lane-change forest",
             "version": VERSION,
             "features": list(self.names),
             "rate_hz": self.rate_hz,
             "horizons_s": list(self.horizons_s),
             "facts": self.facts,
         }
-        text = np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8)
-        aside = file.with_name(f".{file.name}.{uuid4().hex}.partial")
-        try:
-            with aside.open("wb") as stream:
-                arrays: dict[str, Any] = {HEADER: text, **{name: getattr(self, name) for name in ARRAYS}}
-                np.savez_compressed(stream, **arrays)
-                stream.flush()
-                os.fsync(stream.fileno())
-            aside.replace(file)
-        finally:
-            aside.unlink(missing_ok=True)
+        content = {"header": json.dumps(header, allow_nan=False), "classifier": self.classifier}
+        write_file(file, skops.io.dumps(content, compression=ZIP_DEFLATED))
 
     @classmethod
     def load(cls, file: Path) -> Self:
-        """Read what `save` wrote; nothing of it is executed.
+        """Read a forest that `save` wrote; nothing in the file is executed.
 
         Raises:
-            ForestError: there is no such file, it is damaged or another, its nodes do not make trees, or it does not
-                say what it was fitted on.
+            ForestError: no such file; it is damaged, of another kind or version, or holds types that are not trusted;
+                its nodes do not make trees; or facts are missing.
         """
-        header, arrays = _read(file)
-        if header.get("version") != VERSION:
-            found = header.get("version")
-            raise ForestError(f"{file}: expected version {VERSION} of lane forests, got {found!r}{AGAIN}")
-        names, facts = header.get("features"), header.get("facts")
-        horizons, rate_hz = _read_numbers(header.get("horizons_s")), _read_numbers([header.get("rate_hz")])
-        if not isinstance(names, list) or not names or not all(name in NAMES for name in names):
-            raise ForestError(f"{file}: expected features of {', '.join(NAMES)}, got {names}{AGAIN}")
-        if horizons is None or rate_hz is None or not isinstance(facts, dict):
-            raise ForestError(
-                f"{file}: expected horizons in s, a rate in Hz and facts, got {header.get('horizons_s')!r}, "
-                f"{header.get('rate_hz')!r} and {type(facts).__name__}{AGAIN}"
-            )
-        lacking = [name for name, kind in NEEDED_FACTS.items() if not isinstance(facts.get(name), kind)]
-        if lacking:
-            raise ForestError(
-                f"{file}: expected facts of {', '.join(NEEDED_FACTS)}, got no {', '.join(lacking)}{AGAIN}"
-            )
+        if not file.is_file():
+            raise ForestError(f"{file}: no such file{AGAIN}")
         try:
-            LaneForestSettings.read(facts["settings"])
-        except UsageError as wrong:
-            raise ForestError(f"{file}: {wrong}{AGAIN}") from None
-        _check_trees(file, arrays, len(names), len(horizons))
-        return cls(tuple(names), int(rate_hz[0]), horizons, facts, **arrays)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", InconsistentVersionWarning)  # trees of another scikit-learn
+                content = skops.io.loads(file.read_bytes(), trusted=list(TRUSTED))
+            header, classifier = json.loads(content["header"]), content["classifier"]
+        except Exception as broken:
+            raise ForestError(f"{file}: not a lane forest that can be read here ({broken}){AGAIN}") from broken
+        try:
+            _check_header(header)
+            forest = cls(
+                classifier=classifier,
+                names=tuple(header["features"]),
+                rate_hz=header["rate_hz"],
+                horizons_s=tuple(map(float, header["horizons_s"])),
+                facts=header["facts"],
+            )
+            _check_classifier(forest)
+        except (UsageError, ValueError, TypeError, AttributeError) as wrong:
+            raise ForestError(f"{file}: {wrong}{AGAIN}") from wrong
+        return forest
 
 
-AGAIN = "; run `tracklake lane-forest` again"
-
-
-def decide(odds: Floats) -> Bytes:
-    """The most probable class of probabilities (..., 3); of two alike, the first."""
-    decided: Bytes = odds.argmax(axis=-1).astype(np.uint8)
+def decide_classes(probability: Singles) -> Bytes:
+    """Find the most probable class of probabilities (..., 3); of two equally probable ones, the first."""
+    decided: Bytes = probability.argmax(axis=-1).astype(np.uint8)
     return decided
 
 
-def _read_numbers(values: object) -> tuple[float, ...] | None:
-    """A list of numbers above 0; None where it is none."""
-    numbers = values if isinstance(values, list) else [None]
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in numbers):
-        return None
-    return tuple(map(float, numbers))
+def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSettings | None = None) -> LaneForest:
+    """Fit a forest on a folder's training part.
 
-
-def _read(file: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """The header and the arrays, of the declared dtypes.
+    Args:
+        folder: tensors of any protocol, which gives the horizons.
+        seed: seed of the draw, the shifts and the trees: same seed, same forest.
+        settings: None for the defaults.
 
     Raises:
-        ForestError: see `LaneForest.load`.
+        TracklakeError: the training part has no sample that keeps its lane, or none that changes it.
     """
-    if not file.is_file():
-        raise ForestError(f"{file}: no such file{AGAIN}")
-    try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            found = {name: stored[name] for name in stored.files}
-        header = json.loads(found.pop(HEADER, np.empty(0, np.uint8)).tobytes())
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as broken:
-        raise ForestError(f"{file}: not a whole lane forest ({broken}){AGAIN}") from broken
+    settings = settings or LaneForestSettings()
+    samples = label_samples(folder, "train", settings)
+    drawn = samples.select(draw_balanced(samples.stratum, settings.examples, np.random.default_rng(seed)))
+    facts = {
+        "protocol": folder.index["protocol"],
+        "split": folder.split,
+        "blocks": folder.index["blocks"],
+        "train_subsets": sorted(folder.subsets_of("train")),
+        "lane_changes": samples.changes,
+        "left_out": samples.left_out,
+        "left_out_by_reason": samples.reasons,
+        "samples_by_stratum": dict(zip(STRATA, samples.count_strata().tolist(), strict=True)),
+        "drawn_by_stratum": dict(zip(STRATA, drawn.count_strata().tolist(), strict=True)),
+    }
+    if len(np.unique(drawn.maneuver)) < 2:
+        raise TracklakeError(
+            f"{folder.path}: a lane-change forest needs samples of the training part that keep their lane and some "
+            f"that change it; got {facts['samples_by_stratum']} ({samples.changes} lane changes in all). It needs "
+            "recordings with lanes, longer or more of them"
+        )
+    return fit_examples(gather_examples(folder, drawn), settings, seed, protocol=folder.protocol, facts=facts)
+
+
+def fit_examples(
+    examples: Examples,
+    settings: LaneForestSettings,
+    seed: int,
+    *,
+    protocol: Protocol,
+    facts: Mapping[str, Any] | None = None,
+) -> LaneForest:
+    """Augment examples, choose features, and fit the trees.
+
+    One forest predicts everything: each tree is fitted on the maneuver and on the lanes at all horizons together, so
+    that a leaf knows both the maneuver under way and how far it will have come at each horizon.
+
+    Args:
+        examples: examples as drawn.
+        settings: settings of the fit.
+        seed: seed of the shifts and the trees.
+        protocol: protocol of the examples, which gives the rate and the horizons.
+        facts: plain values to keep beside the settings, the seed and the coefficients.
+
+    Raises:
+        TracklakeError: no feature correlates enough with the maneuver.
+    """
+    augmented = examples.augment(settings, np.random.default_rng([seed, 1]))
+    least, most = settings.least_correlation, settings.most_correlation
+    table = choose_features(augmented.feature, augmented.maneuver, least=least, most=most)
+    names = tuple(row.feature for row in table if row.chosen)
+    if not names:
+        raise TracklakeError(
+            f"no feature correlates with the maneuver by {least:g} or more (the best, {table[0].feature}, by "
+            f"{table[0].strength:.3f}): set `least_correlation` lower"
+        )
+    classifier = RandomForestClassifier(
+        n_estimators=settings.trees, min_samples_leaf=settings.leaf, random_state=seed, n_jobs=1
+    )
+    given = augmented.feature[:, [FEATURE_NUMBER[name] for name in names]]
+    classifier.fit(given, np.column_stack([augmented.maneuver, augmented.ahead]))
+    known = {
+        **(facts or {}),
+        "settings": {**asdict(settings), "augmentation": list(settings.augmentation)},
+        "seed": seed,
+        "examples": len(augmented),
+        "coefficients": [asdict(row) for row in table],
+    }
+    return LaneForest(classifier, names, protocol.rate_hz, list_horizons(protocol), known)
+
+
+def _check_header(header: Any) -> None:  # noqa: ANN401  (whatever JSON a file holds)
+    """Refuse a header that is not one of a forest of this version.
+
+    Raises:
+        ValueError: what was expected, and what was found.
+        UsageError: a setting is unknown, of another type, or out of range.
+    """
     if not isinstance(header, dict):
-        raise ForestError(f"{file}: expected a header that is an object, got {type(header).__name__}{AGAIN}")
-    dtypes = {name: array.dtype for name, array in found.items()}
-    if dtypes != ARRAYS:
-        raise ForestError(f"{file}: expected arrays {_name(ARRAYS)}, got {_name(dtypes)}{AGAIN}")
-    return header, found
+        raise ValueError(f"expected a header that is an object, got {type(header).__name__}")
+    version, names, facts = header.get("version"), header.get("features"), header.get("facts")
+    rate_hz, horizons_s = header.get("rate_hz"), header.get("horizons_s")
+    if version != VERSION:
+        raise ValueError(f"expected version {VERSION} of lane forests, got {version!r}")
+    if not isinstance(names, list) or not names or not all(name in FEATURE_NAMES for name in names):
+        raise ValueError(f"expected features of {', '.join(FEATURE_NAMES)}, got {names}")
+    if not (isinstance(horizons_s, list) and horizons_s and all(map(_is_positive, [rate_hz, *horizons_s]))):
+        raise ValueError(f"expected horizons in s and a rate in Hz, above 0; got {horizons_s!r} and {rate_hz!r}")
+    held = facts if isinstance(facts, dict) else {}
+    lacking = [name for name, kind in FACTS.items() if not isinstance(held.get(name), kind)]
+    if lacking:
+        raise ValueError(f"expected facts with {', '.join(FACTS)}, got no {', '.join(lacking)}")
+    LaneForestSettings.read(held["settings"])
 
 
-def _name(dtypes: Mapping[str, object]) -> str:
-    return ", ".join(f"{name} ({dtype})" for name, dtype in sorted(dtypes.items())) or "none"
+def _is_positive(value: object) -> bool:
+    """Whether a plain value is a number above 0."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
 
 
-def _check_trees(file: Path, arrays: dict[str, npt.NDArray[Any]], features: int, horizons: int) -> None:
-    """Refuse nodes that do not make trees: a walk would leave the arrays, or never end.
+def _check_classifier(forest: LaneForest) -> None:
+    """Refuse nodes that do not make trees: a prediction would leave the arrays, or never end.
 
     Raises:
-        ForestError: saying what is wrong.
+        ValueError: what was expected, and what was found.
+        TypeError: an attribute of the classifier is of another type.
+        AttributeError: the classifier or a tree lacks an attribute.
     """
-    root, left, right, feature, threshold, leaf_odds = (arrays[name] for name in ARRAYS)
-    nodes = len(left)
-    leaf = left < 0 if left.ndim == 1 else np.zeros(0, dtype=np.bool_)
-    shapes = {name: array.shape for name, array in arrays.items() if name not in ("root", "leaf_odds")}
-    if not nodes or set(shapes.values()) != {(nodes,)}:
-        raise ForestError(f"{file}: expected one number for each node, got shapes {shapes}{AGAIN}")
-    shape = (int(leaf.sum()), 1 + horizons, len(LATERAL_MANEUVERS))
-    if leaf_odds.shape != shape:
-        raise ForestError(f"{file}: expected the leaves' odds in the shape {shape}, got {leaf_odds.shape}{AGAIN}")
-    if root.ndim != 1 or not len(root) or root[0] != 0 or (np.diff(root) <= 0).any() or root[-1] >= nodes:
-        raise ForestError(f"{file}: expected each tree's first node in order, below {nodes}, the first 0{AGAIN}")
-    number = np.arange(nodes)
-    end = np.append(root, nodes)[np.searchsorted(root, number, side="right")]
-    inner = ~leaf
-    for side in (left, right):
-        # A child stands behind its parent, in the same tree: every walk ends.
-        if ((side <= number) | (side >= end))[inner].any() or (side[leaf] != -1).any():
-            raise ForestError(f"{file}: expected nodes that lead on within their tree, and leaves that do not{AGAIN}")
-    if ((feature < 0) | (feature >= features))[inner].any() or not np.isfinite(threshold).all():
-        raise ForestError(f"{file}: expected thresholds of features 0 to {features - 1} at every node{AGAIN}")
-    sums = leaf_odds.sum(axis=-1)
-    if not ((leaf_odds >= 0).all() and (np.abs(sums - 1) < 1e-6).all()):
-        raise ForestError(f"{file}: expected odds that sum to 1 in every leaf{AGAIN}")
+    classifier, features, outputs = forest.classifier, len(forest.names), 1 + len(forest.horizons_s)
+    if type(classifier) is not RandomForestClassifier:
+        raise ValueError(f"expected a RandomForestClassifier, got {type(classifier).__name__}")
+    if not classifier.estimators_:
+        raise ValueError("expected at least one tree")
+    for tree in (estimator.tree_ for estimator in classifier.estimators_):
+        children = np.stack([tree.children_left, tree.children_right])
+        inner = children[0] != -1
+        # A child stands behind its parent: every walk ends.
+        if not ((children > np.arange(tree.node_count)) & (children < tree.node_count))[:, inner].all():
+            raise ValueError("expected nodes that lead to later nodes of their tree")
+        if not ((tree.feature >= 0) & (tree.feature < features))[inner].all():
+            raise ValueError(f"expected nodes that compare features 0 to {features - 1}")
+    classes = [own.tolist() for own in classifier.classes_]
+    if len(classes) != outputs or not all(set(own) <= set(range(len(LATERAL_MANEUVERS))) for own in classes):
+        raise ValueError(f"expected {outputs} outputs with classes of {', '.join(LATERAL_MANEUVERS)}, got {classes}")
+    probability = forest.predict_proba(np.zeros((1, len(FEATURE_NAMES)), dtype=np.float32))
+    if not np.allclose(probability.sum(axis=-1), 1):
+        raise ValueError("expected probabilities that sum to 1")

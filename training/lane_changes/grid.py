@@ -1,59 +1,61 @@
-"""Scores of predicted cells: the column from a model's own place or from the forest, the row from the model's place.
+"""Scores of predicted cells: columns from a model's own places or from the forest, rows from the model's places.
 
-Truth and labels come from the future: they are compared with, and group the scores. What predicts is given samples as
-`training.data.observed` lets them be seen.
+True places and labels come from the future: predictions are compared with them and grouped by them. Models and the
+forest read only what `training.data.observed` holds.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from tracklake.schemas.arrays import Bytes, Flags, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Flags, Floats, Integers
-from tracklake.training.data.nearest_vehicles import gather_surroundings
-from tracklake.training.data.observed import Observed, ObservedScene, part_batch
+from tracklake.training.data.observed import FutureInputError, ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
-from tracklake.training.lane_changes.examples import STRATA, Judged, judge_samples
-from tracklake.training.lane_changes.features import NUMBER, describe_targets
-from tracklake.training.lane_changes.forest import LaneForest, decide
-from tracklake.training.lane_changes.labels import KEEP, LEFT
-from tracklake.training.lane_changes.settings import LaneForestSettings
+from tracklake.training.lane_changes.examples import (
+    Targets,
+    cut_numbers,
+    label_samples,
+    list_horizons,
+    read_targets,
+)
+from tracklake.training.lane_changes.features import FEATURE_NUMBER
+from tracklake.training.lane_changes.forest import LaneForest, decide_classes
 from tracklake.training.models import MODELS, Predictor, Reads
 from tracklake.training.models.constant_velocity import ConstantVelocity
-from tracklake.training.models.inputs import NEAREST
+from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import NotFiniteError, Prediction
 from tracklake.training.runs.run_folder import refuse_leak
 
-ALL = "all"
+COLUMNS = np.array([{"keep": 0, "left": -1, "right": 1}[name] for name in LATERAL_MANEUVERS], dtype=np.int8)
+"""Column of each class of the forest."""
 MOST = 200_000
-"""Samples that are scored at most; where a part has more, so many of them are drawn."""
+"""Largest number of samples that are scored; of a larger part, so many are drawn."""
 
 
 @dataclass(frozen=True)
 class CellScore:
-    """One model at one horizon, over all samples or one stratum. Shares are None where n is 0.
+    """Scores of one model at one horizon, over all samples or one stratum. Shares are None where n is 0.
 
     Args:
-        model: its name.
-        column: where the column comes from: `place`, the model's own, or `forest`.
-        seconds: the horizon.
-        stratum: of `examples.STRATA`, or `all`.
-        n: samples behind each share.
-        cell: share of samples in the cell predicted; a true place outside of the nine is never right.
-        row: likewise of rows alone.
-        lane: likewise of columns alone.
-        cell_clipped: as `cell`, were the outer columns and rows without end.
-        majority: share of the most frequent true cell: what always saying it would reach.
+        model: name of the model.
+        column: source of the column: `place`, the model's own, or `forest`.
+        seconds: horizon, s.
+        stratum: name from `examples.STRATA`, or `all`.
+        n: number of samples behind each share.
+        cell: share of samples in the predicted cell; a true place outside the nine is never right.
+        row: the same of rows alone.
+        lane: the same of columns alone.
+        cell_clipped: as `cell`, if the outer columns and rows had no end.
+        majority: share of the most frequent true cell: what a constant prediction of it would reach.
         own_lane: share of true places in the own column.
-        outside: share of true places outside of the nine cells.
+        outside: share of true places outside the nine cells.
     """
 
     model: str
@@ -69,21 +71,17 @@ class CellScore:
     own_lane: float | None
     outside: float | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class ManeuverScore:
-    """What the forest says of the maneuver under way, over all samples or one stratum. None: no such sample.
+    """Scores of the forest's maneuvers, over all samples or one stratum. None: no such sample.
 
     Args:
         stratum: as in `CellScore`.
-        n: samples.
-        accuracy: share whose most probable maneuver is the label.
+        n: number of samples.
+        accuracy: share of samples whose most probable maneuver is the label.
         recall: the same of the samples of each label.
-        balanced: mean of the recalls there are.
+        balanced: mean of the recalls that are not None.
         majority: share of the most frequent label.
     """
 
@@ -94,19 +92,15 @@ class ManeuverScore:
     balanced: float | None
     majority: float | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class GridScores:
-    """All of it.
+    """Scores of cells and maneuvers on one part.
 
     Args:
-        cells: by model, column, horizon and stratum.
-        maneuvers: by stratum.
-        left_out: samples of the part that are not scored.
+        cells: scores by model, column, horizon and stratum.
+        maneuvers: scores by stratum.
+        left_out: number of the part's samples that are not scored.
         left_out_by_reason: the same by `examples.LEFT_OUT`.
     """
 
@@ -116,20 +110,20 @@ class GridScores:
     left_out_by_reason: dict[str, int]
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
+        """Convert to plain values."""
         return asdict(self)
 
 
-@dataclass(frozen=True)
-class _Cells:
-    """Columns and rows of S samples at T horizons: (S, T) each."""
+class _ForestPredictor:
+    """Forest with the interface of a model, for the guard: all probabilities in one array, and no places."""
 
-    column: Codes
-    row: Codes
+    def __init__(self, forest: LaneForest) -> None:
+        self._forest = forest
 
-    @classmethod
-    def join(cls, pieces: "list[_Cells]") -> "_Cells":
-        return cls(np.concatenate([piece.column for piece in pieces]), np.concatenate([piece.row for piece in pieces]))
+    def predict(self, observed: ObservedScene[Any]) -> Prediction:
+        probability = self._forest.predict(observed)
+        none = np.zeros((len(probability), 0, 2), dtype=np.float32)
+        return Prediction(position_m=none, lateral=probability.reshape(len(probability), -1))
 
 
 def evaluate_grid(
@@ -141,218 +135,159 @@ def evaluate_grid(
     reads: Mapping[str, Reads] | None = None,
     most: int = MOST,
     seed: int = 0,
-    pass_by: Callable[[str, str], None] | None = None,
+    on_skip: Callable[[str, str], None] | None = None,
 ) -> GridScores:
-    """Score models by the cell in which they say the vehicle will be, at every horizon that the forest knows.
+    """Score models by the cells of their predicted places, at every horizon of the forest.
 
-    Each model is scored twice: with the column of its own place, and with the forest's. Samples are those whose
-    maneuver and whole future are known (`examples.judge_samples`, with the forest's T_d).
+    Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
+    `examples.label_samples`, with the forest's T_d.
 
     Args:
-        folder: of the protocol that forest and models were made for.
-        predictors: by name.
-        forest: fitted.
+        folder: tensors of the protocol that forest and models were made for.
+        predictors: models by name.
+        forest: fitted forest.
         part: train, val or eval.
-        reads: by name: what each is given. Where a name is missing: what the registry says of it, else `grid`.
-        most: samples at most.
-        seed: of the draw where there are more.
-        pass_by: told the name of a model that cannot be scored, and why; it is left out. None: the first one is raised.
+        reads: input of each model; by default as in the registry, or else `grid`.
+        most: largest number of samples.
+        seed: seed of the draw where there are more.
+        on_skip: called with the name of a model that cannot be scored, and the reason. None: the first one is raised.
 
     Raises:
-        FutureInputError: the forest or a model is found to see the future.
-        TracklakeError: no such part; the forest has learned from subsets of this part; or it was fitted at another rate
-            or for horizons that the folder does not score; or a model predicts places that are not finite numbers, or
-            not of the horizon's shape.
+        FutureInputError: the forest or a model sees the future.
+        TracklakeError: the forest was fitted on subsets of this part, at another rate, or for horizons that the folder
+            does not score; or see `predict_places`.
     """
     ticks = _find_ticks(folder, forest)
     refuse_leak(forest.facts, folder, part)
-    given = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
-    known = forest.facts["settings"]
-    asked = dict(predictors)
-    settings = LaneForestSettings(start_s=known["start_s"], tolerance_m=known["tolerance_m"])
-    judged = judge_samples(folder, part, settings)
-    reasons = judged.reasons
-    if len(judged.sample) > most:
-        drawn = np.random.default_rng(seed).permutation(len(judged.sample))[:most]
-        judged = judged.take(np.sort(drawn))
-    if len(judged.sample):
-        refuse_future(_Guarded(forest), folder, part, name="lane-forest", reads="scene")
-        for name in predictors:
-            with _passing_by(name, asked, pass_by):
-                refuse_future(asked[name], folder, part, name=name, reads=given[name])
-
-    true: list[_Cells] = []
-    said: dict[tuple[str, str], list[_Cells]] = {(name, by): [] for name in predictors for by in ("place", "forest")}
-    maneuver = [np.empty(0, dtype=np.uint8)]
-    for numbers in _cut(judged.sample):
-        seen = _Seen.read(folder, numbers)
-        described = describe_targets(seen.scene, forest.rate_hz)
-        decided = decide(forest.predict_proba(described))  # (B, 1 + T)
-        maneuver.append(decided[:, 0])
-        cells = _Grid(ConstantVelocity(folder.protocol).predict(seen.grid), seen.scene, described, ticks)
-        true.append(cells.find(seen.future[:, ticks]))
-        forest_column = turn_to_columns(decided[:, 1:])
-        for name in list(asked):
-            with _passing_by(name, asked, pass_by):
-                own = cells.find(_ask(name, asked[name], seen, given[name])[:, ticks])
-                said[name, "place"].append(own)
-                said[name, "forest"].append(_Cells(forest_column, own.row))
-    strata = _find_strata(judged)
-    scores = [
-        score
-        for (name, by), pieces in said.items()
-        if name in asked and pieces
-        for score in _score_cells(name, by, _Cells.join(pieces), _Cells.join(true), forest.horizons_s, strata)
-    ]
-    decided_all = np.concatenate(maneuver)
-    maneuvers = [score_maneuvers(name, decided_all[of], judged.maneuver[of]) for name, of in strata.items()]
-    return GridScores(scores, maneuvers, sum(reasons.values()), reasons)
+    found = label_samples(folder, part, forest.settings)
+    samples = found.draw(most, seed)
+    if len(samples):
+        refuse_future(_ForestPredictor(forest), folder, part, name="lane-forest", reads="scene")
+    targets = read_targets(folder, samples.sample, ticks)
+    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, name="straight")
+    true = find_cells(targets.place_m, straight_m, targets)
+    decided = decide_classes(forest.predict_proba(targets.feature))  # (S, 1 + T)
+    forest_column = COLUMNS[decided[:, 1:]]
+    strata = samples.find_strata()
+    inputs = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
+    cells: list[CellScore] = []
+    for name, predictor in predictors.items() if len(samples) else ():
+        try:
+            refuse_future(predictor, folder, part, name=name, reads=inputs[name])
+            place_m = predict_places(folder, samples.sample, predictor, ticks, name=name, reads=inputs[name])
+        except (TracklakeError, FutureInputError, ValueError) as refused:
+            if on_skip is None:
+                raise
+            on_skip(name, str(refused))
+            continue
+        own = find_cells(place_m, straight_m, targets)
+        joined = np.stack([forest_column, own[..., 1]], axis=-1)
+        for source, predicted in (("place", own), ("forest", joined)):
+            cells += _score_cells(name, source, predicted, true, forest.horizons_s, strata)
+    maneuvers = [score_maneuvers(name, decided[of, 0], samples.maneuver[of]) for name, of in strata.items()]
+    return GridScores(cells, maneuvers, found.left_out, found.reasons)
 
 
-@contextmanager
-def _passing_by(name: str, asked: dict[str, Predictor], pass_by: Callable[[str, str], None] | None) -> Iterator[None]:
-    """Leave a model out that is refused, where somebody is told of it."""
-    try:
-        yield
-    except TracklakeError as refused:
-        if pass_by is None:
-            raise
-        del asked[name]
-        pass_by(name, str(refused))
-
-
-class _Guarded:
-    """A forest as the guard asks: what it says of the maneuver and of the lanes ahead, in one array."""
-
-    def __init__(self, forest: LaneForest) -> None:
-        self._forest = forest
-
-    def predict(self, observed: ObservedScene[Any]) -> Prediction:
-        odds = self._forest.predict(observed)
-        return Prediction(position_m=np.zeros((len(odds), 0, 2), np.float32), lateral=odds.reshape(len(odds), -1))
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Some samples, read in both ways, and what came of them."""
-
-    grid: Observed[Any]
-    scene: ObservedScene[Any]
-    future: Floats
-
-    @classmethod
-    def read(cls, folder: TensorFolder, numbers: Integers) -> "_Seen":
-        grid, truth = part_batch(folder.gather(numbers))
-        scene, _ = gather_surroundings(folder, numbers, nearest=NEAREST)
-        return cls(grid, scene, truth.future)
-
-
-def _ask(name: str, predictor: Predictor, seen: _Seen, reads: Reads) -> Floats:
-    """(B, F, 2) the places that a model says.
+def predict_places(
+    folder: TensorFolder,
+    sample: Integers,
+    predictor: Predictor,
+    ticks: tuple[int, ...],
+    *,
+    name: str,
+    reads: Reads = "grid",
+) -> Singles:
+    """Predict the places of samples (S,) at some ticks ahead (T,): (S, T, 2).
 
     Raises:
-        NotFiniteError: they are not finite numbers.
-        TracklakeError: they are not of the horizon's shape.
+        NotFiniteError: places are not finite numbers.
+        TracklakeError: places are not of the horizon's shape.
     """
-    place_m = predictor.predict(seen.scene if reads == "scene" else seen.grid).position_m
-    if place_m.shape != seen.future.shape:
-        raise TracklakeError(f"`{name}`: expected places of shape {seen.future.shape}, got {place_m.shape}")
-    if not np.isfinite(place_m).all():
-        raise NotFiniteError(name, "positions")
-    return place_m
+    at = np.array(ticks, dtype=np.intp) - 1
+    places = []
+    for numbers in cut_numbers(sample, BATCH_SIZE):
+        observed, truth = read_samples(folder, numbers, reads)
+        place_m = predictor.predict(observed).position_m
+        expected = truth_of_ego(truth).future.shape
+        if place_m.shape != expected:
+            raise TracklakeError(f"`{name}`: expected places of shape {expected}, got {place_m.shape}")
+        if not np.isfinite(place_m).all():
+            raise NotFiniteError(name, "positions")
+        places.append(place_m[:, at])
+    return np.concatenate(places)
 
 
-class _Grid:
-    """The nine cells of some samples at T horizons; made of what is seen of them."""
+def find_cells(place_m: Singles, straight_m: Singles, targets: Targets) -> Codes:
+    """Find the columns and rows of places: (S, T, 2).
 
-    def __init__(
-        self, straight: Prediction, scene: ObservedScene[Any], described: Floats, ticks: npt.NDArray[np.intp]
-    ) -> None:
-        self._middle_m = straight.position_m[:, ticks, 0]
-        self._lanes = scene.lanes
-        self._length_m = measure_rows(described[:, NUMBER["relative_speed_mps"]], described[:, NUMBER["ego"]])
-
-    def find(self, place_m: Floats) -> _Cells:
-        """The cells of places (B, T, 2)."""
-        return _Cells(
-            find_columns(place_m[..., 1], self._lanes), find_rows(place_m[..., 0], self._middle_m, self._length_m)
-        )
+    Args:
+        place_m: (S, T, 2) places relative to the sample's last position.
+        straight_m: (S, T, 2) constant-velocity places.
+        targets: S samples as observed; their true places are not used.
+    """
+    speed_mps, ego = (targets.feature[:, FEATURE_NUMBER[name]] for name in ("relative_speed_mps", "ego"))
+    column = find_columns(place_m[..., 1], targets.lanes)
+    row = find_rows(place_m[..., 0], straight_m[..., 0], measure_rows(speed_mps, ego))
+    return np.stack([column, row], axis=-1)
 
 
-def turn_to_columns(lateral: npt.NDArray[np.uint8]) -> Codes:
-    """Columns of LATERAL_MANEUVERS' codes, any shape: keep is 0, left -1, right 1."""
-    return np.where(lateral == KEEP, 0, np.where(lateral == LEFT, -1, 1)).astype(np.int8)
-
-
-def score_maneuvers(stratum: str, decided: npt.NDArray[np.uint8], label: npt.NDArray[np.uint8]) -> ManeuverScore:
-    """Maneuvers said (B,) beside labels (B,)."""
-    right, classes = decided == label, range(len(LATERAL_MANEUVERS))
-    recall = {LATERAL_MANEUVERS[which]: _share(right[label == which]) for which in classes}
+def score_maneuvers(stratum: str, decided: Bytes, label: Bytes) -> ManeuverScore:
+    """Compare predicted maneuvers (B,) with labels (B,)."""
+    right, of_class = decided == label, {name: label == code for code, name in enumerate(LATERAL_MANEUVERS)}
+    recall = {name: _mean(right[of]) for name, of in of_class.items()}
     found = [share for share in recall.values() if share is not None]
     return ManeuverScore(
         stratum=stratum,
         n=len(label),
-        accuracy=_share(right),
+        accuracy=_mean(right),
         recall=recall,
         balanced=sum(found) / len(found) if found else None,
-        majority=max((share for which in classes if (share := _share(label == which)) is not None), default=None),
+        majority=max(float(of.mean()) for of in of_class.values()) if len(label) else None,
     )
 
 
 def _score_cells(
-    model: str, by: str, said: _Cells, true: _Cells, horizons_s: tuple[float, ...], strata: Mapping[str, Flags]
+    model: str, source: str, own: Codes, true: Codes, horizons_s: tuple[float, ...], strata: Mapping[str, Flags]
 ) -> Iterator[CellScore]:
-    """One row for each horizon and stratum."""
-    true_cell = number_cells(true.column, true.row)
-    row = (said.row == true.row) & (np.abs(true.row) < OUTSIDE)
-    lane = (said.column == true.column) & (np.abs(true.column) < OUTSIDE)
-    clipped = (_clip(said.row) == _clip(true.row)) & (_clip(said.column) == _clip(true.column))
+    """Score predicted columns and rows (S, T, 2): one score for each horizon and stratum."""
+    true_cell = number_cells(true[..., 0], true[..., 1])
+    right = (own == true) & (np.abs(true) < OUTSIDE)
+    clipped = (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1)
     for horizon, seconds in enumerate(horizons_s):
         for stratum, of in strata.items():
             cells = true_cell[of, horizon]
             inside = np.bincount(cells[cells >= 0], minlength=9)
             yield CellScore(
                 model=model,
-                column=by,
+                column=source,
                 seconds=seconds,
                 stratum=stratum,
                 n=len(cells),
-                cell=_share((row & lane)[of, horizon]),
-                row=_share(row[of, horizon]),
-                lane=_share(lane[of, horizon]),
-                cell_clipped=_share(clipped[of, horizon]),
+                cell=_mean(right[of, horizon].all(axis=-1)),
+                row=_mean(right[of, horizon, 1]),
+                lane=_mean(right[of, horizon, 0]),
+                cell_clipped=_mean(clipped[of, horizon]),
                 majority=int(inside.max()) / len(cells) if len(cells) else None,
-                own_lane=_share(true.column[of, horizon] == 0),
-                outside=_share(cells < 0),
+                own_lane=_mean(true[of, horizon, 0] == 0),
+                outside=_mean(cells < 0),
             )
 
 
-def _clip(codes: Codes) -> Codes:
-    return np.clip(codes, -1, 1)
-
-
-def _share(flags: Flags) -> float | None:
+def _mean(flags: Flags) -> float | None:
+    """Compute the share of flags that are set; None where there are none."""
     return float(flags.mean()) if len(flags) else None
 
 
-def _find_strata(judged: Judged) -> dict[str, Flags]:
-    """Which samples are of each stratum; all of them first."""
-    everything = np.ones(len(judged.sample), dtype=np.bool_)
-    return {ALL: everything} | {name: judged.stratum == number for number, name in enumerate(STRATA)}
+def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:
+    """Convert the forest's horizons to ticks ahead: (T,).
 
-
-def _cut(numbers: Integers) -> Iterator[Integers]:
-    for start in range(0, len(numbers), BATCH_SIZE):
-        yield numbers[start : start + BATCH_SIZE]
-
-
-def _find_ticks(folder: TensorFolder, forest: LaneForest) -> npt.NDArray[np.intp]:
-    """(T,) positions of the forest's horizons in futures."""
-    protocol = folder.protocol
-    scored = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
+    Raises:
+        TracklakeError: the forest was fitted at another rate, or for horizons that the folder does not score.
+    """
+    protocol, scored = folder.protocol, list_horizons(folder.protocol)
     if forest.rate_hz != protocol.rate_hz or not set(forest.horizons_s) <= set(scored):
         raise TracklakeError(
             f"the forest was fitted at {forest.rate_hz} Hz for horizons of {forest.horizons_s} s; {folder.path} is of "
             f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
         )
-    return np.round(np.array(forest.horizons_s) * protocol.rate_hz).astype(np.intp) - 1
+    return tuple(round(seconds * protocol.rate_hz) for seconds in forest.horizons_s)

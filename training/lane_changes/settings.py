@@ -1,4 +1,4 @@
-"""What can be set of a lane-change forest; each value stands in the stored forest."""
+"""Settings of a lane-change forest, stored with the forest."""
 
 import math
 from collections.abc import Mapping
@@ -9,6 +9,7 @@ from tracklake.schemas.errors import UsageError
 from tracklake.training.lane_changes.labels import START_S, TOLERANCE_M
 
 AUGMENTATIONS = ("mirror", "shift")
+"""Copies of all examples that a fit can add: on a mirrored road, or with the ego at another distance."""
 
 
 @dataclass(frozen=True)
@@ -16,15 +17,16 @@ class LaneForestSettings:
     """How examples are labelled, drawn and learned from.
 
     Args:
-        start_s: T_d, how long before its end a maneuver begins; the publication gives none.
-        tolerance_m: how near a lane's centre has reached it.
-        examples: drawn from the training part at most, before augmentation.
-        augmentation: of AUGMENTATIONS; each adds a copy of the examples, mirrored or with the ego shifted.
-        shift_m: egos are shifted by up to this, either way.
-        trees: in the forest.
-        leaf: examples that a leaf holds at least.
-        least_correlation: features that correlate less with every class are left out.
-        most_correlation: of two features that correlate more, the one that says less of the classes is left out.
+        start_s: T_d, time from a maneuver's start to its end, s.
+        tolerance_m: distance from a lane's centre at which the vehicle has reached it, m.
+        examples: largest number drawn from the training part, before augmentation.
+        augmentation: names from AUGMENTATIONS.
+        shift_m: largest shift of an ego along the road, either way, m.
+        trees: number of trees.
+        leaf: smallest number of examples in a leaf.
+        least_correlation: features that correlate less than this with every class are left out.
+        most_correlation: of two features that correlate more than this, the one that correlates less with the classes
+            is left out.
     """
 
     start_s: float = START_S
@@ -38,14 +40,14 @@ class LaneForestSettings:
     most_correlation: float = 0.95
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Refuse values that make no sense.
 
         Raises:
-            UsageError: saying what.
+            UsageError: a value is out of range, or an augmentation is unknown.
         """
         unknown = sorted(set(self.augmentation) - set(AUGMENTATIONS))
         if unknown:
-            raise UsageError(f"augmentation is of {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
+            raise UsageError(f"augmentation: expected {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
         for name in ("start_s", "examples", "trees", "leaf"):
             if not 0 < getattr(self, name) < math.inf:
                 raise UsageError(f"{name}: expected more than 0, got {getattr(self, name)}")
@@ -55,19 +57,27 @@ class LaneForestSettings:
 
     @classmethod
     def read(cls, stored: object) -> Self:
-        """What a forest's facts hold; a setting that they lack is as it is by itself.
+        """Read settings from plain values; a missing setting takes its default.
 
         Raises:
-            UsageError: it is no object, or a value is none of these, of another kind, or cannot be.
+            UsageError: not an object, or a setting is unknown, of another type, or out of range.
         """
         if not isinstance(stored, Mapping):
             raise UsageError(f"expected settings by name, got {type(stored).__name__}")
-        known = {own.name: own.default for own in fields(cls)}
-        read: dict[str, Any] = {}
+        defaults = {own.name: own.default for own in fields(cls)}
+        values: dict[str, Any] = {}
         for name, value in stored.items():
-            given = tuple(value) if isinstance(value, list) else value
-            given = float(given) if type(given) is int and isinstance(known.get(name), float) else given
-            if name not in known or type(given) is not type(known[name]):
-                raise UsageError(f"expected settings of {', '.join(known)}, each as by itself; got {name} = {value!r}")
-            read[name] = given
-        return cls(**read)
+            kind = type(defaults.get(name))
+            given = (
+                tuple(value)
+                if isinstance(value, list)
+                else float(value)
+                if (type(value), kind) == (int, float)
+                else value
+            )
+            if name not in defaults or type(given) is not kind:
+                raise UsageError(
+                    f"expected settings {', '.join(defaults)}, typed as their defaults; got {name} = {value!r}"
+                )
+            values[name] = given
+        return cls(**values)

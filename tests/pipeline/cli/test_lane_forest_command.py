@@ -11,7 +11,7 @@ from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes import LaneForest
 from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA
-from tracklake.training.lane_changes.features import NAMES
+from tracklake.training.lane_changes.features import FEATURE_NAMES
 from tracklake.training.models import MODELS
 from tracklake.training.runs.run_folder import describe_run, save_run
 
@@ -35,12 +35,12 @@ def done(command, copied):
 
 def test_the_forest_and_its_scores_are_stored(done, copied):
     folder = copied / "models" / "lane-forest"
-    assert sorted(file.name for file in folder.iterdir()) == ["forest.npz", "lane_forest.json"]
-    forest = LaneForest.load(folder / "forest.npz")
+    assert sorted(file.name for file in folder.iterdir()) == ["forest.skops", "lane_forest.json"]
+    forest = LaneForest.load(folder / "forest.skops")
     stored = json.loads((folder / "lane_forest.json").read_text())
     assert stored["forest"] == forest.facts
     assert stored["features"] == list(forest.names)
-    assert {row["feature"] for row in stored["forest"]["coefficients"]} == set(NAMES)
+    assert {row["feature"] for row in stored["forest"]["coefficients"]} == set(FEATURE_NAMES)
     assert (forest.facts["seed"], forest.facts["settings"]["examples"]) == (4, 300)
     keys = {(row["model"], row["column"], row["seconds"], row["stratum"]) for row in stored["cells"]}
     assert keys == {
@@ -53,7 +53,7 @@ def test_the_forest_and_its_scores_are_stored(done, copied):
     assert stored["left_out"] == sum(stored["left_out_by_reason"].values())
     assert tuple(stored["left_out_by_reason"]) == LEFT_OUT
     assert (stored["learning_curve"], stored["passed_by"]) == ([], {})
-    assert str(folder / "forest.npz") in done.out
+    assert str(folder / "forest.skops") in done.out
 
 
 def test_what_a_person_reads(done):
@@ -87,7 +87,7 @@ def kept(done, copied):
 
 def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     """A run of constant velocity is scored as constant velocity itself; what cannot be opened is passed by."""
-    scored, forest = json.loads((kept / "lane_forest.json").read_text()), (kept / "forest.npz").read_bytes()
+    scored, forest = json.loads((kept / "lane_forest.json").read_text()), (kept / "forest.skops").read_bytes()
     [index] = (copied / "tensors").glob("*/*/index.json")
     folder = TensorFolder.open(index.parent)
     config, models = describe_run("constant-velocity", {}, {}, folder), copied / "models"
@@ -111,7 +111,7 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     assert finished.code == 0, finished.err
     told = json.loads(finished.out)
     assert told["forest"] == scored["forest"]
-    assert (kept / "forest.npz").read_bytes() == forest
+    assert (kept / "forest.skops").read_bytes() == forest
     straight = [own for own in scored["cells"] if own["model"] == "constant-velocity"]
     assert [own for own in told["cells"] if own["model"] == "good"] == [own | {"model": "good"} for own in straight]
     assert [own for own in told["cells"] if own["model"] != "good"] == scored["cells"]
@@ -138,10 +138,10 @@ def test_settings_are_the_forests(command, copied, kept):
         "lane-forest", "--lake", copied, "--examples", "200", *(part for own in given for part in ("--set", own))
     )
     assert finished.code == 0, finished.err
-    forest = LaneForest.load(kept / "forest.npz")
+    forest = LaneForest.load(kept / "forest.skops")
     known = forest.facts["settings"]
     assert [known[name] for name in ("start_s", "trees", "leaf", "shift_m", "examples")] == [2.0, 3, 9, 1.5, 200]
-    assert len(forest.root) == 3
+    assert len(forest.classifier.estimators_) == 3
 
 
 @pytest.mark.parametrize(
@@ -162,16 +162,16 @@ def test_what_cannot_be_set_is_told(command, copied, arguments, told):
 
 
 def test_a_forest_of_another_protocol_or_none_is_not_used(command, copied, kept):
-    file = kept / "forest.npz"
+    file = kept / "forest.skops"
     forest = LaneForest.load(file)
     replace(forest, facts=forest.facts | {"protocol": {"name": CSP.name, "digest": "another"}}).save(file)
     finished = command.here("lane-forest", "--lake", copied, "--use")
     assert finished.code == 1
-    assert f"forest.npz: fitted for another protocol than csp ({CSP.digest})" in finished.err
+    assert f"forest.skops: fitted for another protocol than csp ({CSP.digest})" in finished.err
     file.unlink()
     finished = command.here("lane-forest", "--lake", copied, "--use")
     assert finished.code == 1
-    assert "forest.npz: no such file; run `tracklake lane-forest` again" in finished.err
+    assert "forest.skops: no such file; run `tracklake lane-forest` again" in finished.err
 
 
 def test_other_tensors_are_refused(command, copied):

@@ -13,7 +13,13 @@ from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation import guard
 from tracklake.training.evaluation.evaluate import measure_errors
-from tracklake.training.evaluation.guard import OF_ROWS, OF_SAMPLES, choose_moments, refuse_future, samples_of_scene
+from tracklake.training.evaluation.guard import (
+    ROW_CHANGES,
+    SAMPLE_CHANGES,
+    choose_moments,
+    find_scene_samples,
+    refuse_future,
+)
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, Prediction
@@ -198,7 +204,9 @@ def test_asking_for_what_comes_is_refused(folder, cheat):
     ],
 )
 def test_a_model_that_reaches_the_tensors_another_way_is_found_out(folder, cheat, array):
-    told = rf"`cheat` sees the future: what .* at tick \d+ of highd/b changes .*\(`{array}` of sample \d+, .* apart"
+    told = (
+        rf"`cheat` sees the future: its prediction at tick \d+ of highd/b changes .*\(`{array}` of sample \d+, .* apart"
+    )
     with pytest.raises(FutureInputError, match=told):
         measure_errors(cheat(folder), folder, "eval", name="cheat")
 
@@ -250,7 +258,9 @@ def test_a_model_that_never_says_the_same_cannot_be_checked(folder):
             said = super().predict(observed).position_m
             return Prediction(said + np.random.default_rng().normal(size=said.shape))
 
-    with pytest.raises(TracklakeError, match=r"`dreams` predicts otherwise each time it is asked .*fix its seed"):
+    with pytest.raises(
+        TracklakeError, match=r"`dreams` predicts differently each time from the same input .*fix its seed"
+    ):
         measure_errors(Dreams(), folder, "eval", name="dreams")
 
 
@@ -289,14 +299,14 @@ def test_the_folder_is_as_it_was_after_a_refusal(folder):
 
 
 def test_everything_that_is_told_by_row_is_another_thing_afterwards(folder):
-    assert set(OF_ROWS) == {array.name for array in ARRAYS if array.shape[0] == "N"}
-    for name, change in {**OF_ROWS, **OF_SAMPLES}.items():
+    assert set(ROW_CHANGES) == {array.name for array in ARRAYS if array.shape[0] == "N"}
+    for name, change in {**ROW_CHANGES, **SAMPLE_CHANGES}.items():
         values = getattr(folder, name)
         other = change(values.copy())
         assert other.dtype == values.dtype, name
         same = np.isclose(other, values)
         assert not same.any() or name == "sample_future", name
-    assert OF_SAMPLES["sample_future"](np.array([1, 2, 4], dtype=np.uint8)).tolist() == [1, 1, 3]
+    assert SAMPLE_CHANGES["sample_future"](np.array([1, 2, 4], dtype=np.uint8)).tolist() == [1, 1, 3]
 
 
 @pytest.mark.parametrize("name", ["position_m", "speed_mps", "lane"])
@@ -304,7 +314,7 @@ def test_differences_between_later_rows_change_as_well(name):
     """Whatever stood there: of two rows within a horizon of each other, not even the difference stays."""
     dtypes = {"position_m": np.int16, "speed_mps": np.float32, "lane": np.int16}
     still = np.zeros((20_000, 2) if name == "position_m" else 20_000, dtype=dtypes[name])
-    other = OF_ROWS[name](still)
+    other = ROW_CHANGES[name](still)
     for apart in range(1, MOST_TICKS + 1):
         assert (other[apart:] != other[:-apart]).all()
     assert len(np.unique(np.diff(other, axis=0).reshape(len(other) - 1, -1)[:, 0])) > 2, "nor does it grow evenly"
@@ -313,7 +323,8 @@ def test_differences_between_later_rows_change_as_well(name):
 def test_runs_end_at_the_moment_and_what_can_be_seen_of_them_stays(stored):
     """Every row keeps its subset, tick and size; later ones are of nobody who was seen."""
     for scene in stored.scenes_of("eval"):
-        _, tick, begin, after = guard._rows_after(stored, scene)
+        where, begin, after = guard._find_later_rows(stored, scene)
+        tick = int(where.split()[2])
         kept = dict(vars(stored))
         rows = np.arange(len(stored.position_m))
 
@@ -326,7 +337,7 @@ def test_runs_end_at_the_moment_and_what_can_be_seen_of_them_stays(stored):
         facts, vehicle, _ = look_up()
         here = facts[0] == facts[0][stored.scene_row[stored.scene_offset[scene]]]
         assert after.tolist() == rows[here & (facts[1] > tick)].tolist()
-        with guard._another(stored, guard._cut_runs(stored, begin)):
+        with guard._replace_arrays(stored, guard._cut_runs(stored, begin)):
             facts_then, vehicle_then, end = look_up()
             of_runs = [own.name for own in ARRAYS if own.shape == ("R",)]
             assert {len(getattr(stored, name)) for name in of_runs} == {len(stored.run_first_row) - 1}
@@ -347,7 +358,7 @@ def test_moments_are_spread_over_the_part_and_are_not_its_ends(folder):
     assert choose_moments(folder, "eval", 3).tolist() == [scenes[1], scenes[5], scenes[9]]
     assert choose_moments(folder, "eval", 1000).tolist() == scenes.tolist()
     assert len(choose_moments(folder, "val", 3)) == 0
-    together = np.concatenate([samples_of_scene(folder, scene) for scene in scenes])
+    together = np.concatenate([find_scene_samples(folder, scene) for scene in scenes])
     assert sorted(together) == folder.samples_of("eval").tolist()
 
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from test_densities import look_up, random_density
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.evaluations import AVERAGES, EVALUATIONS, FIGURES
 from tracklake.training.data.observed import Truth
 from tracklake.training.evaluation.scores import Score, Strata, Tally
@@ -241,14 +242,14 @@ def test_a_prediction_of_another_shape_is_refused():
     case = plain([[1.0, 2.0]])
     # Places of one tick would be broadcast over all of them.
     case.said = Prediction(case.said.position_m[:, :1])
-    with pytest.raises(ValueError, match=r"expected places of shape \(2, 4, 2\), got \(2, 1, 2\)"):
+    with pytest.raises(TracklakeError, match=r"expected places of shape \(2, 4, 2\), got \(2, 1, 2\)"):
         tally(case)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 2.5, -1.0])
 def test_seconds_between_ticks_or_beyond_the_horizon_are_refused(seconds):
     own = Tally(plain([[1.0]]).strata, TICKS)
-    with pytest.raises(ValueError, match=f"no tick lies {seconds:g} s ahead: expected multiples of 0.5 s up to 2"):
+    with pytest.raises(UsageError, match=f"no tick lies {seconds:g} s ahead: expected multiples of 0.5 s up to 2"):
         own.score((seconds,), RATE_HZ)
 
 

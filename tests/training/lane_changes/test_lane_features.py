@@ -10,11 +10,11 @@ from lane_tracks import CODES
 
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import ObservedScene
-from tracklake.training.lane_changes.choice import choose_features
 from tracklake.training.lane_changes.features import (
+    FEATURE_NAMES,
+    FEATURE_NUMBER,
     FEATURES,
-    NAMES,
-    NUMBER,
+    choose_features,
     describe_targets,
     find_egos,
     mirror_targets,
@@ -56,7 +56,7 @@ def describe(*vehicles, rate_hz=RATE, **of_scene):
     values = describe_targets(scene(*vehicles, **of_scene), rate_hz)
     assert values.shape == (1, len(FEATURES))
     assert values.dtype == np.float32
-    return dict(zip(NAMES, values[0].tolist(), strict=True))
+    return dict(zip(FEATURE_NAMES, values[0].tolist(), strict=True))
 
 
 def test_the_target_alone():
@@ -79,7 +79,7 @@ def test_the_target_alone():
         "left_lane": 0,
         "right_lane": 1,
     }
-    nobody = dict.fromkeys(NAMES[NUMBER["ego"] :], 0)
+    nobody = dict.fromkeys(FEATURE_NAMES[FEATURE_NUMBER["ego"] :], 0)
     assert found == pytest.approx(expected | nobody, abs=2e-3, rel=1e-3)
 
 
@@ -203,7 +203,7 @@ def test_mirrored_scenes_have_mirrored_features(seed):
     features = describe_targets(seen, RATE)
     np.testing.assert_allclose(mirrored, mirror_targets(features), atol=1e-5)
     np.testing.assert_array_equal(mirror_targets(mirror_targets(features)), features)
-    lateral = [NUMBER[name] for name in ("lateral_speed_mps", "offset_m")]
+    lateral = [FEATURE_NUMBER[name] for name in ("lateral_speed_mps", "offset_m")]
     np.testing.assert_array_equal(mirror_targets(features)[:, lateral], -features[:, lateral])
 
 
@@ -229,7 +229,7 @@ def test_no_scenes_have_no_features():
 
 def test_a_shift_moves_the_ego_alone_and_leaves_it_behind():
     features = np.zeros((4, len(FEATURES)), np.float32)
-    gap, ego = NUMBER["gap_m"], NUMBER["ego"]
+    gap, ego = FEATURE_NUMBER["gap_m"], FEATURE_NUMBER["ego"]
     features[:, ego] = [1, 1, 1, 0]
     features[:, gap] = [30, 30, 4, 0]
     shifted = shift_targets(features, np.array([5.0, -5.0, -5.0, 5.0], np.float32))
@@ -243,21 +243,23 @@ def test_features_are_chosen_by_their_correlation():
     maneuver = draw.integers(0, 3, 500).astype(np.uint8)
     feature = np.zeros((500, len(FEATURES)), np.float32)
     left, right = (maneuver == CODES[letter] for letter in "lr")
-    feature[:, NUMBER["lateral_speed_mps"]] = right * 1.0 - left + draw.normal(scale=0.3, size=500)
-    feature[:, NUMBER["moved_m"]] = feature[:, NUMBER["lateral_speed_mps"]] * 3 + draw.normal(scale=0.4, size=500)
-    feature[:, NUMBER["speed_mps"]] = left * 2.0 + draw.normal(size=500)
-    feature[:, NUMBER["gap_m"]] = draw.normal(size=500)
-    feature[:, NUMBER["ego"]] = 1
+    feature[:, FEATURE_NUMBER["lateral_speed_mps"]] = right * 1.0 - left + draw.normal(scale=0.3, size=500)
+    feature[:, FEATURE_NUMBER["moved_m"]] = feature[:, FEATURE_NUMBER["lateral_speed_mps"]] * 3 + draw.normal(
+        scale=0.4, size=500
+    )
+    feature[:, FEATURE_NUMBER["speed_mps"]] = left * 2.0 + draw.normal(size=500)
+    feature[:, FEATURE_NUMBER["gap_m"]] = draw.normal(size=500)
+    feature[:, FEATURE_NUMBER["ego"]] = 1
     table = choose_features(feature, maneuver, least=0.2, most=0.95)
     assert len(table) == len(FEATURES)
     by_name = {row.feature: row for row in table}
     for name in ("lateral_speed_mps", "moved_m", "speed_mps", "gap_m"):
-        expected = [np.corrcoef(feature[:, NUMBER[name]], maneuver == code)[0, 1] for code in range(3)]
+        expected = [np.corrcoef(feature[:, FEATURE_NUMBER[name]], maneuver == code)[0, 1] for code in range(3)]
         assert [by_name[name].keep, by_name[name].left, by_name[name].right] == pytest.approx(expected, abs=1e-6)
     strengths = [max(abs(row.keep), abs(row.left), abs(row.right)) for row in table]
     assert strengths == sorted(strengths, reverse=True)
     assert [row.feature for row in table if row.chosen] == ["lateral_speed_mps", "speed_mps"]
-    alike = np.corrcoef(feature[:, NUMBER["moved_m"]], feature[:, NUMBER["lateral_speed_mps"]])[0, 1]
+    alike = np.corrcoef(feature[:, FEATURE_NUMBER["moved_m"]], feature[:, FEATURE_NUMBER["lateral_speed_mps"]])[0, 1]
     assert by_name["moved_m"].reason == f"as lateral_speed_mps ({alike:.3f})"
     assert by_name["gap_m"].reason == by_name["ego"].reason == "below 0.2"
     assert by_name["ego"].strength == 0, "what does not vary says nothing"

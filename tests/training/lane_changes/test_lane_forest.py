@@ -1,11 +1,14 @@
-"""A forest's arrays say what scikit-learn's trees say; stored, they come back, and what is damaged is refused."""
+"""Forests are fitted, stored and read back; files that are damaged or foreign are refused."""
 
 import json
+import pickle
+import zipfile
 from dataclasses import asdict, replace
-from io import BytesIO
 
 import numpy as np
 import pytest
+import sklearn
+import skops.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, random_examples, track
@@ -13,158 +16,206 @@ from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.nearest_vehicles import gather_surroundings
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,
     Examples,
-    augment,
     draw_balanced,
     gather_examples,
-    judge_samples,
+    label_samples,
 )
-from tracklake.training.lane_changes.features import FEATURES, NUMBER
-from tracklake.training.lane_changes.fitting import fit_lane_forest, fit_trees, grow, to_arrays
-from tracklake.training.lane_changes.forest import ForestError, LaneForest, decide
+from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER, FEATURES
+from tracklake.training.lane_changes.forest import (
+    VERSION,
+    ForestError,
+    LaneForest,
+    decide_classes,
+    fit_examples,
+    fit_lane_forest,
+)
 from tracklake.training.lane_changes.settings import LaneForestSettings
 
 FACTS = {"protocol": {"name": "short"}, "blocks": [], "train_subsets": ["highd/a"]}
 FEW = LaneForestSettings(trees=7, leaf=3, augmentation=(), examples=400)
-HORIZONS_S = (0.5, 1.0)
+BRIEF = Protocol(name="brief", rate_hz=10, history_s=2.0, horizon_s=1.0, scored_s=(0.5, 1.0))
 
 
 @pytest.fixture(scope="module")
 def forest():
-    return grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts=FACTS)
+    return fit_examples(random_examples(1, 300), FEW, 3, protocol=BRIEF, facts=FACTS)
 
 
 @pytest.mark.parametrize("missing", [None, "r", "l"])
-def test_the_walk_says_what_scikit_learn_says(missing):
+def test_classes_without_examples_have_no_probability(missing):
     examples = random_examples(2, 300)
     if missing:
         maneuver = np.where(examples.maneuver == CODES[missing], CODES["k"], examples.maneuver).astype(np.uint8)
         ahead = examples.ahead.copy()
         ahead[:, 1] = CODES["k"]  # one class only
         examples = replace(examples, maneuver=maneuver, ahead=ahead)
-    classes = np.concatenate([examples.maneuver[:, None], examples.ahead], axis=1)
-    fitted = fit_trees(examples.feature, classes, FEW, 5)
-    names = tuple(feature.name for feature in FEATURES)
-    ours = LaneForest(names, 10, HORIZONS_S, {}, **to_arrays(fitted))
-    asked = np.random.default_rng(3).normal(size=(5000, len(FEATURES))).astype(np.float32)
-    asked[:300] = examples.feature
-    odds = ours.predict_proba(asked)
-    assert odds.shape == (5000, 3, 3)
-    for output, theirs in enumerate(fitted.predict_proba(asked)):
-        expected = np.zeros((5000, 3))
-        expected[:, fitted.classes_[output].astype(int)] = theirs
-        np.testing.assert_allclose(odds[:, output], expected, atol=1e-6)
-    assert decide(np.array([[0.3, 0.3, 0.4], [0.5, 0.5, 0.0]])).tolist() == [2, 0]
+    forest = fit_examples(examples, FEW, 5, protocol=BRIEF)
+    probability = forest.predict_proba(random_examples(3, 5000).feature)
+    assert probability.shape == (5000, 3, 3)
+    np.testing.assert_allclose(probability.sum(axis=-1), 1, atol=1e-6)
+    assert (probability.max(axis=0) > 0).all() == (missing is None)
+    if missing:
+        assert not probability[:, 0, CODES[missing]].any()
+        assert (probability[:, 2, CODES["k"]] == 1).all()
+    asked = random_examples(3, 5000).feature[:, [FEATURE_NUMBER[name] for name in forest.names]]
+    for output, theirs in enumerate(forest.classifier.predict_proba(asked)):
+        classes = forest.classifier.classes_[output].astype(int)
+        np.testing.assert_array_equal(probability[:, output, classes], theirs.astype(np.float32))
+    assert forest.predict_proba(np.zeros((0, len(FEATURES)), np.float32)).shape == (0, 3, 3)
+    assert decide_classes(np.array([[0.3, 0.3, 0.4], [0.5, 0.5, 0.0]])).tolist() == [2, 0]
 
 
 def test_it_learns_what_there_is_to_learn(forest):
     new = random_examples(9, 2000)
-    right = decide(forest.predict_proba(new.feature))[:, 0] == new.maneuver
+    right = decide_classes(forest.predict_proba(new.feature))[:, 0] == new.maneuver
     majority = np.bincount(new.maneuver).max() / 2000
     assert right.mean() > majority + 0.15
     assert forest.names[0] == "lateral_speed_mps"
 
 
 def test_same_seed_same_forest(forest):
-    again = grow(random_examples(1, 300), FEW, 3, rate_hz=10, horizons_s=HORIZONS_S, facts=FACTS)
-    other = grow(random_examples(1, 300), FEW, 4, rate_hz=10, horizons_s=HORIZONS_S)
-    np.testing.assert_array_equal(again.threshold, forest.threshold)
+    again = fit_examples(random_examples(1, 300), FEW, 3, protocol=BRIEF, facts=FACTS)
+    other = fit_examples(random_examples(1, 300), FEW, 4, protocol=BRIEF)
+    asked = random_examples(4, 500).feature
+    np.testing.assert_array_equal(again.predict_proba(asked), forest.predict_proba(asked))
     assert again.facts == forest.facts
     assert again.facts["seed"] == 3
     assert len(again.facts["coefficients"]) == len(FEATURES)
-    assert other.threshold.shape != forest.threshold.shape or (other.threshold != forest.threshold).any()
+    assert (other.predict_proba(asked) != forest.predict_proba(asked)).any()
 
 
 def test_stored_and_read_back(forest, tmp_path):
-    forest.save(tmp_path / "forest.npz")
-    back = LaneForest.load(tmp_path / "forest.npz")
+    forest.save(tmp_path / "forest.skops")
+    back = LaneForest.load(tmp_path / "forest.skops")
     asked = random_examples(4, 500).feature
     np.testing.assert_array_equal(back.predict_proba(asked), forest.predict_proba(asked))
     for name in ("names", "rate_hz", "horizons_s", "facts"):
         assert getattr(back, name) == getattr(forest, name)
-    assert [file.name for file in tmp_path.iterdir()] == ["forest.npz"], "nothing is left beside it"
-    with np.load(tmp_path / "forest.npz", allow_pickle=False) as stored:
-        assert all(stored[name].dtype != object for name in stored.files)
+    assert back.settings == FEW
+    assert [file.name for file in tmp_path.iterdir()] == ["forest.skops"], "nothing is left beside it"
+    found = skops.io.get_untrusted_types(file=tmp_path / "forest.skops")
+    assert found == ["sklearn.tree._tree.Tree"], "numbers are all that is read, and no code"
 
 
 def rewrite(file, **changes):
-    with np.load(file) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    for name, change in changes.items():
-        arrays[name] = change(arrays[name]) if callable(change) else change
-    np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
-
-
-def as_npy(array):
-    stream = BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
+    """Store the parts of a file again, some of them changed."""
+    content = skops.io.load(file, trusted=["sklearn.tree._tree.Tree"])
+    skops.io.dump({name: changes[name](part) if name in changes else part for name, part in content.items()}, file)
 
 
 def in_header(**changes):
-    def change(text):
-        return np.frombuffer(json.dumps(json.loads(text.tobytes()) | changes).encode(), np.uint8)
-
-    return lambda file: rewrite(file, header=change)
+    return lambda file: rewrite(file, header=lambda text: json.dumps(json.loads(text) | changes))
 
 
 def with_settings(settings):
     return in_header(facts={**FACTS, "settings": settings})
 
 
-def set_at(position, value):
-    def change(array):
-        array = array.copy()
-        array[position] = value
-        return array
+def in_nodes(name, value):
+    """Set a field of the first tree's root."""
 
-    return change
+    def change(classifier):
+        tree = classifier.estimators_[0].tree_
+        state = tree.__getstate__()
+        state["nodes"][name][0] = value
+        tree.__setstate__(state)
+        return classifier
+
+    return lambda file: rewrite(file, classifier=change)
 
 
+def in_classifier(**changes):
+    def change(classifier):
+        for name, value in changes.items():
+            setattr(classifier, name, value)
+        return classifier
+
+    return lambda file: rewrite(file, classifier=change)
+
+
+class Foreign:
+    """A type that nobody trusts."""
+
+
+def flip_byte(file):
+    whole = file.read_bytes()
+    file.write_bytes(whole[:900] + bytes([whole[900] ^ 1]) + whole[901:])
+
+
+def save_version_1(file):
+    """The arrays that earlier versions stored."""
+    with file.open("wb") as stream:
+        np.savez(stream, header=np.frombuffer(b'{"version": 1}', np.uint8), root=np.zeros(1, np.int32))
+
+
+def set_version(file):
+    """Change scikit-learn's version where skops notes it."""
+    with zipfile.ZipFile(file) as stored:
+        members = {name: stored.read(name) for name in stored.namelist()}
+    schema = members["schema.json"].replace(
+        json.dumps(f'"{sklearn.__version__}"').encode(), json.dumps('"0.1"').encode()
+    )
+    with zipfile.ZipFile(file, "w") as changed:
+        for name, content in (members | {"schema.json": schema}).items():
+            changed.writestr(name, content)
+
+
+UNREADABLE = "not a lane forest that can be read here"
 DAMAGES = {
     "gone": (lambda file: file.unlink(), "no such file"),
-    "empty": (lambda file: file.write_bytes(b""), "not a whole lane forest"),
-    "cut short": (lambda file: file.write_bytes(file.read_bytes()[:-99]), "not a whole lane forest"),
-    "a flipped byte": (
-        lambda file: file.write_bytes((whole := file.read_bytes())[:900] + bytes([whole[900] ^ 1]) + whole[901:]),
-        "not a whole lane forest",
+    "empty": (lambda file: file.write_bytes(b""), UNREADABLE),
+    "cut short": (lambda file: file.write_bytes(file.read_bytes()[:-99]), UNREADABLE),
+    "a flipped byte": (flip_byte, UNREADABLE),
+    "something else": (lambda file: file.write_text("forest"), UNREADABLE),
+    "a pickle": (lambda file: file.write_bytes(pickle.dumps({"header": "{}"})), UNREADABLE),
+    "an earlier version": (save_version_1, UNREADABLE),
+    "other contents": (lambda file: skops.io.dump([1, 2], file), UNREADABLE),
+    "a missing part": (lambda file: skops.io.dump({"header": "{}"}, file), UNREADABLE + r" \('classifier'\)"),
+    "a type of someone else's": (
+        lambda file: rewrite(file, classifier=lambda _: Foreign()),
+        UNREADABLE + ".*Untrusted types found in the file: .*Foreign",
     ),
-    "something else": (lambda file: file.write_text("forest"), "not a whole lane forest"),
-    "a single array": (lambda file: file.write_bytes(as_npy(np.zeros(3))), "not a whole lane forest"),
-    "a pickle": (lambda file: np.savez(file, header=np.array([{}], object)), "not a whole lane forest"),
-    "other arrays": (lambda file: np.savez(file, weights=np.zeros(3)), "not a whole lane forest"),
-    "a missing array": (lambda file: rewrite(file, left=None), r"expected arrays .*left \(int32\).*, got feature"),
-    "another dtype": (lambda file: rewrite(file, left=lambda a: a.astype(np.int64)), r"got .*left \(int64\)"),
-    "no object": (lambda file: rewrite(file, header=np.frombuffer(b"[1]", np.uint8)), "that is an object, got list"),
-    "a later version": (in_header(version=2), "expected version 1 of lane forests, got 2"),
+    "trees of another scikit-learn": (
+        set_version,
+        UNREADABLE + ".* from version 0.1 when using version",
+    ),
+    "another estimator": (
+        lambda file: rewrite(file, classifier=lambda own: own.estimators_[0]),
+        "expected a RandomForestClassifier, got DecisionTreeClassifier",
+    ),
+    "no object": (lambda file: rewrite(file, header=lambda _: "[1]"), "that is an object, got list"),
+    "a later version": (in_header(version=VERSION + 1), "expected version 2 of lane forests, got 3"),
     "an unknown feature": (in_header(features=["colour"]), "expected features of speed_mps, .*, got .*colour"),
     "no features": (in_header(features=[]), "expected features of speed_mps"),
     "no horizons": (in_header(horizons_s=None), "expected horizons in s"),
     "a negative rate": (in_header(rate_hz=-1), "a rate in Hz"),
     "too few features": (in_header(features=["speed_mps"]), "features 0 to 0"),
-    "too many horizons": (in_header(horizons_s=[0.5, 1.0, 2.0]), r"odds in the shape \(\d+, 4, 3\)"),
+    "too many features": (in_header(features=list(FEATURE_NAMES)), "21 features"),
+    "too many horizons": (in_header(horizons_s=[0.5, 1.0, 2.0]), "expected 4 outputs"),
     "unknown origin": (in_header(facts={"settings": {}}), "got no protocol, blocks, train_subsets;"),
     "origin of another kind": (in_header(facts={**FACTS, "settings": {}, "train_subsets": 3}), "got no train_subsets;"),
     "no settings": (with_settings([]), "got no settings;"),
-    "an unknown setting": (with_settings({"depth": 3}), "expected settings of start_s, .*; got depth = 3"),
+    "an unknown setting": (with_settings({"depth": 3}), "expected settings start_s, .*; got depth = 3"),
     "a setting of another kind": (with_settings({"trees": "many"}), "got trees = 'many'"),
     "a setting that cannot be": (with_settings({"trees": 0}), "trees: expected more than 0"),
-    "a circle": (lambda file: rewrite(file, left=set_at(0, 0)), "nodes that lead on"),
-    "a way out": (lambda file: rewrite(file, right=set_at(0, 10**6)), "nodes that lead on"),
-    "a tree that begins in the middle": (lambda file: rewrite(file, root=set_at(0, 1)), "first node in order"),
-    "arrays of two lengths": (lambda file: rewrite(file, threshold=lambda a: a[1:]), "one number for each node"),
-    "no threshold": (lambda file: rewrite(file, threshold=set_at(0, np.nan)), "expected thresholds"),
-    "odds": (lambda file: rewrite(file, leaf_odds=set_at((0, 0), 0.5)), "odds that sum to 1"),
+    "a circle": (in_nodes("left_child", 0), "nodes that lead to later nodes"),
+    "a way out": (in_nodes("right_child", 10**6), "nodes that lead to later nodes"),
+    "an unknown feature at a node": (in_nodes("feature", 99), "expected nodes that compare features"),
+    "other classes": (in_classifier(classes_=[np.array([0, 1, 7])] * 3), "outputs with classes of keep, left, right"),
+    "no trees": (in_classifier(estimators_=[]), "expected at least one tree"),
+    "another number of classes": (in_classifier(n_classes_=[3, 3, 2]), "broadcast"),
 }
 
 
 @pytest.mark.parametrize(("damage", "message"), DAMAGES.values(), ids=DAMAGES)
 def test_what_is_damaged_or_foreign_is_refused(forest, tmp_path, damage, message):
-    file = tmp_path / "forest.npz"
+    file = tmp_path / "forest.skops"
     forest.save(file)
     damage(file)
     with pytest.raises(ForestError, match=message) as refused:
@@ -193,20 +244,20 @@ def test_a_draw_is_balanced_as_far_as_the_strata_go(stratum, most, seed):
 
 def test_copies_are_mirrored_and_shifted():
     examples = random_examples(6, 40)
-    examples.feature[:, NUMBER["ego"]] = 1
-    examples.feature[:, NUMBER["gap_m"]] = 30
-    more = augment(examples, replace(FEW, augmentation=("mirror", "shift"), shift_m=4.0), np.random.default_rng(0))
+    examples.feature[:, FEATURE_NUMBER["ego"]] = 1
+    examples.feature[:, FEATURE_NUMBER["gap_m"]] = 30
+    more = examples.augment(replace(FEW, augmentation=("mirror", "shift"), shift_m=4.0), np.random.default_rng(0))
     assert len(more) == 120
     np.testing.assert_array_equal(more.feature[:40], examples.feature)
     swapped = {CODES["k"]: CODES["k"], CODES["l"]: CODES["r"], CODES["r"]: CODES["l"]}
     assert more.maneuver[40:80].tolist() == [swapped[code] for code in examples.maneuver.tolist()]
     assert more.ahead[40:80].tolist() == [[swapped[code] for code in row] for row in examples.ahead.tolist()]
-    lateral, gap = NUMBER["lateral_speed_mps"], NUMBER["gap_m"]
+    lateral, gap = FEATURE_NUMBER["lateral_speed_mps"], FEATURE_NUMBER["gap_m"]
     np.testing.assert_array_equal(more.feature[40:80, lateral], -examples.feature[:, lateral])
     assert more.maneuver[80:].tolist() == examples.maneuver.tolist()
     moved = more.feature[80:, gap] - 30
     assert (np.abs(moved).max() <= 4, np.abs(moved).min() > 0, moved.std() > 1) == (True, True, True)
-    assert len(augment(examples, FEW, np.random.default_rng(0))) == 40
+    assert len(examples.augment(FEW, np.random.default_rng(0))) == 40
 
 
 def change_lanes(first_id, count, *, to_right, draw):
@@ -238,7 +289,7 @@ def test_samples_are_judged_where_the_track_goes_on(tmp_path):
     rows = track(1, y_m, speed_mps=10.0) + track(2, [2.0] * 20, speed_mps=10.0)
     rows = [(*row[:6], 12.0 if row[:2] == (1, 5) else row[6], row[7]) for row in rows]
     found = open_tracks(tmp_path / "t", {"a": rows})
-    judged = judge_samples(found, "train", replace(FEW, start_s=3.0))
+    judged = label_samples(found, "train", replace(FEW, start_s=3.0))
     # 20 ticks each: two of history before, and six (3 s, longer than the horizon of 2 s) after; 2 x 12 of 2 x 17.
     assert (len(judged.sample), judged.left_out, judged.changes) == (24, 10, 1)
     # Samples are ticks 2 to 18 of 0 to 19: 16 to 18 lack the horizon of four ticks, 14 and 15 the six of T_d.
@@ -267,7 +318,7 @@ def test_samples_without_a_lane_or_a_speed_are_left_out_and_counted(tmp_path):
     lane[3] = 0
     rows = track(1, [2.0] * 14, lane=lane)
     rows = [(*row[:6], np.nan if row[1] == 6 else 20.0, row[7]) for row in rows]
-    judged = judge_samples(open_tracks(tmp_path / "t", {"a": rows}), "train", replace(FEW, start_s=1.0))
+    judged = label_samples(open_tracks(tmp_path / "t", {"a": rows}), "train", replace(FEW, start_s=1.0))
     # Tick 3 has no lane; 10 to 12 lack the future; 6 has no speed, nor has 8 one to compare with, 1 s before.
     assert judged.reasons == dict(zip(LEFT_OUT, (1, 3, 0, 2), strict=True))
     assert len(judged.sample) == 5
@@ -283,11 +334,11 @@ def test_a_folder_is_learned_from(folder):
     assert json.loads(json.dumps(fitted.facts)) == fitted.facts, "plain values"
     drawn = sum(fitted.facts["drawn_by_stratum"].values())
     assert fitted.facts["examples"] == 3 * drawn
-    judged = judge_samples(folder, "eval", replace(FEW, start_s=3.0))
+    judged = label_samples(folder, "eval", replace(FEW, start_s=3.0))
     scene, _ = gather_surroundings(folder, judged.sample, nearest=10)
-    decided = decide(fitted.predict(scene))
+    decided = decide_classes(fitted.predict(scene))
     examples = gather_examples(folder, judged)
-    np.testing.assert_array_equal(decided, decide(fitted.predict_proba(examples.feature)))
+    np.testing.assert_array_equal(decided, decide_classes(fitted.predict_proba(examples.feature)))
     assert (decided[:, 0] == examples.maneuver).mean() > (examples.maneuver == CODES["k"]).mean() + 0.1
 
 
@@ -305,7 +356,7 @@ def test_without_evaluation_recordings_the_forest_stays_and_the_curve_is_explain
     assert "no learning curve:" in done.stderr
     assert "has no samples in `eval`; with a single recording everything trains" in done.stderr
     out = tmp_path / "lake" / "models" / "lane-forest"
-    assert len(LaneForest.load(out / "forest.npz").root) == 3
+    assert len(LaneForest.load(out / "forest.skops").classifier.estimators_) == 3
     assert json.loads((out / "lane_forest.json").read_text())["learning_curve"] == []
 
 
@@ -318,13 +369,13 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path):
         fit_lane_forest(short, 0, FEW)
     nothing = Examples(np.zeros((9, len(FEATURES)), np.float32), np.zeros(9, np.uint8), np.zeros((9, 2), np.uint8))
     with pytest.raises(TracklakeError, match=r"no feature correlates with the maneuver by 0\.05 or more"):
-        grow(nothing, FEW, 0, rate_hz=10, horizons_s=HORIZONS_S)
+        fit_examples(nothing, FEW, 0, protocol=BRIEF)
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"augmentation": ("rotate",)}, "augmentation is of mirror, shift; got rotate"),
+        ({"augmentation": ("rotate",)}, "augmentation: expected mirror, shift; got rotate"),
         ({"start_s": 0.0}, "start_s: expected more than 0, got 0.0"),
         ({"shift_m": -1.0}, "shift_m: expected 0 or more, got -1.0"),
         ({"start_s": float("inf")}, "start_s: expected more than 0, got inf"),
@@ -351,7 +402,7 @@ def test_int16_storage_gives_the_same_examples(tmp_path):
         for storage in ("float32", "int16-centimetres")
     )
     asked = replace(FEW, start_s=3.0)
-    of = [gather_examples(folder, judge_samples(folder, "train", asked)) for folder in (exact, rounded)]
+    of = [gather_examples(folder, label_samples(folder, "train", asked)) for folder in (exact, rounded)]
     np.testing.assert_array_equal(of[0].maneuver, of[1].maneuver)
     # A position is off by 5 mm at most; a parabola through three at 2 Hz multiplies that by 8 in speeds, by 16 in
     # accelerations; headings and yaw rates are those by 20 m/s.

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lane_tracks import CODES, SHORT, open_tracks, track
+from sklearn.ensemble import RandomForestClassifier
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
 from tracklake.training.lane_changes.cells import find_columns, find_rows, measure_rows, number_cells
-from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, judge_samples
+from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, label_samples
 from tracklake.training.lane_changes.forest import LaneForest
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
@@ -56,17 +57,15 @@ def test_cells_are_numbered_lane_by_lane(column, row):
 
 
 def constant_forest(*codes, horizons_s=(0.5, 1.0, 2.0), start_s=2.0):
-    """A forest of one leaf, which says the same of everyone: the maneuver, then the lane at each horizon."""
-    odds = np.eye(3)[[CODES[code] for code in codes]][None]
+    """A forest of one leaf: for every target the same maneuver, and the same lane at each horizon."""
+    classifier = RandomForestClassifier(n_estimators=1, random_state=0)
+    classifier.fit(np.zeros((2, 1)), [[CODES[code] for code in codes]] * 2)
     facts = {
         "settings": {"start_s": start_s, "tolerance_m": 0.1},
         "blocks": [],
         "train_subsets": ["highd/another"],
     }
-    nothing = np.array([-1], np.int32)
-    return LaneForest(
-        ("speed_mps",), 2, horizons_s, facts, np.array([0], np.int32), nothing, nothing, nothing, np.zeros(1), odds
-    )
+    return LaneForest(classifier, ("speed_mps",), 2, horizons_s, facts)
 
 
 class Says:
@@ -142,7 +141,7 @@ def test_a_true_place_outside_is_never_right(tmp_path):
     """It brakes after tick 2 so hard that it is far behind; a model that says so is right along, and in no cell."""
     x_m = [0, 10, 20, 21, 22, 23, 24, 25, 26, 27, 28]
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2] * 11, x_m=x_m)}, parts={"a": "eval"})
-    judged = judge_samples(folder, "eval", LaneForestSettings(start_s=2.0))
+    judged = label_samples(folder, "eval", LaneForestSettings(start_s=2.0))
     assert len(judged.sample) == 5
     scores = evaluate_grid(folder, {"knows": Says([1, 2, 3, 4], 0.0)}, constant_forest("k", "k", "k", "k"))
     for seconds in (0.5, 1.0, 2.0):
@@ -178,7 +177,7 @@ def test_places_that_are_none_are_refused_or_their_model_is_passed_by(one_change
         evaluate_grid(one_change, {"wrong": model}, forest)
     told = []
     scores = evaluate_grid(
-        one_change, {"wrong": model, **straight}, forest, pass_by=lambda name, why: told.append((name, why))
+        one_change, {"wrong": model, **straight}, forest, on_skip=lambda name, why: told.append((name, why))
     )
     [(name, why)] = told
     assert (name, re.search(message, why) is not None) == ("wrong", True)
@@ -191,7 +190,7 @@ def test_who_sees_the_future_is_found_out(one_change):
             return Prediction(np.zeros((len(observed.history), 4, 2), np.float32) + one_change.position_m[-1, 0])
 
     told = {}
-    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), pass_by=told.__setitem__)
+    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), on_skip=told.__setitem__)
     assert (scores.cells, list(told)) == ([], ["peeks"])
     assert "`peeks` sees the future" in told["peeks"]
     with pytest.raises(FutureInputError, match="`peeks` sees the future"):
@@ -251,12 +250,12 @@ def test_a_drawn_part_is_scored_in_part(busy):
 
 def test_the_learning_curve(busy):
     points = learn_curve(busy, sizes=(20, 60, 10**6), seeds=(0, 1), settings=SMALL)
-    counts = judge_samples(busy, "train", SMALL).count_strata()
+    counts = label_samples(busy, "train", SMALL).count_strata()
     assert (counts[:2] > 0).tolist() == [True, True], "everybody keeps his speed: two of the strata are empty"
     assert not counts[2:].any()
     pool = 2 * min(counts[:2])
     assert 60 < pool < sum(counts)
-    truth = judge_samples(busy, "eval", SMALL)
+    truth = label_samples(busy, "eval", SMALL)
     sizes = sorted({(point.drawn, point.augmented, point.seed) for point in points})
     assert sizes == [(size, more, seed) for size in (20, 60, pool) for more in (False, True) for seed in (0, 1)]
     assert {point.n for point in points} == {len(truth.sample)}

@@ -13,7 +13,7 @@ from tensor_tables import write
 
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.lane_changes.labels import find_judged, find_maneuvers, label_rows
+from tracklake.training.lane_changes.labels import find_labelled, find_maneuvers, label_rows
 
 
 def letters(folder, **settings):
@@ -88,8 +88,8 @@ def test_without_markings_lanes_are_nominal(tmp_path):
 
 def test_rows_near_the_end_of_their_run_are_not_judged(tmp_path):
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2] * 6) + track(2, [2] * 3)})
-    assert find_judged(folder, np.arange(9), start_s=2.0).tolist() == [True] * 2 + [False] * 7
-    assert find_judged(folder, np.arange(9), start_s=1.0).tolist() == [True] * 4 + [False] * 2 + [True] + [False] * 2
+    assert find_labelled(folder, np.arange(9), start_s=2.0).tolist() == [True] * 2 + [False] * 7
+    assert find_labelled(folder, np.arange(9), start_s=1.0).tolist() == [True] * 4 + [False] * 2 + [True] + [False] * 2
 
 
 def loop_over_rows(folder, start_s, tolerance_m, markings):
