@@ -82,7 +82,7 @@ def predict(
         from tracklake.pipeline.stages.tensors import tensor_folder
         from tracklake.schemas.files import write_file
         from tracklake.training.data.tensor_folder import TensorFolder
-        from tracklake.training.plots.drawing import draw_picture
+        from tracklake.training.plots.picture_drawing import draw_picture
 
         _check(models or [], sample, vehicle, time, pick, part, count, out)
         settings = read_settings(lake=lake, protocol=protocol)
@@ -146,7 +146,7 @@ def _check(
 
 def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
     """The sample that was named, if one was."""
-    from tracklake.training.plots.picking import find_sample
+    from tracklake.training.plots.sample_choice import find_sample
 
     if sample is not None:
         last = len(folder.sample_row) - 1
@@ -210,7 +210,7 @@ def _pick(
     judge: "Forecaster",
 ) -> list[int]:
     """Samples of a kind."""
-    from tracklake.training.plots.picking import MOST_LOOKED_AT, pick_samples
+    from tracklake.training.plots.sample_choice import MOST_LOOKED_AT, pick_samples
 
     found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
@@ -249,7 +249,7 @@ def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_v
 
 def _tell(terminal: "Terminal", picture: "Picture", file: Path) -> None:
     """Where the drawing is, and how far each model is from the truth at its end."""
-    from tracklake.training.plots.rows import list_errors
+    from tracklake.training.plots.picture_rows import list_errors
 
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
     off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
@@ -270,7 +270,7 @@ def _refuse_inattentive(asked: list["Forecaster"]) -> None:
 
 def _draw_attention(folder: "TensorFolder", asked: list["Forecaster"], samples: list[int], target: Path) -> list[Path]:
     """Attention maps of every model that has any, in a folder of its name."""
-    from tracklake.training.plots.attention_maps import export_attention
+    from tracklake.training.plots.attention_drawing import export_attention
 
     found = []
     for own in asked:

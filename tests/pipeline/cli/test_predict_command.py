@@ -130,8 +130,8 @@ def test_without_a_lake_there_is_nothing_to_draw(tmp_path, monkeypatch):
 
 def test_kinds_to_pick_are_those_that_samples_are_picked_by():
     from tracklake.pipeline.cli.predict import MOST_MODELS, SUFFIXES, Pick
-    from tracklake.training.plots import charts, drawing
-    from tracklake.training.plots.picking import PICKS
+    from tracklake.training.plots import charts, picture_drawing
+    from tracklake.training.plots.sample_choice import PICKS
 
     assert {pick.value for pick in Pick} == set(PICKS)
-    assert (MOST_MODELS, SUFFIXES) == (drawing.MOST_MODELS, charts.SUFFIXES)
+    assert (MOST_MODELS, SUFFIXES) == (picture_drawing.MOST_MODELS, charts.SUFFIXES)

@@ -9,7 +9,7 @@ from drawn_moment import FAR_SAMPLE, OWN_SAMPLE, open_moment
 from tensor_tables import TINY, random_clock, sample_everything, split_row, write
 
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.picking import NoSampleError, find_sample, measure_last_distance, pick_samples
+from tracklake.training.plots.sample_choice import NoSampleError, find_sample, measure_last_distance, pick_samples
 from tracklake.training.runs.forecasters import open_forecaster
 
 
@@ -99,7 +99,7 @@ def test_draws_repeat_by_seed_and_are_of_the_part_and_kind(many):
 
 
 def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.picking.BATCH_SIZE", 7)
+    monkeypatch.setattr("tracklake.training.plots.sample_choice.BATCH_SIZE", 7)
     folder, tables = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     places = {(v, t): (x, y) for v, t, x, y in tables[1][1].select("vehicle_id", "tick", "x_m", "y_m").rows()}
@@ -118,12 +118,12 @@ def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
 
 
 def test_of_very_many_some_are_looked_at(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.picking.MOST_LOOKED_AT", 2)
+    monkeypatch.setattr("tracklake.training.plots.sample_choice.MOST_LOOKED_AT", 2)
     folder, _ = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     assert len(pick_samples(folder, "eval", "worst", count=5, judge=judge)) == 2
 
 
 def test_the_worst_needs_a_model(folder):
-    with pytest.raises(ValueError, match="needs one to judge by"):
+    with pytest.raises(ValueError, match="needs a model to judge by"):
         pick_samples(folder, "eval", "worst")
