@@ -230,7 +230,7 @@ def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_
 
     try:
         if all_vehicles:
-            return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
+            return take_picture(folder, sample, forecast_scene(folder, sample, asked))
         run = folder.runs_of(folder.sample_row[[sample]])
         own = int(folder.run_vehicle_id[run[0]])
         return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})

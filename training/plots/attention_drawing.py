@@ -12,7 +12,6 @@ import numpy.typing as npt
 from tracklake.schemas.chart_theme import INK, MUTED, PAPER
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.plots.attention_maps import LANES, AttentionMap, map_attention
 from tracklake.training.plots.charts import Drawing, Row
 from tracklake.training.plots.forecasts import Doubles
@@ -35,9 +34,6 @@ def export_attention(
     network: "SceneAttention",
     samples: npt.ArrayLike,
     out_dir: Path,
-    *,
-    nearest: int = NEAREST,
-    suffix: str = ".svg",
 ) -> list[Path]:
     """Write a drawing and a JSON table per sample; files of the same names are replaced.
 
@@ -46,23 +42,20 @@ def export_attention(
         network: a network with attention.
         samples: (B,) sample numbers.
         out_dir: folder of the files, created if missing.
-        nearest: most vehicles around each ego.
-        suffix: `.svg` or `.png`.
 
     Returns:
         Drawing and table of the first sample, of the second ...
 
     Raises:
         IndexError: no sample has the number.
-        ValueError: another suffix.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     written = []
-    for shown in map_attention(folder, network, samples, nearest=nearest):
+    for shown in map_attention(folder, network, samples):
         picture = shown.picture
         name = f"{picture.subset}_{picture.own.vehicle_id}_{picture.time_s:.1f}s_attention"
-        drawing, table = out_dir / f"{name}{suffix}", out_dir / f"{name}.json"
-        write_file(drawing, draw_attention(shown).render(suffix))
+        drawing, table = out_dir / f"{name}.svg", out_dir / f"{name}.json"
+        write_file(drawing, draw_attention(shown).render(drawing.suffix))
         write_file(table, json.dumps(shown.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
         written += [drawing, table]
     return written

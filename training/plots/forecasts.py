@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, runtime_checkable
-from typing import Protocol as Interface
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +10,9 @@ import numpy.typing as npt
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.training.data.batches import Floats
 from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
-from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.data.windows import check_numbers, place
-from tracklake.training.models.inputs import NEAREST, read_samples
+from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 
@@ -98,36 +96,23 @@ def forecast_samples(
     return found
 
 
-def forecast_scene(
-    folder: TensorFolder, sample: int, models: Sequence[Forecaster], *, nearest: int | None = NEAREST
-) -> dict[int, list[Forecast]]:
+def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaster]) -> dict[int, list[Forecast]]:
     """Predict a sample's whole scene with every model; by vehicle id, in the models' order.
 
-    A model of scenes predicts the sample's vehicle and its nearest vehicles at once. Any other model predicts every
-    sample of the scene by itself.
-
-    Args:
-        folder: tensors.
-        sample: number of the sample.
-        models: models or runs.
-        nearest: most vehicles around the sample's that a model of scenes gets; None: the whole scene. Its prediction
-            of a vehicle may depend on this number.
+    A model of scenes predicts all vehicles at once; any other model predicts every sample of the scene by itself.
 
     Raises:
         IndexError: no sample has the number.
         NotFiniteError: a predicted position is not a finite number.
-        ValueError: `nearest` is negative.
     """
     scene = int(folder.scene_of_sample[check_numbers([sample], len(folder.sample_row), "sample")[0]])
     members = slice(int(folder.scene_offset[scene]), int(folder.scene_offset[scene + 1]))
     samples = folder.scene_sample[members]
     ids = folder.run_vehicle_id[folder.runs_of(folder.scene_row[members])].tolist()
     found: dict[int, list[Forecast]] = {vehicle: [] for vehicle in ids}
-    shown = len(ids) - 1 if nearest is None else nearest
     for model in models:
-        if isinstance(model.predictor, ScenePredictor):
-            around = _forecast_around(folder, sample, model.name, model.predictor, shown)
-            for vehicle, forecast in around.items():
+        if model.reads == "scene":
+            for vehicle, forecast in _forecast_together(folder, sample, model, len(ids) - 1).items():
                 found[vehicle].append(forecast)
         else:
             of_sample = forecast_samples(folder, samples[samples >= 0], [model])
@@ -136,33 +121,21 @@ def forecast_scene(
     return {vehicle: forecasts for vehicle, forecasts in found.items() if forecasts}
 
 
-@runtime_checkable
-class ScenePredictor(Interface):
-    """A model that predicts every vehicle of a scene at once."""
-
-    def predict_scene(self, observed: ObservedScene[Any]) -> "SceneForecast":
-        """Predict means, covariances and mask of all vehicles, relative to the ego's last position."""
-        ...
-
-
-def _forecast_around(
-    folder: TensorFolder, sample: int, name: str, model: ScenePredictor, nearest: int
-) -> dict[int, Forecast]:
-    """Predict a sample's vehicle and its nearest vehicles at once, by id."""
+def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, others: int) -> dict[int, Forecast]:
+    """Predict a sample's vehicle and the others of its scene at once, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = gather_surroundings(folder, number, nearest=nearest)
-    scene, around = model.predict_scene(observed), find_around(folder, number, nearest)
-    ids = folder.run_vehicle_id[folder.runs_of(around.row[0])]
+    observed, _ = gather_surroundings(folder, number, nearest=others)
+    network: Any = model.predictor
+    scene: SceneForecast = network.predict_scene(observed)
+    ids = folder.run_vehicle_id[folder.runs_of(find_around(folder, number, others).row[0])].tolist()
     origin = find_origins(folder, number)[0]
-    variance = np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1)
-    sigma = np.sqrt(variance)  # (V, F, 2)
-    correlation = scene.covariance_m2[0, ..., 0, 1] / (sigma[..., 0] * sigma[..., 1])
+    sigma = np.sqrt(np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1))  # (V, F, 2)
+    correlation = scene.covariance_m2[0, ..., 0, 1] / sigma.prod(axis=-1)
     weight = np.ones((len(ids), 1), dtype=sigma.dtype)
     density = Density(weight, scene.mean_m[0, :, None], sigma[:, None], correlation[:, None])
     prediction = Prediction(scene.mean_m[0], density)
-    return {
-        int(ids[v]): place_forecast(name, prediction, v, origin) for v in np.flatnonzero(scene.vehicle_mask[0]).tolist()
-    }
+    present = np.flatnonzero(scene.vehicle_mask[0]).tolist()
+    return {ids[row]: place_forecast(model.name, prediction, row, origin) for row in present}
 
 
 def find_origins(folder: TensorFolder, samples: npt.NDArray[np.int64]) -> Doubles:

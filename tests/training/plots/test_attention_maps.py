@@ -124,10 +124,9 @@ def test_drawings_name_every_head_and_fetch_nothing(folder, shown, tmp_path):
     assert not re.search(r"(href|src|@import|url\()[^>]*http", svg)
     for words in ("head 1", "head 2", "vehicle 1 of highd b", "encoder: vehicles", "decoder: vehicles", "2 (50%)"):
         assert words in svg
-    png, _ = export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path, suffix=".png")
-    assert png.read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match=r"\.svg or \.png"):
-        export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path, suffix=".pdf")
+    drawing, _ = export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path)
+    assert drawing.read_text() == svg
+    assert draw_attention(shown).render(".png").startswith(b"\x89PNG")
     assert len(draw_attention(shown).to_vega_lite()["datasets"]["weights"]) == HEADS * (9 + 6 + 9)
 
 
