@@ -210,12 +210,12 @@ def _pick(
     judge: "Forecaster",
 ) -> list[int]:
     """Samples of a kind."""
-    from tracklake.training.plots.sample_choice import MOST_LOOKED_AT, pick_samples
+    from tracklake.training.plots.sample_choice import MOST_SEARCHED, pick_samples
 
     found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
         many = len(folder.samples_of(part))
-        among = f"{MOST_LOOKED_AT:,} drawn of {many:,}" if many > MOST_LOOKED_AT else f"{many:,}"
+        among = f"{MOST_SEARCHED:,} drawn of {many:,}" if many > MOST_SEARCHED else f"{many:,}"
         terminal.say(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
     if len(found) < count:
         terminal.say(f"note: there are only {len(found)} such samples", style="dim")

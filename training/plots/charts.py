@@ -14,7 +14,10 @@ Layers = alt.LayerChart | alt.FacetChart
 """What `altair.layer` returns."""
 Layout = alt.Chart | Layers | alt.HConcatChart | alt.VConcatChart
 
-CONFIG = make_config(background=PAPER, padding=14, label=13, title=13, heading=17)
+_THEME = make_config(background=PAPER, padding=14, label=13, title=13, heading=17)
+_LEGENDS = {"labelLimit": 0, "layout": {"top": {"direction": "vertical", "margin": 0}}}
+CONFIG = {**_THEME, "legend": {**_THEME["legend"], **_LEGENDS}}
+"""The theme; legends stand below each other, with names in full length."""
 PNG_SCALE = 2
 """Pixels of a PNG per pixel of the drawing."""
 SUFFIXES = (".svg", ".png")
@@ -34,7 +37,7 @@ class Drawing:
 
     def to_vega_lite(self) -> dict[str, Any]:
         """Make the specification, with the theme and the rows."""
-        return {**self.layout.configure(**CONFIG).to_dict(validate=False), "datasets": self.rows}
+        return {**self.layout.to_dict(validate=False), "config": CONFIG, "datasets": self.rows}
 
     def render(self, suffix: str) -> bytes:
         """Make the bytes of a file.

@@ -121,6 +121,7 @@ def _draw_figure(
         symbolStrokeWidth=2.5,
         symbolOpacity=1,
         labelColor=INK,
+        labelLimit=170,
     )
 
     def value(name: str) -> alt.Y:

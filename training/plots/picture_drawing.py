@@ -36,6 +36,8 @@ WIDTH = 1060
 """Width of the road, in pixels."""
 LANE_HEIGHT, LEAST_HEIGHT, MOST_HEIGHT = 54, 170, 400
 """Height of a lane, and bounds of the road's height, in pixels."""
+LEGEND_SYMBOL, LEGEND_LETTER = 40, 7
+"""Width of a legend's symbol with its margins, and of a letter, in pixels."""
 ERROR_HEIGHT, ERROR_GAP = 170, 50
 """Height of an error panel, and the space between panels, in pixels."""
 ERRORS = (
@@ -156,7 +158,8 @@ class _Series:
     @classmethod
     def make(cls, models: tuple[str, ...]) -> "_Series":
         names, count = ["history", "truth", *models], len(models)
-        legend = alt.Legend(title=None, labelColor=INK, symbolSize=70)
+        columns = max(1, WIDTH // (LEGEND_SYMBOL + LEGEND_LETTER * max(map(len, names))))
+        legend = alt.Legend(title=None, labelColor=INK, symbolSize=70, columns=columns)
 
         def scale(*marks: str) -> alt.Scale:
             return alt.Scale(domain=names, range=list(marks))

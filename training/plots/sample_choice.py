@@ -14,7 +14,7 @@ from tracklake.training.runs.forecasters import Forecaster
 Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
 PICKS: tuple[Pick, ...] = get_args(Pick)
 
-MOST_LOOKED_AT = 20_000
+MOST_SEARCHED = 20_000
 """Most samples searched for the worst; of more, so many are drawn at random."""
 BATCH_SIZE = 2048
 """Samples predicted at once."""
@@ -103,8 +103,8 @@ def pick_samples(
         return random.permutation(found)[:count]
     if judge is None:
         raise ValueError("`worst` needs a model to judge by")
-    if len(found) > MOST_LOOKED_AT:
-        found = np.sort(random.choice(found, MOST_LOOKED_AT, replace=False))
+    if len(found) > MOST_SEARCHED:
+        found = np.sort(random.choice(found, MOST_SEARCHED, replace=False))
     distance = measure_last_distance(folder, found, judge)
     return found[np.argsort(-distance, kind="stable")[:count]]
 

@@ -31,7 +31,7 @@ def picture(tmp_path_factory):
     return take_picture(folder, OWN_SAMPLE, forecast_scene(folder, OWN_SAMPLE, [sure()]))
 
 
-def test_the_edges_are_told_from_the_lines_between_lanes(picture):
+def test_edges_differ_from_the_lines_between_lanes(picture):
     assert [(row["y_m"], row["edge"]) for row in list_markings(picture)] == [(0, True), (4, False), (8, True)]
     assert [(row["lane"], row["y_m"]) for row in list_lanes(picture)] == [("lane 1", 2), ("lane 2", 6)]
 

@@ -22,8 +22,8 @@ def folder(tmp_path_factory):
 
 
 def draw(folder, *models):
-    said = forecast_samples(folder, [OWN_SAMPLE], models)[OWN_SAMPLE]
-    return take_picture(folder, OWN_SAMPLE, {OWN: said})
+    forecasts = forecast_samples(folder, [OWN_SAMPLE], models)[OWN_SAMPLE]
+    return take_picture(folder, OWN_SAMPLE, {OWN: forecasts})
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def picture(folder, straight):
 
 
 @pytest.fixture(scope="module")
-def everybody(folder):
+def whole_scene(folder):
     return take_picture(folder, OWN_SAMPLE, forecast_scene(folder, OWN_SAMPLE, [sure()]))
 
 
@@ -139,19 +139,19 @@ def test_models_have_the_same_colour_and_shape_on_the_road_and_in_errors(drawing
             assert [scale[model] for model in ("constant-velocity", "sure")] == list(marks[:2])
 
 
-def test_all_vehicles_of_a_moment_are_drawn(everybody):
-    drawing = draw_picture(everybody)
+def test_all_vehicles_of_a_scene_are_drawn(whole_scene):
+    drawing = draw_picture(whole_scene)
     tables = drawing.to_vega_lite()["datasets"]
     assert len({row["ellipse"] for row in tables["ellipses"]}) == 2 * 2 + 2
     assert [(row["vehicle_id"], row["known"]) for row in tables["boxes"]] == [(1, True), (2, True), (5, False)]
     assert drawing.render(".svg").startswith(b"<svg")
 
 
-def test_the_legend_names_what_is_there_and_nothing_else(picture, everybody, folder, straight):
+def test_the_legend_names_only_present_marks(picture, whole_scene, folder, straight):
     ellipses, thin = "ellipses: 1 and 3 sigma at each second", "thin lines: less probable, with probability"
     near = ["vehicle 1", "neighbor in its grid"]
     assert legend_of(picture) == ([*near, "history", "truth", "constant-velocity", "sure"], [f"{ellipses}; {thin}"])
-    names, [marks] = legend_of(everybody)
+    names, [marks] = legend_of(whole_scene)
     assert names == [*near, "other vehicle", "history", "truth", "sure"]
     assert marks == f"{ellipses}, of others 3; {thin}; outlined vehicle: size unknown"
     assert legend_of(draw(folder, straight)) == ([*near, "history", "truth", "constant-velocity"], [])
@@ -159,14 +159,21 @@ def test_the_legend_names_what_is_there_and_nothing_else(picture, everybody, fol
     assert legend_of(alone)[0] == ["vehicle 1", "history", "truth", "constant-velocity", "sure"]
 
 
-def test_lanes_that_nobody_marked_are_said_to_be_nominal_and_names_are_no_markup(tmp_path):
+def test_long_names_of_models_stand_whole_in_the_legend_within_the_drawing(folder):
+    names = [f"attention-h4-ngsim-5s-learning-rate-0.001-seed-{number}" for number in range(4)]
+    picture = draw(folder, *map(sure, names))
+    assert legend_of(picture)[0][-4:] == names
+    assert int(ET.fromstring(draw_picture(picture).render(".svg")).get("width")) < 1300
+
+
+def test_lanes_without_markings_are_named_nominal_and_names_are_no_markup(tmp_path):
     picture = draw(open_moment(tmp_path, markings=None), sure("<b>&amp; ${datum.x}"))
     texts = texts_of(draw_picture(picture).render(".svg"))
     assert any("lanes of 12 ft, as no markings are known" in text for text in texts)
     assert "<b>&amp; ${datum.x}" in texts
 
 
-def test_more_models_than_can_be_told_apart(folder):
+def test_more_models_than_colours_are_refused(folder):
     models = [sure(f"model {number}") for number in range(5)]
     with pytest.raises(ValueError, match="shows 1 to 4 models, got 5: model 0"):
         draw_picture(draw(folder, *models))
