@@ -83,7 +83,7 @@ def predict(
         from tracklake.schemas.errors import explain_file_errors
         from tracklake.schemas.files import write_file
         from tracklake.training.data.tensor_folder import TensorFolder
-        from tracklake.training.plots.drawing import draw_picture
+        from tracklake.training.plots.picture_drawing import draw_picture
 
         _check(models or [], sample, vehicle, time, pick, part, count, out)
         settings = read_settings(lake=lake, protocol=protocol)
@@ -148,7 +148,7 @@ def _check(
 
 def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
     """The sample that was named, if one was."""
-    from tracklake.training.plots.picking import find_sample
+    from tracklake.training.plots.sample_choice import find_sample
 
     if sample is not None:
         last = len(folder.sample_row) - 1
@@ -213,12 +213,12 @@ def _pick(
     judge: "Forecaster",
 ) -> list[int]:
     """Samples of a kind."""
-    from tracklake.training.plots.picking import MOST_LOOKED_AT, pick_samples
+    from tracklake.training.plots.sample_choice import MOST_SEARCHED, pick_samples
 
     found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
         many = len(folder.samples_of(part))
-        among = f"{MOST_LOOKED_AT:,} drawn of {many:,}" if many > MOST_LOOKED_AT else f"{many:,}"
+        among = f"{MOST_SEARCHED:,} drawn of {many:,}" if many > MOST_SEARCHED else f"{many:,}"
         terminal.say(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
     if len(found) < count:
         terminal.say(f"note: there are only {len(found)} such samples", style="dim")
@@ -231,7 +231,7 @@ def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_
     from tracklake.training.plots.picture import take_picture
 
     if all_vehicles:
-        return take_picture(folder, sample, forecast_scene(folder, sample, asked, nearest=None))
+        return take_picture(folder, sample, forecast_scene(folder, sample, asked))
     run = folder.runs_of(folder.sample_row[[sample]])
     own = int(folder.run_vehicle_id[run[0]])
     return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})
@@ -248,7 +248,7 @@ def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_v
 
 def _tell(terminal: "Terminal", picture: "Picture", file: Path) -> None:
     """Where the drawing is, and how far each model is from the truth at its end."""
-    from tracklake.training.plots.rows import list_errors
+    from tracklake.training.plots.picture_rows import list_errors
 
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
     off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
@@ -269,7 +269,7 @@ def _refuse_inattentive(asked: list["Forecaster"]) -> None:
 
 def _draw_attention(folder: "TensorFolder", asked: list["Forecaster"], samples: list[int], target: Path) -> list[Path]:
     """Attention maps of every model that has any, in a folder of its name."""
-    from tracklake.training.plots.attention_maps import export_attention
+    from tracklake.training.plots.attention_drawing import export_attention
 
     found = []
     for own in asked:

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import polars as pl
 
 from tracklake.quality_reports.plots.axes import Scale, draw_frame, draw_line, span, widen, wrap_svg
-from tracklake.quality_reports.plots.charts import BLUE, ORANGE
 from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+from tracklake.schemas.chart_theme import BLUE, ORANGE
 
 EXAMPLES = 2
 """Shown per rule, of different vehicles."""

@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tracklake.quality_reports.plots.charts import GRID, MUTED
+from tracklake.schemas.chart_theme import GRID, MUTED
 
 Floats = NDArray[np.float64]
 MINUS = "\N{MINUS SIGN}"

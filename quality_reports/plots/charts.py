@@ -1,9 +1,8 @@
 """The report's plots: Altair charts of rows already aggregated by SQL, as SVG text.
 
 Every function takes rows of one or two statements of `sql/` and returns one `<svg>` element, the same bytes for the
-same rows, that fetches nothing. Colours are of Okabe and Ito's palette, told apart by colour-blind readers, and never
-the only sign: marks differ in shape or place too. The page's style sheet maps the colours here onto the reader's theme
-(`templates/report.css`), so they are named once, below.
+same rows, that fetches nothing. The page's style sheet (`templates/report.css`) maps the theme's colours onto the
+reader's, by their values.
 """
 
 import re
@@ -14,16 +13,11 @@ import altair as alt
 import vl_convert
 
 from tracklake.quality_reports.plots.rasters import VIRIDIS
+from tracklake.schemas.chart_theme import BLUE, GREEN, INK, MUTED, ORANGE, make_config
 from tracklake.schemas.start_assessments import ESTIMATORS
 
 Row = dict[str, Any]
 
-INK = "#1f2328"
-MUTED = "#59636e"
-GRID = "#d8dee4"
-BLUE = "#0072b2"
-ORANGE = "#d55e00"
-GREEN = "#009e73"
 SERIES = (BLUE, ORANGE, GREEN)
 
 FLOW = (
@@ -33,6 +27,7 @@ FLOW = (
 )
 """Columns of subset_flow.sql and their axis titles."""
 
+CONFIG = make_config(background="transparent", padding=4, label=11, title=12, heading=13)
 WIDTH = 760
 ROW_HEIGHT = 18
 LABEL_LIMIT = 190
@@ -354,31 +349,7 @@ def _height(rows: Sequence[Row]) -> int:
 
 def _svg(chart: alt.Chart | alt.LayerChart | alt.FacetChart | alt.HConcatChart | alt.VConcatChart) -> str:
     """Render a chart, transparent and in the report's ink."""
-    styled = (
-        chart.configure(font="sans-serif", background="transparent", aria=False, padding=4)
-        .configure_view(stroke=None)
-        .configure_axis(
-            labelColor=MUTED,
-            titleColor=MUTED,
-            titleFontWeight="normal",
-            gridColor=GRID,
-            domainColor=MUTED,
-            tickColor=MUTED,
-            labelFontSize=11,
-            titleFontSize=12,
-        )
-        .configure_legend(
-            labelColor=MUTED,
-            titleColor=MUTED,
-            titleFontWeight="normal",
-            orient="top",
-            labelFontSize=11,
-            titleFontSize=12,
-            columnPadding=18,
-            padding=8,
-        )
-        .configure_title(color=INK, anchor="start", fontSize=13, offset=12)
-    )
+    styled = chart.configure(**CONFIG)
     # Rows are aggregates: a few thousand at most, but more than Altair's limit for unaggregated data.
     with alt.data_transformers.enable("default", max_rows=None):
         svg: str = vl_convert.vegalite_to_svg(styled.to_dict(validate=False))

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import polars as pl
 
 from tracklake.quality_reports.plots.axes import Scale, draw_frame, draw_line, wrap_svg
-from tracklake.quality_reports.plots.charts import BLUE, FLOW, INK, Row, name_lane
+from tracklake.quality_reports.plots.charts import FLOW, Row, name_lane
+from tracklake.schemas.chart_theme import BLUE, INK
 
 PANEL_WIDTH, PANEL_HEIGHT, LEFT, TOP, BOTTOM, APART = 250, 80, 58, 40, 38, 20
 

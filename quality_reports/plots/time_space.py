@@ -9,8 +9,8 @@ import numpy as np
 import polars as pl
 
 from tracklake.quality_reports.plots.axes import Scale, draw_frame, wrap_svg, write_points
-from tracklake.quality_reports.plots.charts import MUTED
 from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade
+from tracklake.schemas.chart_theme import MUTED
 
 COLUMNS, ROWS = 1000, 140
 """Cells at most: about one per pixel across, and along the road."""

@@ -1,4 +1,4 @@
-"""A moment of three vehicles whose numbers are known by hand, for tests of drawings; and a model with densities."""
+"""A scene of three vehicles whose numbers are known by hand, for tests of drawings; and a model with densities."""
 
 import numpy as np
 import polars as pl

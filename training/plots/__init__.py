@@ -1,1 +1,1 @@
-"""Drawings: samples with what came and what models say, attention, errors over the horizon."""
+"""Drawings of samples with predictions, of attention weights, and of errors over the horizon."""

@@ -1,9 +1,10 @@
-"""A figure of errors over the horizon: RMSE, and how much it grows from step to step, one column per data set."""
+"""The figure of errors over the horizon: RMSE and its growth from step to step, one column per data set."""
 
 import altair as alt
 import polars as pl
 
-from tracklake.training.plots.charts import AMBER, BLUE, GREEN, INK, ORANGE, PURPLE, SKY, Drawing, Layers, Tables
+from tracklake.schemas.chart_theme import AMBER, BLUE, GREEN, INK, ORANGE, PURPLE, SKY
+from tracklake.training.plots.charts import Drawing
 
 KEY = ("model", "dataset", "seed", "seconds")
 COLUMNS = {
@@ -13,57 +14,41 @@ COLUMNS = {
     "seconds": pl.Float64(),
     "rmse_m": pl.Float64(),
 }
-"""Of the table that is drawn."""
+"""Columns of the table that is drawn."""
 
 PALETTE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, SKY, INK)
 DASHES: tuple[list[int], ...] = ([1, 0], [8, 4], [2, 3])
-"""Colours; where all are used, the same again with the next dashes."""
+"""Colours of models; after the last one they repeat with the next dashes."""
 MOST_MODELS = len(PALETTE) * len(DASHES)
 
 FIGURE_WIDTH, HEIGHT, GAP, AXIS = 1060, 230, 30, 52
-"""Pixels; the last for the numbers and title beside a panel, so that all stand in line."""
+"""Width of the figure, height of a panel, space between panels, and width of the vertical axis, in pixels."""
 
 
 def draw_error_growth(table: pl.DataFrame) -> Drawing:
-    """Lines of the mean over seeds, in a band from the least to the greatest; models in their order in the table.
+    """Draw RMSE over time, and its change from each time to the next: means over seeds, in bands of all seeds.
 
-    The upper row is RMSE over time; the lower one is its change from each time to the next, the first from 0 m at the
-    sample's own moment.
+    The first change is from 0 m at the sample's own tick. Models and data sets keep their order in the table.
 
     Args:
-        table: COLUMNS, one row per KEY; `dataset` is what a column of the figure is called. The times of a run (model,
-            data set and seed) are 1, 2, ... steps; the step is that of all, the last time its own.
+        table: COLUMNS, one row per KEY; every data set is a column of the figure. The times of a run (model, data set
+            and seed) are 1, 2, ... steps; all runs have the same step, each its own last time.
 
     Raises:
-        ValueError: a column is missing or of another dtype, a value is null, not finite or negative, a key comes twice,
+        ValueError: a column is missing or of another dtype, a value is null, not finite or negative, a key repeats,
             times are not such steps, or there are more than MOST_MODELS models.
     """
     check_errors(table)
     models, datasets = (table[name].unique(maintain_order=True).to_list() for name in ("model", "dataset"))
-    panels = (("rmse", "RMSE (m)"), ("growth", f"change of RMSE per {min(table['seconds'].to_list()):g} s (m)"))
-    tables = Tables()
-    everything = tables.chart("errors", summarise_seeds(table).to_dicts())
-    width = (FIGURE_WIDTH - GAP * (len(datasets) - 1)) // len(datasets)
-    rows = (
-        alt.hconcat(
-            *(
-                _draw_panel(everything, models, dataset, figure, title if column == 0 else None).properties(
-                    width=width,
-                    height=HEIGHT,
-                    title=alt.Title(dataset, fontSize=15, frame="group", offset=12) if figure == "rmse" else "",
-                )
-                for column, dataset in enumerate(datasets)
-            ),
-            spacing=GAP,
-        ).resolve_scale(y="shared")
-        for figure, title in panels
-    )
-    heading = alt.Title("Errors over the horizon", subtitle=_tell_seeds(table), offset=10)
-    return Drawing(alt.vconcat(*rows, spacing=24, title=heading), tables)
+    step_s = min(table["seconds"].to_list())
+    panels = (("rmse", "RMSE (m)"), ("growth", f"change of RMSE per {step_s:g} s (m)"))
+    heading = alt.Title("Errors over the horizon", subtitle=describe_seeds(table), offset=10)
+    figures = [_draw_figure(models, datasets, *panel, named=panel is panels[0]) for panel in panels]
+    return Drawing(alt.vconcat(*figures, spacing=24, title=heading), {"errors": summarise_seeds(table).to_dicts()})
 
 
-def _tell_seeds(table: pl.DataFrame) -> str:
-    """What lines and bands are."""
+def describe_seeds(table: pl.DataFrame) -> str:
+    """Describe what lines and bands are: the figure's subtitle."""
     seeds = table.group_by("model", "dataset").agg(pl.col("seed").n_unique())["seed"].unique().sort().to_list()
     if seeds == [1]:
         return "of one seed"
@@ -72,7 +57,7 @@ def _tell_seeds(table: pl.DataFrame) -> str:
 
 
 def check_errors(table: pl.DataFrame) -> None:
-    """Refuse a table that cannot be drawn, or would be drawn wrongly; see `draw_error_growth`."""
+    """Refuse a table that cannot be drawn, or would be drawn wrongly, as `draw_error_growth` says."""
     what = "errors to draw: expected"
     for name, dtype in COLUMNS.items():
         if table.schema.get(name) != dtype:
@@ -100,14 +85,11 @@ def check_errors(table: pl.DataFrame) -> None:
 
 
 def summarise_seeds(table: pl.DataFrame) -> pl.DataFrame:
-    """Mean, least and greatest over seeds, of RMSE and of its change since the time before.
-
-    Args:
-        table: as `draw_error_growth` takes it.
+    """Compute mean, least and greatest over seeds, of RMSE and of its change since the time before.
 
     Returns:
-        model, dataset, seconds; mean, low and high of each, as `rmse_mean_m`, `growth_low_m` ...; by model and data set
-        in their order in the table, then by time.
+        model, dataset, seconds, and columns as `rmse_mean_m`, `growth_low_m` ...; by model and data set in their order
+        in the table, then by time.
     """
     before = pl.col("rmse_m").shift(1, fill_value=0.0).over(KEY[:3])
     grown = table.sort("seconds").with_columns(growth_m=pl.col("rmse_m") - before)
@@ -125,37 +107,41 @@ def summarise_seeds(table: pl.DataFrame) -> pl.DataFrame:
     return order.join(over_seeds, on=["model", "dataset"], maintain_order="left_right")
 
 
-def _draw_panel(everything: alt.Chart, models: list[str], dataset: str, figure: str, title: str | None) -> Layers:
-    """One figure of one data set."""
-    colours = [PALETTE[number % len(PALETTE)] for number in range(len(models))]
-    dashes = [DASHES[number // len(PALETTE)] for number in range(len(models))]
+def _draw_figure(
+    models: list[str], datasets: list[str], figure: str, title: str, *, named: bool
+) -> alt.FacetChart | alt.LayerChart:
+    """Draw one figure in a panel per data set; `named`: with the data sets' names above."""
+    repeats = [divmod(number, len(PALETTE)) for number in range(len(models))]
+    colours, dashes = [PALETTE[colour] for _, colour in repeats], [DASHES[dash] for dash, _ in repeats]
     legend = alt.Legend(
         title=None,
-        orient="top",
         columns=6,
         symbolType="stroke",
         symbolSize=600,
         symbolStrokeWidth=2.5,
         symbolOpacity=1,
-        columnPadding=20,
-        rowPadding=4,
-        labelFontSize=13,
         labelColor=INK,
         labelLimit=170,
     )
-    axis = alt.Axis(grid=False, tickMinStep=1, format="d", labelFlush=False)
-    base = everything.transform_filter(alt.FieldEqualPredicate(field="dataset", equal=dataset)).encode(
-        x=alt.X("seconds:Q", title="seconds ahead", scale=alt.Scale(zero=True, nice=False), axis=axis),
+
+    def value(name: str) -> alt.Y:
+        return alt.Y(f"{figure}_{name}_m:Q", title=title, axis=alt.Axis(tickCount=5, minExtent=AXIS, maxExtent=AXIS))
+
+    base = alt.Chart().encode(
+        x=alt.X(
+            "seconds:Q",
+            title="seconds ahead",
+            scale=alt.Scale(zero=True, nice=False),
+            axis=alt.Axis(grid=False, tickMinStep=1, format="d", labelFlush=False),
+        ),
         color=alt.Color("model:N", sort=models, scale=alt.Scale(domain=models, range=colours), legend=legend),
     )
-
-    def value(what: str) -> alt.Y:
-        axis = alt.Axis(tickCount=5, minExtent=AXIS, maxExtent=AXIS)
-        return alt.Y(f"{figure}_{what}_m:Q", title=title, axis=axis)
-
+    dash = alt.StrokeDash("model:N", sort=models, scale=alt.Scale(domain=models, range=dashes), legend=legend)
     band = base.mark_area(opacity=0.15).encode(y=value("low"), y2=f"{figure}_high_m:Q")
-    line = base.mark_line(strokeWidth=2).encode(
-        y=value("mean"),
-        strokeDash=alt.StrokeDash("model:N", sort=models, scale=alt.Scale(domain=models, range=dashes), legend=legend),
+    line = base.mark_line(strokeWidth=2).encode(y=value("mean"), strokeDash=dash)
+    header = alt.Header(
+        title=None, labels=named, labelFontSize=15, labelFontWeight="bold", labelColor=INK, labelAnchor="start"
     )
-    return alt.layer(band, line)
+    width = (FIGURE_WIDTH - GAP * (len(datasets) - 1)) // len(datasets)
+    panels = alt.layer(band, line, data=alt.NamedData("errors")).properties(width=width, height=HEIGHT)
+    return panels.facet(column=alt.Column("dataset:N", sort=datasets, header=header), spacing=GAP)

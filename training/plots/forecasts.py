@@ -1,9 +1,8 @@
-"""What models say of vehicles, placed on the carriageway: one object per model and vehicle, to be drawn."""
+"""Predictions of models on the carriageway: one forecast per model and vehicle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, runtime_checkable
-from typing import Protocol as Interface
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +10,9 @@ import numpy.typing as npt
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.training.data.batches import Floats
 from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
-from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.data.windows import check_numbers, place
-from tracklake.training.models.inputs import NEAREST, read_samples
+from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 
@@ -26,13 +24,13 @@ Doubles = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Alternative:
-    """One bivariate normal density per tick, of those that a forecast mixes.
+    """One component of a forecast's mixture: a bivariate normal density per tick.
 
     Args:
-        probability: of this alternative.
-        mean_m: (F, 2) on the carriageway.
+        probability: weight in the mixture.
+        mean_m: (F, 2) positions on the carriageway.
         sigma_m: (F, 2) standard deviations along and across the road.
-        correlation: (F,) between the two.
+        correlation: (F,) correlation of the two.
     """
 
     probability: float
@@ -43,14 +41,14 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What one model says of one vehicle.
+    """One model's prediction of one vehicle.
 
     Args:
-        model: the run's or model's name.
-        position_m: (F, 2) on the carriageway, at 1, 2, ... ticks.
-        alternatives: the most probable first; none where the model gives no density.
-        lateral: probabilities by maneuver; None where it gives none.
-        longitudinal: likewise.
+        model: name of the run or model.
+        position_m: (F, 2) positions on the carriageway after 1, 2, ... ticks.
+        alternatives: the most probable first; empty where the model gives no density.
+        lateral: probabilities by maneuver; None where the model gives none.
+        longitudinal: probabilities by maneuver; None where the model gives none.
     """
 
     model: str
@@ -60,7 +58,7 @@ class Forecast:
     longitudinal: dict[str, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """Make plain values for JSON."""
         return {
             "model": self.model,
             "position_m": self.position_m.round(3).tolist(),
@@ -81,132 +79,103 @@ class Forecast:
 def forecast_samples(
     folder: TensorFolder, samples: npt.ArrayLike, models: Sequence[Forecaster]
 ) -> dict[int, list[Forecast]]:
-    """What every model says of samples (B,), all of them in one batch; by number of sample, in the models' order.
+    """Predict samples (B,) with every model, in one batch each; by sample number, in the models' order.
 
     Raises:
-        IndexError: a number below 0, or not below S.
-        ValueError: a place is not a finite number.
+        IndexError: no sample has the number.
+        NotFiniteError: a predicted position is not a finite number.
     """
     sample = np.asarray(samples, dtype=np.int64)
     found: dict[int, list[Forecast]] = {int(number): [] for number in sample}
     origin = find_origins(folder, sample)
     for model in models:
         observed, _ = read_samples(folder, sample, model.reads)
-        said = model.predictor.predict(observed)
-        for place_in_batch, number in enumerate(sample):
-            found[int(number)].append(place_forecast(model.name, said, place_in_batch, origin[place_in_batch]))
+        prediction = model.predictor.predict(observed)
+        for row, number in enumerate(sample.tolist()):
+            found[number].append(place_forecast(model.name, prediction, row, origin[row]))
     return found
 
 
-def forecast_scene(
-    folder: TensorFolder, sample: int, models: Sequence[Forecaster], *, nearest: int | None = NEAREST
-) -> dict[int, list[Forecast]]:
-    """What every model says of a sample's moment; by vehicle id, in the models' order.
+def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaster]) -> dict[int, list[Forecast]]:
+    """Predict a sample's whole scene with every model; by vehicle id, in the models' order.
 
-    A model of scenes is asked once, about the sample's vehicle and those around it that it is shown; any other about
-    all samples of the moment, each as it sees the others.
-
-    Args:
-        folder: of the sample.
-        sample: its number.
-        models: whom to ask.
-        nearest: vehicles around the sample's that models of scenes are shown, at most; None: everyone at that moment.
-            What they say of one vehicle may depend on how many they are shown.
+    A model of scenes predicts all vehicles at once; any other model predicts every sample of the scene by itself.
 
     Raises:
-        IndexError: a number below 0, or not below S.
-        ValueError: a place is not a finite number, or `nearest` is negative.
+        IndexError: no sample has the number.
+        NotFiniteError: a predicted position is not a finite number.
     """
     scene = int(folder.scene_of_sample[check_numbers([sample], len(folder.sample_row), "sample")[0]])
     members = slice(int(folder.scene_offset[scene]), int(folder.scene_offset[scene + 1]))
     samples = folder.scene_sample[members]
     ids = folder.run_vehicle_id[folder.runs_of(folder.scene_row[members])].tolist()
     found: dict[int, list[Forecast]] = {vehicle: [] for vehicle in ids}
-    shown = len(ids) - 1 if nearest is None else nearest
     for model in models:
-        if isinstance(model.predictor, ScenePredictor):
-            for vehicle, said in _forecast_around(folder, sample, model.name, model.predictor, shown).items():
-                found[vehicle].append(said)
+        if model.reads == "scene":
+            for vehicle, forecast in _forecast_together(folder, sample, model, len(ids) - 1).items():
+                found[vehicle].append(forecast)
         else:
             of_sample = forecast_samples(folder, samples[samples >= 0], [model])
             for vehicle, number in zip(ids, samples.tolist(), strict=True):
                 found[vehicle] += of_sample.get(number, [])
-    return {vehicle: said for vehicle, said in found.items() if said}
+    return {vehicle: forecasts for vehicle, forecasts in found.items() if forecasts}
 
 
-@runtime_checkable
-class ScenePredictor(Interface):
-    """A model that predicts every vehicle of a scene at once."""
-
-    def predict_scene(self, observed: ObservedScene[Any]) -> "SceneForecast":
-        """Means, covariances and mask of all vehicles, relative to the ego's last position."""
-        ...
-
-
-def _forecast_around(
-    folder: TensorFolder, sample: int, name: str, model: ScenePredictor, nearest: int
-) -> dict[int, Forecast]:
-    """What a model of scenes says of every vehicle that it is shown, by id."""
+def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, others: int) -> dict[int, Forecast]:
+    """Predict a sample's vehicle and the others of its scene at once, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = gather_surroundings(folder, number, nearest=nearest)
-    said, around = model.predict_scene(observed), find_around(folder, number, nearest)
-    ids = folder.run_vehicle_id[folder.runs_of(around.row[0])]
+    observed, _ = gather_surroundings(folder, number, nearest=others)
+    network: Any = model.predictor
+    scene: SceneForecast = network.predict_scene(observed)
+    ids = folder.run_vehicle_id[folder.runs_of(find_around(folder, number, others).row[0])].tolist()
     origin = find_origins(folder, number)[0]
-    variance = np.diagonal(said.covariance_m2[0], axis1=-2, axis2=-1)
-    sigma = np.sqrt(variance)  # (V, F, 2)
-    correlation = said.covariance_m2[0, ..., 0, 1] / (sigma[..., 0] * sigma[..., 1])
+    sigma = np.sqrt(np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1))  # (V, F, 2)
+    correlation = scene.covariance_m2[0, ..., 0, 1] / sigma.prod(axis=-1)
     weight = np.ones((len(ids), 1), dtype=sigma.dtype)
-    density = Density(weight, said.mean_m[0, :, None], sigma[:, None], correlation[:, None])
-    prediction = Prediction(said.mean_m[0], density)
-    return {
-        int(ids[v]): place_forecast(name, prediction, v, origin) for v in np.flatnonzero(said.vehicle_mask[0]).tolist()
-    }
+    density = Density(weight, scene.mean_m[0, :, None], sigma[:, None], correlation[:, None])
+    prediction = Prediction(scene.mean_m[0], density)
+    present = np.flatnonzero(scene.vehicle_mask[0]).tolist()
+    return {ids[row]: place_forecast(model.name, prediction, row, origin) for row in present}
 
 
 def find_origins(folder: TensorFolder, samples: npt.NDArray[np.int64]) -> Doubles:
-    """(B, 2) the samples' last positions on the carriageway."""
+    """Find the samples' last positions on the carriageway (B, 2)."""
     stored = folder.position_m[folder.sample_row[samples]][:, None, :]
     return place(stored, folder.centre_m[folder.subset_of(samples)], folder.step_m)[:, 0].astype(np.float64)
 
 
-def place_forecast(model: str, said: Prediction, number: int, origin_m: Doubles) -> Forecast:
-    """One sample's prediction, moved from its last position to the carriageway.
-
-    Args:
-        model: whose.
-        said: of B samples.
-        number: which of them.
-        origin_m: (2,) the sample's last position.
+def place_forecast(model: str, prediction: Prediction, row: int, origin_m: Doubles) -> Forecast:
+    """Move one prediction of a batch from the sample's last position (2,) to the carriageway.
 
     Raises:
-        ValueError: a place is not a finite number.
+        NotFiniteError: a position is not a finite number.
     """
-    position = said.position_m[number].astype(np.float64) + origin_m
+    position = prediction.position_m[row].astype(np.float64) + origin_m
     if not np.isfinite(position).all():
         raise NotFiniteError(model, "positions")
     return Forecast(
         model=model,
         position_m=position,
-        alternatives=() if said.density is None else _place_density(said.density, number, origin_m),
-        lateral=_name(LATERAL_MANEUVERS, said.lateral, number),
-        longitudinal=_name(LONGITUDINAL_MANEUVERS, said.longitudinal, number),
+        alternatives=() if prediction.density is None else _place_density(prediction.density, row, origin_m),
+        lateral=_name_maneuvers(LATERAL_MANEUVERS, prediction.lateral, row),
+        longitudinal=_name_maneuvers(LONGITUDINAL_MANEUVERS, prediction.longitudinal, row),
     )
 
 
-def _place_density(density: Density, number: int, origin_m: Doubles) -> tuple[Alternative, ...]:
-    weight = density.weight[number].astype(np.float64)
+def _place_density(density: Density, row: int, origin_m: Doubles) -> tuple[Alternative, ...]:
+    weight = density.weight[row].astype(np.float64)
     return tuple(
         Alternative(
             probability=float(weight[a]),
-            mean_m=density.mean_m[number, a].astype(np.float64) + origin_m,
-            sigma_m=density.sigma_m[number, a].astype(np.float64),
-            correlation=density.correlation[number, a].astype(np.float64),
+            mean_m=density.mean_m[row, a].astype(np.float64) + origin_m,
+            sigma_m=density.sigma_m[row, a].astype(np.float64),
+            correlation=density.correlation[row, a].astype(np.float64),
         )
         for a in np.argsort(-weight, kind="stable")
     )
 
 
-def _name(names: tuple[str, ...], probabilities: Floats | None, number: int) -> dict[str, float] | None:
+def _name_maneuvers(names: tuple[str, ...], probabilities: Floats | None, row: int) -> dict[str, float] | None:
     if probabilities is None:
         return None
-    return {name: round(float(share), 4) for name, share in zip(names, probabilities[number], strict=True)}
+    return {name: round(float(share), 4) for name, share in zip(names, probabilities[row], strict=True)}

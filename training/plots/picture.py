@@ -1,39 +1,37 @@
-"""What is drawn of samples: the road, the vehicles on it, what came, and what models say; as plain numbers.
+"""A sample and its scene as plain numbers: the road, the vehicles, their true futures, and the models' forecasts.
 
-What came is looked up beside the predictions, never before them: models are given what `read_samples` says may be seen.
+Futures are read beside the predictions, never before them: models get what `read_samples` allows.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.batches import SceneBatch
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.data.windows import spread
-from tracklake.training.plots.forecasts import Forecast
+from tracklake.training.plots.forecasts import Doubles, Forecast
 
-Doubles = npt.NDArray[np.float64]
 Role = Literal["own", "neighbor", "other"]
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """One vehicle of a moment. Positions on the carriageway in m, as in `tracks`: those that are known.
+    """One vehicle of a scene; known positions on the carriageway in m, as in `tracks`.
 
     Args:
         vehicle_id: unique within the subset.
-        sample: its number where it is a sample at this moment; else -1.
-        role: `own` of the sample drawn; `neighbor` in its 13 x 3 grid; `other`.
-        history_m: (h, 2) front centre, the last one at the moment itself; 1 <= h <= H.
-        future_m: (f, 2) what came, at 1, 2, ... ticks; 0 <= f <= F.
+        sample: number of the vehicle's own sample at this tick; -1 without one.
+        role: `own` for the sample's vehicle, `neighbor` in its 13 x 3 grid, else `other`.
+        history_m: (h, 2) front centres up to this tick; 1 <= h <= H.
+        future_m: (f, 2) true positions after 1, 2, ... ticks; 0 <= f <= F.
         length_m: NaN where unknown.
-        width_m: likewise.
-        forecasts: of the models, in their order.
+        width_m: NaN where unknown.
+        forecasts: in the models' order.
     """
 
     vehicle_id: int
@@ -45,23 +43,41 @@ class Vehicle:
     width_m: float
     forecasts: tuple[Forecast, ...] = ()
 
+    @property
+    def has_density(self) -> bool:
+        """Whether any forecast has a density."""
+        return any(forecast.alternatives for forecast in self.forecasts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Make plain values for JSON; null where unknown."""
+        return {
+            "vehicle_id": self.vehicle_id,
+            "sample": self.sample if self.sample >= 0 else None,
+            "role": self.role,
+            "length_m": None if np.isnan(self.length_m) else round(self.length_m, 3),
+            "width_m": None if np.isnan(self.width_m) else round(self.width_m, 3),
+            "history_m": self.history_m.round(3).tolist(),
+            "truth_m": self.future_m.round(3).tolist(),
+            "predictions": [forecast.to_dict() for forecast in self.forecasts],
+        }
+
 
 @dataclass(frozen=True)
 class Picture:
-    """One moment of one carriageway.
+    """A sample and its scene: all vehicles of a carriageway at one tick.
 
     Args:
-        sample: the number of the sample drawn.
-        part: of the split, that it stands in.
-        split: the split's name.
-        dataset: of the sample.
-        subset: likewise.
-        time_s: since the recording began.
-        rate_hz: ticks a second.
-        lateral: the maneuver that came.
-        longitudinal: likewise.
+        sample: number of the sample.
+        part: part of the split that holds the sample.
+        split: name of the split.
+        dataset: data set of the sample.
+        subset: subset of the sample.
+        time_s: seconds since the recording began.
+        rate_hz: ticks per second.
+        lateral: the sample's true lateral maneuver.
+        longitudinal: the sample's true longitudinal maneuver.
         markings_m: y of the lanes' borders, from the left edge to the right one.
-        marked: whether they are known; else lanes of NOMINAL_LANE_M are taken.
+        marked: whether the borders are known; else lanes are NOMINAL_LANE_M wide.
         vehicles: the sample's own first, then by id.
     """
 
@@ -80,62 +96,33 @@ class Picture:
 
     @property
     def own(self) -> Vehicle:
-        """The vehicle that the sample is of."""
+        """The sample's vehicle."""
         return self.vehicles[0]
 
     @property
     def models(self) -> tuple[str, ...]:
-        """Whose forecasts are drawn, in order."""
-        return tuple(dict.fromkeys(said.model for vehicle in self.vehicles for said in vehicle.forecasts))
+        """Names of the models with forecasts, in order."""
+        return tuple(dict.fromkeys(forecast.model for vehicle in self.vehicles for forecast in vehicle.forecasts))
 
     def to_dict(self) -> dict[str, Any]:
-        """The numbers drawn, as plain values for JSON; null where unknown."""
-        plain = {name: getattr(self, name) for name in _PLAIN}
-        return {**plain, "markings_m": list(self.markings_m), "vehicles": [_describe(one) for one in self.vehicles]}
-
-
-_PLAIN = (
-    "sample",
-    "part",
-    "split",
-    "dataset",
-    "subset",
-    "time_s",
-    "rate_hz",
-    "lateral",
-    "longitudinal",
-    "marked",
-)
-
-
-def _describe(vehicle: Vehicle) -> dict[str, Any]:
-    sizes = {"length_m": vehicle.length_m, "width_m": vehicle.width_m}
-    return {
-        "vehicle_id": vehicle.vehicle_id,
-        "sample": vehicle.sample if vehicle.sample >= 0 else None,
-        "role": vehicle.role,
-        **{name: None if np.isnan(size) else round(size, 3) for name, size in sizes.items()},
-        "history_m": vehicle.history_m.round(3).tolist(),
-        "truth_m": vehicle.future_m.round(3).tolist(),
-        "predictions": [said.to_dict() for said in vehicle.forecasts],
-    }
+        """Make plain values for JSON; null where unknown."""
+        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        vehicles = [vehicle.to_dict() for vehicle in self.vehicles]
+        return {**plain, "markings_m": list(self.markings_m), "vehicles": vehicles}
 
 
 def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequence[Forecast]]) -> Picture:
-    """Look up what stood on the road at a sample's moment, and put models' forecasts to it.
-
-    Args:
-        folder: of the sample.
-        sample: its number.
-        forecasts: by vehicle id; of those that have any.
+    """Read a sample's scene, and join the models' forecasts by vehicle id.
 
     Raises:
-        IndexError: a number below 0, or not below S.
+        IndexError: no sample has the number.
     """
-    scene = _find_scene(folder, sample)
-    batch = folder.gather_scenes([scene], absolute=True)
-    row = folder.sample_row[sample]
+    if not 0 <= sample < len(folder.sample_row):
+        raise IndexError(f"samples are numbered 0 to {len(folder.sample_row) - 1:,}, got {sample}")
+    batch = folder.gather_scenes([int(folder.scene_of_sample[sample])], absolute=True)
+    row = int(folder.sample_row[sample])
     run = int(folder.runs_of(np.asarray([row]))[0])
+    tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
     facts = folder.index["subsets"][folder.run_subset[run]]
     markings = facts["lane_markings_m"] or np.arange(max(facts["last_lane"], 1) + 1) * NOMINAL_LANE_M
     return Picture(
@@ -144,7 +131,7 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
         split=folder.split,
         dataset=facts["dataset"],
         subset=facts["subset"],
-        time_s=_time_of(folder, run, int(row)),
+        time_s=tick / folder.protocol.rate_hz,
         rate_hz=folder.protocol.rate_hz,
         lateral=LATERAL_MANEUVERS[folder.sample_lateral[sample]],
         longitudinal=LONGITUDINAL_MANEUVERS[folder.sample_longitudinal[sample]],
@@ -154,21 +141,10 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
     )
 
 
-def _find_scene(folder: TensorFolder, sample: int) -> int:
-    if not 0 <= sample < len(folder.sample_row):
-        raise IndexError(f"samples are numbered 0 to {len(folder.sample_row) - 1:,}, got {sample}")
-    return int(folder.scene_of_sample[sample])
-
-
-def _time_of(folder: TensorFolder, run: int, row: int) -> float:
-    tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
-    return tick / folder.protocol.rate_hz
-
-
 def _list_vehicles(
     folder: TensorFolder, batch: SceneBatch, sample: int, forecasts: Mapping[int, Sequence[Forecast]]
 ) -> tuple[Vehicle, ...]:
-    """The vehicles of the scene: the sample's own, then the others in their order."""
+    """List the vehicles of the scene: the sample's own, then the others in their order."""
     member, _ = spread(folder.scene_offset, batch.scene)
     row = folder.scene_row[member]
     run = folder.runs_of(row)

@@ -47,9 +47,9 @@ def test_a_sample_is_drawn_into_the_lake(predict, tmp_path):
 def test_the_numbers_drawn_are_given_as_json(predict, tmp_path):
     code, out, _ = predict("constant-velocity", "--vehicle", "b:1", "--time", 1, "--json", "--out", "own.png")
     assert code == 0
-    said = json.loads(out)
-    assert said["attention"] == []
-    [picture] = said["pictures"]
+    output = json.loads(out)
+    assert output["attention"] == []
+    [picture] = output["pictures"]
     assert (picture["file"], picture["sample"], picture["lateral"]) == ("own.png", 0, "left")
     own = picture["vehicles"][0]
     assert own["truth_m"] == [[30, 5.5], [40, 4.5], [53, 3], [60, 2]]
@@ -65,7 +65,7 @@ def test_all_samples_of_the_moment_and_a_folder(predict, tmp_path):
     assert [path.name for path in (tmp_path / "drawn").iterdir()] == ["b_1-and-all_1.0s_constant-velocity.svg"]
 
 
-def test_fewer_than_asked_for_is_said(predict):
+def test_fewer_than_requested_is_reported(predict):
     code, out, _ = predict("--pick", "brake", "--count", 3, "--out", "drawn")
     assert code == 0
     assert "there are only 1 such samples" in out
@@ -82,7 +82,7 @@ def test_without_names_the_newest_runs_that_fit_are_drawn(predict, tensors, tmp_
     code, out, err = predict("--sample", 0, "--json")
     assert code == 0
     [picture] = json.loads(out)["pictures"]
-    models = [said["model"] for said in picture["vehicles"][0]["predictions"]]
+    models = [one["model"] for one in picture["vehicles"][0]["predictions"]]
     assert models == ["constant-velocity", "new", "middle", "old"]
     assert "passed by:" in err
     assert "trained for the protocol tiny (another)" in err
@@ -93,7 +93,7 @@ def test_without_names_the_newest_runs_that_fit_are_drawn(predict, tensors, tmp_
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "message"),
     [
         (["--sample", 2], 2, "--sample is a number from 0 to 1; got 2"),
         (["--sample", -1], 2, "--sample is a number from 0 to 1; got -1"),
@@ -114,10 +114,10 @@ def test_without_names_the_newest_runs_that_fit_are_drawn(predict, tensors, tmp_
         (["--sample", 0, "--attention"], 2, "--attention needs a run of a model with attention"),
     ],
 )
-def test_what_cannot_be_drawn_is_told(predict, tmp_path, arguments, code, told):
+def test_what_cannot_be_drawn_is_refused(predict, tmp_path, arguments, code, message):
     found, out, err = predict(*arguments)
     assert (found, out) == (code, "")
-    assert told in err
+    assert message in err
     assert not (tmp_path / "lake" / "predictions").exists()
 
 
@@ -130,8 +130,8 @@ def test_without_a_lake_there_is_nothing_to_draw(tmp_path, monkeypatch):
 
 def test_kinds_to_pick_are_those_that_samples_are_picked_by():
     from tracklake.pipeline.cli.predict import MOST_MODELS, SUFFIXES, Pick
-    from tracklake.training.plots import charts, drawing
-    from tracklake.training.plots.picking import PICKS
+    from tracklake.training.plots import charts, picture_drawing
+    from tracklake.training.plots.sample_choice import PICKS
 
     assert {pick.value for pick in Pick} == set(PICKS)
-    assert (MOST_MODELS, SUFFIXES) == (drawing.MOST_MODELS, charts.SUFFIXES)
+    assert (MOST_MODELS, SUFFIXES) == (picture_drawing.MOST_MODELS, charts.SUFFIXES)

@@ -1,4 +1,4 @@
-"""What is exported of attention: who is who, which numbers are drawn, and files that fetch nothing."""
+"""Attention maps: the vehicles, the weights that are drawn, and files that fetch nothing."""
 
 import json
 import re
@@ -10,21 +10,28 @@ from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, open_moment
 from tensor_tables import TINY
 
 from tracklake.training.models import find_model
-from tracklake.training.plots.attention_drawing import compose_attention, draw_attention
-from tracklake.training.plots.attention_maps import export_attention, map_attention
-from tracklake.training.plots.attention_rows import list_bands, list_boxes, list_cells, span_road, tell_head
+from tracklake.training.plots.attention_drawing import (
+    choose_extent,
+    describe_head,
+    draw_attention,
+    export_attention,
+    list_bands,
+    list_boxes,
+    list_weights,
+)
+from tracklake.training.plots.attention_maps import map_attention
 
 HEADS = 2
 
 
 @dataclass
-class Looks:
+class Weights:
     vehicles: np.ndarray
     lanes: np.ndarray
     decoder: np.ndarray
 
 
-class Told:
+class KnownAttention:
     """Weights that are known: in head h vehicle v gives u (h + 1) (u + 1) parts, the lanes 1, 2, 3 parts."""
 
     def look(self, observed):
@@ -37,7 +44,7 @@ class Told:
             lanes[:, head] = (np.array([1.0, 2.0, 3.0]) * exists)[:, None, :]
         parts /= parts.sum(axis=-1, keepdims=True)
         lanes /= np.maximum(lanes.sum(axis=-1, keepdims=True), 1)
-        return Looks(parts, lanes, parts[:, ::-1])
+        return Weights(parts, lanes, parts[:, ::-1])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +54,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shown(folder):
-    return map_attention(folder, Told(), [OWN_SAMPLE])[0]
+    return map_attention(folder, KnownAttention(), [OWN_SAMPLE])[0]
 
 
 def test_vehicles_are_the_ego_and_the_nearest_that_are_there(folder, shown):
@@ -60,37 +67,37 @@ def test_vehicles_are_the_ego_and_the_nearest_that_are_there(folder, shown):
     assert shown.vehicles[0, 1].tolist() == pytest.approx([1 / 6, 2 / 6, 3 / 6])
     assert shown.decoder[0, 1].tolist() == pytest.approx([1 / 14, 4 / 14, 9 / 14])
     assert shown.to_lanes[1, 2].tolist() == pytest.approx([1 / 3, 2 / 3, 0])
-    own, far = map_attention(folder, Told(), [OWN_SAMPLE, FAR_SAMPLE], nearest=1)
+    own, far = map_attention(folder, KnownAttention(), [OWN_SAMPLE, FAR_SAMPLE], nearest=1)
     assert (own.vehicle_id, far.vehicle_id) == ((OWN, NEAR), (FAR, NEAR))
     assert far.picture.sample == FAR_SAMPLE
 
 
 def test_the_table_holds_the_numbers(shown):
-    told = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
-    assert (told["subset"], told["time_s"], told["lateral"], told["heads"]) == ("b", 1.0, "left", 2)
-    assert [one["vehicle_id"] for one in told["vehicles"]] == [OWN, NEAR, FAR]
-    assert told["vehicles"][1] == {
+    table = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
+    assert (table["subset"], table["time_s"], table["lateral"], table["heads"]) == ("b", 1.0, "left", 2)
+    assert [one["vehicle_id"] for one in table["vehicles"]] == [OWN, NEAR, FAR]
+    assert table["vehicles"][1] == {
         **{"name": "1", "vehicle_id": NEAR, "along_m": 5.0, "across_m": -4.0},
         **{"length_m": 4.2, "width_m": 1.52},
     }
-    assert (told["vehicles"][2]["length_m"], told["vehicles"][2]["width_m"]) == (None, None)
-    assert [one["exists"] for one in told["lanes"]] == [True, True, False]
-    assert told["attention"]["encoder_vehicles"][0][2] == [0.166667, 0.333333, 0.5]
-    assert told["attention"]["decoder_vehicles"][1][0] == [0.166667, 0.333333, 0.5]
-    assert told["attention"]["encoder_lanes"][0][0] == [0.333333, 0.666667, 0.0]
+    assert (table["vehicles"][2]["length_m"], table["vehicles"][2]["width_m"]) == (None, None)
+    assert [one["exists"] for one in table["lanes"]] == [True, True, False]
+    assert table["attention"]["encoder_vehicles"][0][2] == [0.166667, 0.333333, 0.5]
+    assert table["attention"]["decoder_vehicles"][1][0] == [0.166667, 0.333333, 0.5]
+    assert table["attention"]["encoder_lanes"][0][0] == [0.333333, 0.666667, 0.0]
 
 
 def test_what_is_drawn_of_a_head(shown):
-    assert tell_head(shown, 0) == (
+    assert describe_head(shown, 0) == (
         "the ego attends most to vehicle 2 (50%) and the own lane (67%); in the decoder to vehicle 2 (64%)"
     )
     itself = np.zeros_like(shown.vehicles)
     itself[:, :, 0] = 1
     alone = replace(shown, vehicles=itself, decoder=itself, to_lanes=0 * shown.to_lanes)
-    assert tell_head(alone, 1) == (
+    assert describe_head(alone, 1) == (
         "the ego attends most to itself (100%) and no lane, as none is known; in the decoder to itself (100%)"
     )
-    assert [(row["lane"], row["top_m"], row["bottom_m"], row["told"]) for row in list_bands(shown, 0)] == [
+    assert [(row["lane"], row["top_m"], row["bottom_m"], row["label"]) for row in list_bands(shown, 0)] == [
         ("left", -6, -2, "left (33%)"),
         ("own", -2, 2, "own (67%)"),
     ]
@@ -99,27 +106,28 @@ def test_what_is_drawn_of_a_head(shown):
     assert (near["front_m"], near["back_m"]) == pytest.approx((5, 0.8))
     assert (near["top_m"], near["bottom_m"]) == pytest.approx((-4.76, -3.24))
     assert far["front_m"] - far["back_m"] == pytest.approx(4.5), "of unknown size"
-    assert [box["told"] for box in (own, near, far)] == ["ego (17%)", "1 (33%)", "2 (50%)"]
-    cells = list_cells(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), ["a", "b"], ["x", "y", "z"])
-    assert [(cell["by"], cell["to"], cell["weight"]) for cell in cells][2:4] == [("a", "z", 3), ("b", "x", 4)]
-    (first, last), (top, bottom) = span_road(shown)
+    assert [box["label"] for box in (own, near, far)] == ["ego (17%)", "1 (33%)", "2 (50%)"]
+    weights = {(row["matrix"], row["by"], row["to"]): row["weight"] for row in list_weights(shown, 0)}
+    assert len(weights) == 9 + 3 * 2 + 9
+    assert weights["vehicles", "1", "2"] == pytest.approx(3 / 6)
+    assert weights["decoder", "2", "ego"] == pytest.approx(1 / 14)
+    assert weights["lanes", "ego", "own"] == pytest.approx(2 / 3)
+    assert ("lanes", "ego", "right") not in weights, "a lane that does not exist"
+    (first, last), (top, bottom) = choose_extent(shown)
     assert (first, last) == pytest.approx((-4.1 - 6, 80 + 6))  # 5 % of 84.1 m are less than 6 m
     assert (top, bottom) == pytest.approx((-6 - 2.5, 2 + 2.5))  # the markings at 0, 4 and 8 m, the ego at 6 m
 
 
-def test_drawings_name_every_head_and_fetch_nothing(shown, tmp_path):
-    svg = draw_attention(shown, tmp_path / "a.svg").read_text()
-    assert draw_attention(shown, tmp_path / "b.svg").read_text() == svg, "the same bytes"
+def test_drawings_name_every_head_and_fetch_nothing(folder, shown, tmp_path):
+    svg = draw_attention(shown).render(".svg").decode()
+    assert draw_attention(shown).render(".svg").decode() == svg, "the same bytes"
     assert not re.search(r"(href|src|@import|url\()[^>]*http", svg)
     for words in ("head 1", "head 2", "vehicle 1 of highd b", "encoder: vehicles", "decoder: vehicles", "2 (50%)"):
         assert words in svg
-    png = draw_attention(shown, tmp_path / "a.png").read_bytes()
-    assert png.startswith(b"\x89PNG")
-    with pytest.raises(ValueError, match=r"\.svg or \.png"):
-        draw_attention(shown, tmp_path / "a.pdf")
-    rows = compose_attention(shown).tables.rows
-    assert len(rows["vehicles 0"]) == len(rows["decoder 1"]) == 9
-    assert {cell["to"] for cell in rows["to_lanes 0"]} == {"left", "own"}, "a lane that does not exist is not drawn"
+    drawing, _ = export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path)
+    assert drawing.read_text() == svg
+    assert draw_attention(shown).render(".png").startswith(b"\x89PNG")
+    assert len(draw_attention(shown).to_vega_lite()["datasets"]["weights"]) == HEADS * (9 + 6 + 9)
 
 
 @pytest.mark.parametrize("markings", [(0.0, 4.0, 8.0), None])
@@ -130,8 +138,8 @@ def test_a_network_is_exported(tmp_path, markings):
     assert [file.name for file in files] == [
         f"b_{vehicle}_1.0s_attention{suffix}" for vehicle in (FAR, OWN) for suffix in (".svg", ".json")
     ]
-    told = json.loads(files[3].read_text())
-    for part, rows in told["attention"].items():
+    table = json.loads(files[3].read_text())
+    for part, rows in table["attention"].items():
         np.testing.assert_allclose(np.sum(rows, axis=-1), 1, atol=1e-5, err_msg=part)
         assert np.shape(rows)[:2] == (2, 3)
     assert export_attention(folder, network, [], tmp_path / "out") == []

@@ -84,7 +84,7 @@ def test_models_of_one_seed_have_no_band():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         (HAND.drop("seed"), "expected a column `seed` of Int64, got None"),
         (HAND.with_columns(pl.col("seed").cast(pl.Int32)), "expected a column `seed` of Int64, got Int32"),
@@ -105,6 +105,6 @@ def test_models_of_one_seed_have_no_band():
         ),
     ],
 )
-def test_tables_that_would_be_drawn_wrongly_are_refused(wrong, told):
-    with pytest.raises(ValueError, match=told):
+def test_tables_that_would_be_drawn_wrongly_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
         draw_error_growth(wrong)

@@ -10,19 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tracklake.training.plots.forecasts import forecast_scene
-from tracklake.training.plots.labels import list_odds, spread_labels
 from tracklake.training.plots.picture import take_picture
-from tracklake.training.plots.rows import (
+from tracklake.training.plots.picture_rows import (
     choose_view,
-    list_alternatives,
     list_boxes,
     list_ellipses,
     list_errors,
-    list_histories,
     list_lanes,
     list_markings,
-    list_predictions,
-    list_truths,
+    list_paths,
+    list_probabilities,
+    separate_labels,
     trace_ellipses,
 )
 
@@ -33,7 +31,7 @@ def picture(tmp_path_factory):
     return take_picture(folder, OWN_SAMPLE, forecast_scene(folder, OWN_SAMPLE, [sure()]))
 
 
-def test_the_edges_are_told_from_the_lines_between_lanes(picture):
+def test_edges_differ_from_the_lines_between_lanes(picture):
     assert [(row["y_m"], row["edge"]) for row in list_markings(picture)] == [(0, True), (4, False), (8, True)]
     assert [(row["lane"], row["y_m"]) for row in list_lanes(picture)] == [("lane 1", 2), ("lane 2", 6)]
 
@@ -51,9 +49,13 @@ def test_boxes_reach_from_the_front_back_and_half_their_width_to_both_sides(pict
 
 
 def test_histories_truths_and_predictions_are_the_pictures(picture):
-    histories = list_histories(picture, choose_view(picture))
-    assert [row["vehicle_id"] for row in histories] == [OWN] * 3 + [NEAR] * 2 + [FAR] * 3
-    truths = [(row["vehicle_id"], row["tick"], row["x_m"], row["y_m"], row["second"]) for row in list_truths(picture)]
+    paths = {}
+    for row in list_paths(picture, choose_view(picture)):
+        paths.setdefault(row["kind"], []).append(row)
+    assert list(paths) == ["history", "truth", "alternative", "prediction"]
+    histories = [(row["vehicle_id"], row["role"], row["marked"]) for row in paths["history"]]
+    assert histories == [(OWN, "own", True)] * 3 + [(NEAR, "neighbor", False)] * 2 + [(FAR, "other", False)] * 3
+    truths = [(row["vehicle_id"], row["tick"], row["x_m"], row["y_m"], row["marked"]) for row in paths["truth"]]
     assert truths == [
         (OWN, 0, 20, 6, False),
         (OWN, 1, 30, 5.5, False),
@@ -63,11 +65,12 @@ def test_histories_truths_and_predictions_are_the_pictures(picture):
         (FAR, 0, 100, 2, False),
         (FAR, 1, 120, 2, False),
     ]
-    said = [(row["vehicle_id"], row["own"], row["x_m"], row["second"]) for row in list_predictions(picture)]
-    assert said[:5] == [(OWN, True, 20 + 11 * tick, tick in (2, 4)) for tick in range(5)]
-    assert said[5:] == [(FAR, False, 100 + 11 * tick, tick in (2, 4)) for tick in range(5)]
-    others = list_alternatives(picture)
-    assert [(row["probability"], row["tick"], row["x_m"]) for row in others] == [(0.25, tick, 20) for tick in range(5)]
+    predictions = [(row["series"], row["vehicle_id"], row["x_m"], row["marked"]) for row in paths["prediction"]]
+    assert predictions[:5] == [("sure", OWN, 20 + 11 * tick, tick in (2, 4)) for tick in range(5)]
+    assert predictions[5:] == [("sure", FAR, 100 + 11 * tick, False) for tick in range(5)]
+    others = [(row["series"], row["vehicle_id"], row["tick"], row["x_m"]) for row in paths["alternative"]]
+    assert others == [("sure", OWN, tick, 20) for tick in range(5)]
+    assert len({row["path"] for rows in paths.values() for row in rows}) == 3 + 2 + 1 + 2
 
 
 def test_errors_are_predicted_less_true(picture):
@@ -118,10 +121,10 @@ def test_the_view_shows_the_sample_whole(picture):
 
 def test_probabilities_are_written_beyond_all_lines(picture):
     """They end at (20, 6) and (64, 6), 0 m apart across the road; the truth ends before."""
-    rows = list_odds(picture, choose_view(picture), step_x_m=3, step_y_m=1)
-    assert [(row["told"], row["best"], row["x_m"], row["end_x_m"]) for row in rows] == [
-        ("75%", True, 67, 64),
-        ("25%", False, 67, 20),
+    rows = list_probabilities(picture, choose_view(picture), step_x_m=3, step_y_m=1)
+    assert [(row["series"], row["label"], row["x_m"], row["end_x_m"]) for row in rows] == [
+        ("sure", "75%", 67, 64),
+        ("sure", "25%", 67, 20),
     ]
     assert [row["y_m"] for row in rows] == [5.5, 6.5]
 
@@ -129,7 +132,7 @@ def test_probabilities_are_written_beyond_all_lines(picture):
 @given(st.lists(st.floats(-50, 50), max_size=8), st.floats(0.1, 5))
 def test_labels_keep_their_order_and_distance(wanted, least):
     wanted = sorted(wanted)
-    places = spread_labels(wanted, least)
+    places = separate_labels(np.array(wanted), least).tolist()
     assert len(places) == len(wanted)
     for one, next_one in pairwise(places):
         assert next_one - one >= least - 1e-9

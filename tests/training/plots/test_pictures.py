@@ -1,4 +1,4 @@
-"""What is drawn of a moment, held against numbers known by hand; and what models are given before it is looked up."""
+"""Pictures against numbers known by hand; and what models get before the future is read."""
 
 import json
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def test_rounded_positions_are_drawn_where_they_were(folder, tmp_path):
         np.testing.assert_allclose(one.future_m, other.future_m, atol=0.051)
 
 
-def test_lanes_that_nobody_marked_are_nominal(tmp_path):
+def test_lanes_without_markings_are_nominal(tmp_path):
     picture = take_picture(open_moment(tmp_path, markings=None), OWN_SAMPLE, {})
     assert picture.markings_m == pytest.approx((0.0, 12 * 0.3048, 24 * 0.3048))
     assert not picture.marked
@@ -70,7 +70,7 @@ def test_forecasts_stand_on_the_carriageway(folder):
     """Constant velocity goes on 10 m a tick along lane 2; the other mixes two alternatives, the likelier first."""
     straight = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     found = forecast_samples(folder, [OWN_SAMPLE], [straight, sure()])[OWN_SAMPLE]
-    assert [said.model for said in found] == ["constant-velocity", "sure"]
+    assert [forecasts.model for forecasts in found] == ["constant-velocity", "sure"]
     assert found[0].position_m.tolist() == [[30, 6], [40, 6], [50, 6], [60, 6]]
     assert (found[0].alternatives, found[0].lateral) == ((), None)
     assert found[1].position_m.tolist() == [[31, 6], [42, 6], [53, 6], [64, 6]]
@@ -87,15 +87,18 @@ def test_forecasts_stand_on_the_carriageway(folder):
 def test_every_sample_of_the_moment_is_predicted_in_one_batch(folder):
     model = sure()
     found = forecast_scene(folder, OWN_SAMPLE, [model])
-    assert {vehicle: said[0].position_m.tolist()[0] for vehicle, said in found.items()} == {OWN: [31, 6], FAR: [111, 2]}
+    assert {vehicle: forecasts[0].position_m.tolist()[0] for vehicle, forecasts in found.items()} == {
+        OWN: [31, 6],
+        FAR: [111, 2],
+    }
     assert [len(observed.history) for observed in model.predictor.seen] == [2]
     picture = take_picture(folder, OWN_SAMPLE, found)
     assert [len(one.forecasts) for one in picture.vehicles] == [1, 0, 1]
     assert picture.models == ("sure",)
 
 
-class Everybody:
-    """A model of scenes: whoever is shown moves 7 m a tick; variances 4 and 9 m2, covariance 3 m2."""
+class SceneModel:
+    """A model of scenes: every vehicle moves 7 m a tick; variances 4 and 9 m2, covariance 3 m2."""
 
     def __init__(self):
         self.seen = []
@@ -116,60 +119,61 @@ class SceneForecast:
     vehicle_mask: np.ndarray
 
 
-def test_a_model_of_scenes_is_asked_once_about_everybody_it_is_shown(folder):
-    model = Everybody()
-    found = forecast_scene(folder, OWN_SAMPLE, [Forecaster("everybody", model, "scene"), sure()])
+def test_a_model_of_scenes_predicts_all_vehicles_at_once(folder):
+    model = SceneModel()
+    found = forecast_scene(folder, OWN_SAMPLE, [Forecaster("scene-model", model, "scene"), sure()])
     assert len(model.seen) == 1
-    assert {vehicle: [one.model for one in said] for vehicle, said in found.items()} == {
-        OWN: ["everybody", "sure"],
-        NEAR: ["everybody"],
-        FAR: ["everybody", "sure"],
+    assert {vehicle: [one.model for one in forecasts] for vehicle, forecasts in found.items()} == {
+        OWN: ["scene-model", "sure"],
+        NEAR: ["scene-model"],
+        FAR: ["scene-model", "sure"],
     }
     for vehicle, (x_m, y_m) in ((OWN, (20, 6)), (NEAR, (25, 2)), (FAR, (100, 2))):
-        said = found[vehicle][0]
-        assert said.position_m.tolist() == [[x_m + 7 * tick, y_m] for tick in range(1, 5)]
-        [only] = said.alternatives
+        forecasts = found[vehicle][0]
+        assert forecasts.position_m.tolist() == [[x_m + 7 * tick, y_m] for tick in range(1, 5)]
+        [only] = forecasts.alternatives
         assert only.sigma_m.tolist() == [[2, 3]] * 4
         assert only.correlation == pytest.approx([0.5] * 4)
 
 
-@pytest.mark.parametrize(("nearest", "told"), [(1, 2), (10, 11), (11, 12), (None, 14)])
-def test_a_model_of_scenes_is_shown_as_many_as_asked_for_or_everyone(tmp_path, nearest, told):
-    """Vehicles 0 to 13, each 7 m behind the one before; they are asked about the first, by the sample of tick 2."""
+def test_a_model_of_scenes_predicts_the_whole_scene(tmp_path):
+    """Vehicles 0 to 13, each 7 m behind the one before, more than a model of scenes gets in training."""
     rows = [row for number in range(14) for row in track(number, [2.0] * 8, x_m=[90 - 7 * number] * 8)]
-    crowd, model = open_tracks(tmp_path / "t", {"a": rows}), Everybody()
-    found = forecast_scene(crowd, 0, [Forecaster("everybody", model, "scene")], nearest=nearest)
-    assert {vehicle: said[0].position_m[0].tolist() for vehicle, said in found.items()} == {
-        number: [90 - 7 * number + 7, 2] for number in range(told)
+    crowd, model = open_tracks(tmp_path / "t", {"a": rows}), SceneModel()
+    found = forecast_scene(crowd, 0, [Forecaster("scene-model", model, "scene")])
+    assert {vehicle: forecasts[0].position_m[0].tolist() for vehicle, forecasts in found.items()} == {
+        number: [90 - 7 * number + 7, 2] for number in range(14)
     }
-    assert model.seen[0].vehicle_mask.tolist() == [[True] * told]
+    assert model.seen[0].vehicle_mask.tolist() == [[True] * 14]
 
 
-class Curious:
+class FutureReader:
     def predict(self, observed):
         return Prediction(observed.future)
 
 
-class Nowhere:
+class NotFinite:
     def predict(self, observed):
         return Prediction(np.full((len(observed.history), 4, 2), np.nan, np.float32))
 
 
-def test_models_are_not_shown_what_came(folder):
+def test_models_do_not_get_the_future(folder):
     with pytest.raises(FutureInputError, match="`future` is not known when a model predicts"):
-        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("curious", Curious(), "grid")])
+        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("curious", FutureReader(), "grid")])
 
 
 def test_places_that_are_no_numbers_are_refused(folder):
     with pytest.raises(NotFiniteError, match="`nan` predicts positions that are not finite numbers"):
-        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("nan", Nowhere(), "grid")])
+        forecast_samples(folder, [OWN_SAMPLE], [Forecaster("nan", NotFinite(), "grid")])
 
 
 def test_the_numbers_drawn_are_plain(folder):
-    said = forecast_samples(folder, [OWN_SAMPLE], [sure()])
-    told = json.loads(json.dumps(take_picture(folder, OWN_SAMPLE, {OWN: said[OWN_SAMPLE]}).to_dict(), allow_nan=False))
-    own, near, far = told["vehicles"]
-    assert (told["sample"], told["time_s"], told["markings_m"]) == (OWN_SAMPLE, 1.0, [0, 4, 8])
+    forecasts = forecast_samples(folder, [OWN_SAMPLE], [sure()])
+    table = json.loads(
+        json.dumps(take_picture(folder, OWN_SAMPLE, {OWN: forecasts[OWN_SAMPLE]}).to_dict(), allow_nan=False)
+    )
+    own, near, far = table["vehicles"]
+    assert (table["sample"], table["time_s"], table["markings_m"]) == (OWN_SAMPLE, 1.0, [0, 4, 8])
     assert own["truth_m"] == places(OWN, 3, 4, 5, 6)
     assert own["predictions"][0]["alternatives"][1]["mean_m"] == [[20, 6]] * 4
     assert own["predictions"][0]["alternatives"][0]["sigma_m"] == [[2, 1]] * 4
@@ -183,7 +187,7 @@ def test_numbers_of_no_sample_are_refused(folder, number):
         take_picture(folder, number, {})
 
 
-def test_names_of_no_model_or_run_are_told_what_there_is(folder, tmp_path):
+def test_unknown_names_are_answered_with_the_known_ones(folder, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").touch()
     with pytest.raises(

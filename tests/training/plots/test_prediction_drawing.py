@@ -3,17 +3,14 @@
 import struct
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 from drawn_moment import OWN, OWN_SAMPLE, open_moment, sure
 
-from tracklake.training.plots.charts import Tables
-from tracklake.training.plots.drawing import draw_picture
 from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
-from tracklake.training.plots.key import MODEL_COLOURS, draw_key, list_entries
 from tracklake.training.plots.picture import take_picture
-from tracklake.training.plots.rows import choose_view
+from tracklake.training.plots.picture_drawing import MODEL_COLOURS, MODEL_SHAPES, describe_marks, draw_picture
+from tracklake.training.plots.picture_rows import choose_view
 from tracklake.training.runs.forecasters import open_forecaster
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -25,8 +22,8 @@ def folder(tmp_path_factory):
 
 
 def draw(folder, *models):
-    said = forecast_samples(folder, [OWN_SAMPLE], models)[OWN_SAMPLE]
-    return take_picture(folder, OWN_SAMPLE, {OWN: said})
+    forecasts = forecast_samples(folder, [OWN_SAMPLE], models)[OWN_SAMPLE]
+    return take_picture(folder, OWN_SAMPLE, {OWN: forecasts})
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +37,7 @@ def picture(folder, straight):
 
 
 @pytest.fixture(scope="module")
-def everybody(folder):
+def whole_scene(folder):
     return take_picture(folder, OWN_SAMPLE, forecast_scene(folder, OWN_SAMPLE, [sure()]))
 
 
@@ -54,8 +51,12 @@ def svg(drawing):
     return drawing.render(".svg").decode()
 
 
-def names_of(picture):
-    return [row["told"] for row in list_entries(picture, choose_view(picture))]
+def legend_of(picture):
+    """The legend's names, in their order; and the line on other marks."""
+    svg = ET.fromstring(draw_picture(picture).render(".svg"))
+    labels = [group for group in svg.iter(f"{SVG}g") if "role-legend-label" in group.get("class", "")]
+    names = [text for group in labels for text in texts_of(ET.tostring(group))]
+    return names, describe_marks(picture, choose_view(picture))
 
 
 def texts_of(svg):
@@ -69,10 +70,9 @@ def test_the_svg_says_what_is_drawn_and_fetches_nothing(svg):
         "highd b, vehicle 1 at 1.0 s (sample 0, eval)",
         "true maneuver: left, normal",
         "sure: keep 50%, left 38%, right 12%, normal 75%, brake 25%",
-        "direction of travel",
         "lane 1",
         "lane 2",
-        "along the road (m)",
+        "along the road (m), direction of travel \N{RIGHTWARDS ARROW}",
         "75%",
         "25%",
         "constant-velocity",
@@ -81,7 +81,7 @@ def test_the_svg_says_what_is_drawn_and_fetches_nothing(svg):
     ):
         assert text in texts, texts
     assert any("stretched" in text for text in texts)
-    assert "lanes of 12 ft, as no markings are known" not in texts
+    assert not any("lanes of 12 ft" in text for text in texts)
     assert "href" not in svg
     assert svg.count("http") == svg.count("http://www.w3.org/"), "names of XML, no addresses"
 
@@ -110,60 +110,70 @@ def test_layers_show_the_rows(drawing):
     tables = drawing.to_vega_lite()["datasets"]
     assert len(tables["markings"]) == 3
     assert [row["vehicle_id"] for row in tables["boxes"]] == [1, 2]
-    assert len(tables["predictions"]) == 2 * 5
+    assert [row["series"] for row in tables["paths"] if row["kind"] == "prediction"] == (
+        ["constant-velocity"] * 5 + ["sure"] * 5
+    )
     assert len(tables["ellipses"]) == 2 * 2 * 48
     assert len(tables["errors"]) == 2 * 4
-    assert {(row["model"], row["colour"], row["shape"]) for row in tables["predictions"]} == {
-        ("constant-velocity", MODEL_COLOURS[0], "circle"),
-        ("sure", MODEL_COLOURS[1], "square"),
-    }
+    assert [row["label"] for row in tables["probabilities"]] == ["75%", "25%"]
 
 
-def test_all_vehicles_of_a_moment_are_drawn(everybody):
-    drawing = draw_picture(everybody)
+def test_models_have_the_same_colour_and_shape_on_the_road_and_in_errors(drawing):
+    def find_scales(part, channel):
+        """The scales of a channel in any layer, as pairs of name and mark."""
+        if isinstance(part, list):
+            return [scale for each in part for scale in find_scales(each, channel)]
+        if not isinstance(part, dict):
+            return []
+        own = part.get("encoding", {}).get(channel, {}).get("scale")
+        found = [dict(zip(own["domain"], own["range"], strict=True))] if own else []
+        return found + [
+            scale for key, each in part.items() if key != "datasets" for scale in find_scales(each, channel)
+        ]
+
+    specification = drawing.to_vega_lite()
+    for channel, marks in (("stroke", MODEL_COLOURS), ("fill", MODEL_COLOURS), ("shape", MODEL_SHAPES)):
+        scales = find_scales(specification, channel)
+        assert len(scales) > 3
+        for scale in scales:
+            assert [scale[model] for model in ("constant-velocity", "sure")] == list(marks[:2])
+
+
+def test_all_vehicles_of_a_scene_are_drawn(whole_scene):
+    drawing = draw_picture(whole_scene)
     tables = drawing.to_vega_lite()["datasets"]
     assert len({row["ellipse"] for row in tables["ellipses"]}) == 2 * 2 + 2
-    assert [(row["vehicle_id"], row["fill"] == "transparent") for row in tables["boxes"]] == [
-        (1, False),
-        (2, False),
-        (5, True),
-    ]
+    assert [(row["vehicle_id"], row["known"]) for row in tables["boxes"]] == [(1, True), (2, True), (5, False)]
     assert drawing.render(".svg").startswith(b"<svg")
 
 
-def test_the_key_names_what_is_there_and_nothing_else(picture, everybody, folder, straight):
-    said = ["sure", "1 and 3 sigma at each second", "less probable, with probability"]
+def test_the_legend_names_only_present_marks(picture, whole_scene, folder, straight):
+    ellipses, thin = "ellipses: 1 and 3 sigma at each second", "thin lines: less probable, with probability"
     near = ["vehicle 1", "neighbor in its grid"]
-    assert names_of(picture) == [*near, "history", "truth", "constant-velocity", *said]
-    others = ["sure", "1 and 3 sigma at each second, of others 3", said[2]]
-    assert names_of(everybody) == [*near, "other vehicle", "size unknown", "history", "truth", *others]
-    assert names_of(draw(folder, straight)) == [*near, "history", "truth", "constant-velocity"]
+    assert legend_of(picture) == ([*near, "history", "truth", "constant-velocity", "sure"], [f"{ellipses}; {thin}"])
+    names, [marks] = legend_of(whole_scene)
+    assert names == [*near, "other vehicle", "history", "truth", "sure"]
+    assert marks == f"{ellipses}, of others 3; {thin}; outlined vehicle: size unknown"
+    assert legend_of(draw(folder, straight)) == ([*near, "history", "truth", "constant-velocity"], [])
     alone = replace(picture, vehicles=picture.vehicles[:1])
-    assert names_of(alone) == ["vehicle 1", "history", "truth", "constant-velocity", *said]
+    assert legend_of(alone)[0] == ["vehicle 1", "history", "truth", "constant-velocity", "sure"]
 
 
-def test_entries_of_the_key_do_not_overlap(everybody):
-    rows = draw_key_of(everybody)
-    assert rows[-1]["line"] > 0
-    for before, after in pairwise(rows):
-        assert after["line"] > before["line"] or after["x"] > before["text_x"] + 6 * len(before["told"])
-        assert after["text_x"] + 6 * len(after["told"]) < 700
+def test_long_names_of_models_stand_whole_in_the_legend_within_the_drawing(folder):
+    names = [f"attention-h4-ngsim-5s-learning-rate-0.001-seed-{number}" for number in range(4)]
+    picture = draw(folder, *map(sure, names))
+    assert legend_of(picture)[0][-4:] == names
+    assert int(ET.fromstring(draw_picture(picture).render(".svg")).get("width")) < 1300
 
 
-def draw_key_of(picture):
-    tables = Tables()
-    draw_key(tables, picture, choose_view(picture), 700)
-    return tables.rows["key"]
-
-
-def test_lanes_that_nobody_marked_are_said_to_be_nominal_and_names_are_no_markup(tmp_path):
+def test_lanes_without_markings_are_named_nominal_and_names_are_no_markup(tmp_path):
     picture = draw(open_moment(tmp_path, markings=None), sure("<b>&amp; ${datum.x}"))
     texts = texts_of(draw_picture(picture).render(".svg"))
-    assert "lanes of 12 ft, as no markings are known" in texts
+    assert any("lanes of 12 ft, as no markings are known" in text for text in texts)
     assert "<b>&amp; ${datum.x}" in texts
 
 
-def test_more_models_than_can_be_told_apart(folder):
+def test_more_models_than_colours_are_refused(folder):
     models = [sure(f"model {number}") for number in range(5)]
     with pytest.raises(ValueError, match="shows 1 to 4 models, got 5: model 0"):
         draw_picture(draw(folder, *models))

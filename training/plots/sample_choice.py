@@ -1,4 +1,4 @@
-"""Which samples are drawn: by vehicle and time, at random among those of a kind, or where a model is furthest off."""
+"""The choice of samples: by vehicle and time, at random among those of a kind, or by a model's greatest error."""
 
 from typing import Literal, get_args
 
@@ -15,26 +15,26 @@ from tracklake.training.runs.forecasters import Forecaster
 Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
 PICKS: tuple[Pick, ...] = get_args(Pick)
 
-MOST_LOOKED_AT = 20_000
-"""Samples that the worst is looked for among; of more, so many are drawn."""
+MOST_SEARCHED = 20_000
+"""Most samples searched for the worst; of more, so many are drawn at random."""
 BATCH_SIZE = 2048
+"""Samples predicted at once."""
 
 
 class NoSampleError(TracklakeError):
-    """There is no sample of the kind, vehicle or time asked for."""
+    """No sample has the requested kind, vehicle or time."""
 
 
 def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
-    """The number of a vehicle's sample at a time, or less than half a tick from it.
+    """Find the number of a vehicle's sample at a time, or less than half a tick from it.
 
     Args:
-        folder: where.
+        folder: tensors.
         vehicle: `SUBSET:ID` or `DATASET/SUBSET:ID`.
-        time_s: since the recording began.
+        time_s: seconds since the recording began.
 
     Raises:
-        NoSampleError: no such subset, vehicle or time, of which the nearest are named; or the vehicle is not written
-            so.
+        NoSampleError: no such subset, vehicle or time, or the vehicle is written in another form.
     """
     name, colon, number = vehicle.rpartition(":")
     if not colon or not name or not number.isascii() or not number.isdigit():
@@ -73,21 +73,20 @@ def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
 def pick_samples(
     folder: TensorFolder, part: str, pick: Pick, *, count: int = 1, seed: int = 0, judge: Forecaster | None = None
 ) -> Integers:
-    """Numbers (count,) of samples of a kind; fewer where there are fewer.
+    """Choose samples of a kind: numbers (count,), or fewer where there are fewer.
 
-    Where some of the kind have a whole future, they are drawn from these; of lane changes, where possible, those that
-    are still to come.
+    Samples with a whole future come first, then, among lane changes, those that happen after the sample.
 
     Args:
-        folder: where from.
+        folder: tensors.
         part: train, val or eval.
-        pick: the kind; `worst`: those with the greatest distance at the last position known, the worst first.
-        count: how many at most.
-        seed: of the draw.
-        judge: of `worst`: whose distance.
+        pick: the kind; `worst`: greatest distance at the last known position, the worst first.
+        count: most samples.
+        seed: seed of the draw.
+        judge: the model whose distances count; needed by `worst`.
 
     Raises:
-        NoSampleError: there is none.
+        NoSampleError: no sample is of the kind.
     """
     samples = folder.samples_of(part)
     found = samples[_is_kind(folder, samples, pick)]
@@ -103,28 +102,28 @@ def pick_samples(
     if pick != "worst":
         return random.permutation(found)[:count]
     if judge is None:
-        raise ValueError("the worst of what model: `worst` needs one to judge by")
-    if len(found) > MOST_LOOKED_AT:
-        found = np.sort(random.choice(found, MOST_LOOKED_AT, replace=False))
+        raise ValueError("`worst` needs a model to judge by")
+    if len(found) > MOST_SEARCHED:
+        found = np.sort(random.choice(found, MOST_SEARCHED, replace=False))
     distance = measure_last_distance(folder, found, judge)
     return found[np.argsort(-distance, kind="stable")[:count]]
 
 
 def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Forecaster) -> npt.NDArray[np.float64]:
-    """(B,) distances in m between predicted and true position at the last tick known of each sample."""
+    """Measure the distance in m between predicted and true position at each sample's last known tick (B,)."""
     distances = []
     for start in range(0, len(samples), BATCH_SIZE):
         observed, everything = read_samples(folder, samples[start : start + BATCH_SIZE], judge.reads)
         truth = truth_of_ego(everything)
-        said = judge.predictor.predict(observed).position_m.astype(np.float64)
+        position_m = judge.predictor.predict(observed).position_m.astype(np.float64)
         last = truth.future_mask.sum(axis=1) - 1
-        apart = (said - truth.future)[np.arange(len(last)), last]
+        apart = (position_m - truth.future)[np.arange(len(last)), last]
         distances.append(np.hypot(apart[:, 0], apart[:, 1]))
     return np.concatenate(distances)
 
 
 def _is_kind(folder: TensorFolder, samples: Integers, pick: Pick) -> Flags:
-    """(B,) which samples are candidates."""
+    """Find which samples (B,) are of a kind."""
     keep = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
     normal = folder.sample_longitudinal[samples] == LONGITUDINAL_MANEUVERS.index("normal")
     kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
@@ -132,12 +131,12 @@ def _is_kind(folder: TensorFolder, samples: Integers, pick: Pick) -> Flags:
 
 
 def _changes_lane(folder: TensorFolder, samples: Integers) -> Flags:
-    """(B,) whether the last lane known of the future is another than that of the sample."""
+    """Find whether the last known lane of the future differs from the sample's (B,)."""
     row = folder.sample_row[samples].astype(np.intp)
     changes: Flags = folder.lane[row + folder.sample_future[samples]] != folder.lane[row]
     return changes
 
 
-def _prefer(samples: Integers, whole: Flags) -> Integers:
-    """Those of the samples that are flagged, if any is; else all."""
-    return samples[whole] if whole.any() else samples
+def _prefer(samples: Integers, flagged: Flags) -> Integers:
+    """Keep the flagged samples if there are any, else all."""
+    return samples[flagged] if flagged.any() else samples

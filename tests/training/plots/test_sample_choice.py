@@ -9,7 +9,7 @@ from drawn_moment import FAR_SAMPLE, OWN_SAMPLE, open_moment
 from tensor_tables import TINY, random_clock, sample_everything, split_row, write
 
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.picking import NoSampleError, find_sample, measure_last_distance, pick_samples
+from tracklake.training.plots.sample_choice import NoSampleError, find_sample, measure_last_distance, pick_samples
 from tracklake.training.runs.forecasters import open_forecaster
 
 
@@ -47,7 +47,7 @@ def test_every_sample_is_found_where_it_is(many):
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "time_s", "told"),
+    ("vehicle", "time_s", "message"),
     [
         ("b:5", 1.25, r"no sample of vehicle 5 in b at 1.25 s: it has 1 from 1 to 1 s; the nearest is at 1 s"),
         ("b:5", math.nan, r"no sample of vehicle 5 in b at nan s"),
@@ -61,8 +61,8 @@ def test_every_sample_is_found_where_it_is(many):
         ("b:-1", 1.0, r"expected a vehicle as SUBSET:ID"),
     ],
 )
-def test_what_is_not_there_is_told_with_what_is(folder, vehicle, time_s, told):
-    with pytest.raises(NoSampleError, match=told):
+def test_missing_samples_are_refused_with_the_nearest(folder, vehicle, time_s, message):
+    with pytest.raises(NoSampleError, match=message):
         find_sample(folder, vehicle, time_s)
 
 
@@ -74,7 +74,7 @@ def test_kinds_are_by_the_true_maneuver(folder, pick, wanted):
     assert {int(pick_samples(folder, "eval", pick, seed=seed, count=9)[0]) for seed in range(5)} == wanted
 
 
-def test_a_kind_that_is_not_there_is_told(folder):
+def test_a_kind_without_samples_is_refused(folder):
     with pytest.raises(NoSampleError, match="no sample to pick by `lane-keep` among the 2 of part `eval`"):
         pick_samples(folder, "eval", "lane-keep")
     with pytest.raises(NoSampleError, match="among the 0 of part `train`"):
@@ -99,7 +99,7 @@ def test_draws_repeat_by_seed_and_are_of_the_part_and_kind(many):
 
 
 def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.picking.BATCH_SIZE", 7)
+    monkeypatch.setattr("tracklake.training.plots.sample_choice.BATCH_SIZE", 7)
     folder, tables = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     places = {(v, t): (x, y) for v, t, x, y in tables[1][1].select("vehicle_id", "tick", "x_m", "y_m").rows()}
@@ -117,13 +117,13 @@ def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
     assert pick_samples(folder, "eval", "worst", count=3, judge=judge).tolist() == best.tolist()
 
 
-def test_of_very_many_some_are_looked_at(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.picking.MOST_LOOKED_AT", 2)
+def test_the_worst_is_searched_among_some_of_very_many(many, monkeypatch):
+    monkeypatch.setattr("tracklake.training.plots.sample_choice.MOST_SEARCHED", 2)
     folder, _ = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     assert len(pick_samples(folder, "eval", "worst", count=5, judge=judge)) == 2
 
 
 def test_the_worst_needs_a_model(folder):
-    with pytest.raises(ValueError, match="needs one to judge by"):
+    with pytest.raises(ValueError, match="needs a model to judge by"):
         pick_samples(folder, "eval", "worst")
