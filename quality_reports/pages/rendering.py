@@ -1,6 +1,7 @@
 """How the report's pages are rendered: autoescaped templates, and how single values are put into words."""
 
 import unicodedata
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -37,8 +38,8 @@ def read_style() -> str:
     return (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
 
 
-def label_sums(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with `label`: its subset, or `all` where it sums up the dataset."""
+def label_sums(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Add `label` to a row: its subset, or `all of` the dataset that it sums up."""
     return {**row, "label": row["subset"] if row["subset"] is not None else f"all of {row['dataset']}"}
 
 

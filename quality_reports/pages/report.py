@@ -15,7 +15,8 @@ from tracklake.quality_reports.pages.rendering import flatten, make_environment,
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.rules.registry import RULES, Rule
-from tracklake.quality_reports.summaries import Connection, Row, collect
+from tracklake.quality_reports.summaries import Connection, collect
+from tracklake.schemas.quality import Provenance, Quality
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Report:
     """
 
     html: str
-    quality: dict[str, Any]
+    quality: Quality
     splits_html: str | None = None
 
     @property
@@ -62,7 +63,7 @@ def build_report(
     return Report(html=render(quality, pages), quality=quality, splits_html=render_splits(quality))
 
 
-def render(quality: Row, pages: Mapping[tuple[str, str], str] | None = None) -> str:
+def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
     """Render the page from what `collect` returns. Everything but our own style sheet and plots is escaped."""
     pages = name_pages(quality["subsets"]) if pages is None else pages
     return (
@@ -91,12 +92,12 @@ def render(quality: Row, pages: Mapping[tuple[str, str], str] | None = None) -> 
     )
 
 
-def _without_known(provenance: Row) -> Row:
+def _without_known(provenance: Provenance) -> dict[str, object]:
     """What the provenance table lists: everything but the files, which have a table of their own."""
     return {key: value for key, value in provenance.items() if key != "source_files"}
 
 
-def _drawings(quality: Row) -> dict[str, Any]:
+def _drawings(quality: Quality) -> dict[str, Any]:
     """The page's plots by name, as markup; None where there is nothing to draw."""
     speeds, starts, splits = quality["speeds"], quality["starts"], quality["splits"]
     # The others stand on the page of splits.

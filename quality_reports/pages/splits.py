@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 
 from tracklake.quality_reports.pages.rendering import make_environment, read_style
 from tracklake.quality_reports.plots import charts as plots
+from tracklake.quality_reports.summaries import Row
+from tracklake.schemas.quality import Quality, SplitBalance, Splits
 
 SPLITS_PAGE = "splits.html"
 """Beside the overview."""
@@ -20,10 +21,8 @@ SHARED = {
 }
 """What is drawn of the evaluation part, and what it is called."""
 
-Row = dict[str, Any]
 
-
-def render_splits(quality: Row) -> str | None:
+def render_splits(quality: Quality) -> str | None:
     """Render the page from what `quality_reports.summaries.collect` returns; None where there are no splits."""
     splits = quality["splits"]
     compared = compare_splits(splits)
@@ -60,7 +59,7 @@ def render_splits(quality: Row) -> str | None:
     )
 
 
-def compare_splits(splits: Row) -> list[Row]:
+def compare_splits(splits: Splits) -> list[Row]:
     """Put the splits side by side: of each dataset, what stands in eval beside what stands in train.
 
     Args:
@@ -115,5 +114,5 @@ def _shares(compared: Sequence[Row]) -> list[Row]:
     ]
 
 
-def _datasets(balance: Sequence[Row], split: str) -> list[tuple[str, str]]:
+def _datasets(balance: Sequence[SplitBalance], split: str) -> list[tuple[str, str]]:
     return list(dict.fromkeys((row["split"], row["dataset"]) for row in balance if row["split"] == split))

@@ -1,7 +1,7 @@
 """One page per subset beside the overview: its facts, findings, time-space diagrams, flow, worst examples, scores."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from markupsafe import Markup
 
@@ -13,6 +13,10 @@ from tracklake.quality_reports.plots.flow import draw_flow
 from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+from tracklake.schemas.quality import Quality
+from tracklake.schemas.quality_tracks import SubsetFacts
+
+T = TypeVar("T", bound=Mapping[str, Any])
 
 INTERVALS_S = (5.0, 10.0, 30.0, 60.0)
 """Lengths of the intervals of flow, density and speed: the longest of which a recording has at least FEWEST."""
@@ -20,12 +24,10 @@ FEWEST = 15
 MOST_ROWS = 10
 """Rows of a table of single vehicles."""
 
-MAIN_KEYS = ("dataset", "subset")
-
 
 def render_pages(
     connection: Connection,
-    quality: Row,
+    quality: Quality,
     *,
     rules: Sequence[Rule] = RULES,
     names: Mapping[tuple[str, str], str] | None = None,
@@ -45,7 +47,7 @@ def render_pages(
         {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
     ]
     for subset in quality["subsets"]:
-        content = {**_select(quality, subset), **_ask(connection, subset, declared)}
+        content = {**_select(quality, subset), **_query_subset(connection, subset, declared)}
         yield (
             names[subset["dataset"], subset["subset"]],
             template.render(
@@ -57,11 +59,11 @@ def render_pages(
         )
 
 
-def _select(quality: Row, subset: Row) -> Row:
-    """What the overview knows of a subset already."""
+def _select(quality: Quality, subset: SubsetFacts) -> Row:
+    """Select the figures of a subset from the overview's."""
 
-    def of_subset(rows: Sequence[Row]) -> list[Row]:
-        return [row for row in rows if all(row[key] == subset[key] for key in MAIN_KEYS)]
+    def of_subset(rows: Sequence[T]) -> list[T]:
+        return [row for row in rows if _get_key(row) == _get_key(subset)]
 
     positions = of_subset(quality["starts"]["positions"])
     starts = of_subset(quality["starts"]["subsets"])
@@ -90,9 +92,14 @@ def _select(quality: Row, subset: Row) -> Row:
     }
 
 
-def _ask(connection: Connection, subset: Row, rules: Sequence[Row]) -> Row:
-    """What only the lake knows, with the plots of it."""
-    where = {key: subset[key] for key in MAIN_KEYS}
+def _get_key(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the dataset and the subset of a row."""
+    return row["dataset"], row["subset"]
+
+
+def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[Row]) -> Row:
+    """Query the figures that only the subset's page shows, with their plots."""
+    where = {"dataset": subset["dataset"], "subset": subset["subset"]}
     extent = query(connection, "subset_extent", where)[0]
     limited = {**where, "most": MOST_ROWS}
     seconds = choose_interval(subset["seconds"])

@@ -7,7 +7,7 @@ the only sign: marks differ in shape or place too. The page's style sheet maps t
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import altair as alt
@@ -16,7 +16,7 @@ import vl_convert
 from tracklake.quality_reports.plots.rasters import VIRIDIS
 from tracklake.schemas.start_assessments import ESTIMATORS
 
-Row = dict[str, Any]
+Row = Mapping[str, Any]
 
 INK = "#1f2328"
 MUTED = "#59636e"

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.rules.rule import Case
+from tracklake.schemas.markdown import format_table
 
 HEAD = """# Rules
 
@@ -22,19 +23,19 @@ null.
 
 
 def write_rules() -> str:
-    """The whole page."""
-    return "\n".join([HEAD, *_table(), "", *(line for rule in RULES for line in _section(rule))])
+    """Write the whole page."""
+    overview = format_table(("rule", "severity", "unit", "worst"), map(_summarise, RULES))
+    return "\n".join([HEAD, *overview, "", *(line for rule in RULES for line in _write_section(rule))])
 
 
-def _table() -> Iterator[str]:
-    yield "| rule | severity | unit | worst |"
-    yield "| --- | --- | --- | --- |"
-    for rule in RULES:
-        worst = "the least" if rule.extreme == "min" else "the greatest"
-        yield f"| [{rule.name}](#{rule.name}) | {rule.severity} | {rule.unit} | {worst} |"
+def _summarise(rule: Rule) -> tuple[str, ...]:
+    """Return the cells of a rule's row in the overview."""
+    worst = "the least" if rule.extreme == "min" else "the greatest"
+    return f"[{rule.name}](#{rule.name})", rule.severity, rule.unit, worst
 
 
-def _section(rule: Rule) -> Iterator[str]:
+def _write_section(rule: Rule) -> Iterator[str]:
+    """Yield the lines of a rule's section."""
     thresholds = (f"`{each.name}` = {each.default:g} {each.unit}" for each in rule.thresholds)
     yield f"## {rule.name}"
     yield ""
@@ -45,22 +46,30 @@ def _section(rule: Rule) -> Iterator[str]:
     yield f"- Compared: {rule.compared}"
     yield f"- Source: {rule.source}"
     yield ""
-    yield from _example(rule.case)
+    yield from _write_example(rule.case)
     yield ""
 
 
-def _example(case: Case) -> Iterator[str]:
+def _write_example(case: Case) -> Iterator[str]:
+    """Yield the lines of a rule's example."""
     facts = [f"{case.frame_rate_hz:g} Hz"] if case.frame_rate_hz != Case.frame_rate_hz else []
     if case.lane_markings_m is not None:
         facts.append(f"lane markings at {' m, '.join(map('{:g}'.format, case.lane_markings_m))} m")
     if facts:
         yield f"Example, {', '.join(facts)}:"
         yield ""
-    yield f"| {' | '.join(case.entries)} | breaks it |"
-    yield "| --- " * (len(case.entries) + 1) + "|"
-    for place, values in enumerate(zip(*case.entries.values(), strict=True)):
-        shown = ("" if value is None else f"{value:g}" if isinstance(value, float) else str(value) for value in values)
-        yield f"| {' | '.join(shown)} | {'yes' if place in case.breaks else ''} |"
+    rows = (
+        (*map(_format_value, values), "yes" if place in case.breaks else "")
+        for place, values in enumerate(zip(*case.entries.values(), strict=True))
+    )
+    yield from format_table((*case.entries, "breaks it"), rows)
+
+
+def _format_value(value: object) -> str:
+    """Return the text of a value; nothing for null."""
+    if value is None:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":
