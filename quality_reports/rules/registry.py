@@ -8,26 +8,8 @@ import pandera.polars as pa
 import polars as pl
 from pandera.errors import SchemaErrors
 
-from tracklake.quality_reports.rules.motion import (
-    BACKWARD,
-    FRAME_GAP,
-    HIGH_ACCELERATION,
-    HIGH_JERK,
-    JERK_FLICKER,
-    LOW_CONSTANT_SPEED,
-    POSITION_JUMP,
-    SPEED_MISMATCH,
-)
-from tracklake.quality_reports.rules.place import (
-    HEADWAY_MISMATCH,
-    IMPLAUSIBLE_SIZE,
-    LANE_FLICKER,
-    LEADER_MISMATCH,
-    NEGATIVE_HEADWAY,
-    NEGATIVE_HEADWAY_RECORDED,
-    OUTSIDE_LANE,
-    OVERLAP,
-)
+from tracklake.quality_reports.rules.consistency import CONSISTENCY_RULES
+from tracklake.quality_reports.rules.plausibility import PLAUSIBILITY_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
 
 __all__ = [
@@ -45,25 +27,8 @@ __all__ = [
     "select_broken",
 ]
 
-RULES: tuple[Rule, ...] = (
-    NEGATIVE_HEADWAY,
-    NEGATIVE_HEADWAY_RECORDED,
-    HIGH_ACCELERATION,
-    LOW_CONSTANT_SPEED,
-    BACKWARD,
-    POSITION_JUMP,
-    FRAME_GAP,
-    OVERLAP,
-    SPEED_MISMATCH,
-    HIGH_JERK,
-    JERK_FLICKER,
-    LANE_FLICKER,
-    LEADER_MISMATCH,
-    HEADWAY_MISMATCH,
-    IMPLAUSIBLE_SIZE,
-    OUTSIDE_LANE,
-)
-"""The rules in use, in the order of the report."""
+RULES: tuple[Rule, ...] = (*PLAUSIBILITY_RULES, *CONSISTENCY_RULES)
+"""Rules in use, in the order of the report."""
 
 
 class ThresholdError(ValueError):

@@ -12,6 +12,11 @@ Severity = Literal["error", "warning", "info"]
 Limits = Mapping[str, float]
 """Thresholds by name."""
 
+DESIGN = "docs/DESIGN.md, section 5"
+COIFMAN = "Coifman and Li (2017)"
+PUNZO = "Punzo, Borzacchiello and Ciuffo (2011)"
+"""Sources that several rules cite."""
+
 
 @dataclass(frozen=True)
 class Threshold:
