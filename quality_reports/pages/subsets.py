@@ -10,7 +10,7 @@ from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.rendering import make_environment, read_style
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.plots.flow import draw_flow
-from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
+from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, make_grid
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
 from tracklake.schemas.quality import Quality
@@ -128,7 +128,7 @@ def _draw(connection: Connection, where: Mapping[str, str], extent: Row, seconds
     """The subset's plots, as markup; empty or None where it has no entries."""
     if not extent["entries"]:
         return {"diagrams": [], "legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
-    grid = lay_grid(extent)
+    grid = make_grid(extent)
     cells = query_frame(connection, "subset_time_space", {**where, **grid.parameters()})
     marks = query_frame(connection, "subset_errors", {**where, **grid.parameters(MARK_COLUMNS, MARK_ROWS)})
     intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
