@@ -1,4 +1,4 @@
-"""The report's numbers: one SQL statement per file over the lake's views, gathered into plain values."""
+"""Numbers of the report: SQL statements over the lake's views, one per file, gathered into plain values."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The tables as Markdown, derived from their declarations: `python -m tracklake.schemas.markdown > docs/tables.md`."""
+"""Page of the tables as Markdown, and Markdown tables for the other derived pages: see `make docs`."""
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,7 +22,7 @@ stage has not run. Every file is sorted by its table's key, which is unique with
 
 RAW_HEAD = """## Raw files
 
-The columns read, under the publishers' names and in their units. A line outside the bounds stands in `rejects`.
+The columns read, under the publishers' names and in their units. A line outside the bounds is written to `rejects`.
 """
 
 
@@ -45,6 +45,7 @@ def write_tables() -> str:
 
 
 def _write_section(table: Table, level: str) -> str:
+    """Write the section of a table."""
     partition = f", partitioned by {', '.join(table.partition)}" if table.partition else ""
     return "\n".join(
         [
@@ -69,6 +70,7 @@ def _describe(table: Table) -> Iterator[tuple[str, ...]]:
 
 
 def _format_bound(value: float | None) -> str:
+    """Format a bound; None is no bound."""
     return "any" if value is None else f"{value:,g}"
 
 

@@ -1,4 +1,4 @@
-"""The protocols as Markdown, from their declaration: see `make docs`."""
+"""Page of the protocols as Markdown, derived from their declarations: see `make docs`."""
 
 import sys
 
@@ -9,7 +9,7 @@ HEAD = """# Protocols
 
 Derived from `schemas/protocols.py`; do not edit (`make docs` writes it).
 
-A protocol is a named recipe of sampling, split and metrics, hashed: two figures may stand in one table only where the
+A protocol is a named recipe of sampling, split and metrics, hashed: two figures are comparable only where the
 digests of their protocols agree. `tracklake run SOURCE --protocol NAME` makes samples, split and tensors of it (the
 setting `protocol`, or TRACKLAKE_PROTOCOL); `train`, `evaluate` and `export` take the same flag. The settings
 `min_future_s`, `drop_error_findings`, `nearest` and `split` change a protocol, and its digest with it.

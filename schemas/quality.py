@@ -84,7 +84,7 @@ class Samples(TypedDict):
 
 
 class SplitRecipe(TypedDict):
-    """How a split divides the subsets."""
+    """Recipe that divides the subsets."""
 
     split: SplitName
     meaning: Annotated[str, "how the split divides"]
@@ -96,7 +96,7 @@ class SplitRecipe(TypedDict):
 
 
 class SplitBalance(TypedDict):
-    """How alike the parts of a split are."""
+    """Size and flow of one part of a split."""
 
     split: SplitName
     dataset: Dataset
@@ -113,7 +113,7 @@ class SplitBalance(TypedDict):
 
 
 class SplitMember(TypedDict):
-    """What a part holds of a subset."""
+    """Blocks of a subset in one part."""
 
     split: SplitName
     dataset: Dataset
@@ -130,7 +130,7 @@ class SplitMember(TypedDict):
 
 
 class SplitLeakage(TypedDict):
-    """What two parts of a split share."""
+    """Vehicles, frames, scenes and context that two parts share."""
 
     split: SplitName
     dataset: Dataset
@@ -165,7 +165,7 @@ class SplitContext(TypedDict):
 
 
 class SplitShift(TypedDict):
-    """How a quantity differs between two parts."""
+    """Difference of a quantity between two parts."""
 
     split: SplitName
     dataset: Dataset
@@ -189,7 +189,7 @@ class SplitLeftOut(TypedDict):
 
 
 class Splits(TypedDict):
-    """Splits: recipes, balance, leakage."""
+    """Recipes, balance and leakage of the splits."""
 
     recipes: list[SplitRecipe]
     balance: list[SplitBalance]
@@ -216,14 +216,14 @@ class Completeness(TypedDict):
 
 
 class DroppedRows(TypedDict):
-    """Rows dropped for one reason."""
+    """Number of rows dropped for one reason."""
 
     reason: Annotated[str, "why rows were dropped"]
     rows: Annotated[int, "rows dropped for it"]
 
 
 class IngestedFile(TypedDict):
-    """Rows of a source file."""
+    """Account of the rows of a source file."""
 
     dataset: Dataset
     file: File
@@ -265,7 +265,7 @@ class HorizonScore(TypedDict):
 
 
 class ModelScores(TypedDict):
-    """Errors of a model."""
+    """Errors of a model at all horizons."""
 
     model: Annotated[str, "name of the run"]
     part: Annotated[str, "part of the split that the model was evaluated on"]
@@ -273,7 +273,7 @@ class ModelScores(TypedDict):
 
 
 class ShownSettings(TypedDict, total=False):
-    """Settings of the run."""
+    """Settings that the report shows."""
 
     max_backward_share: Annotated[float, "a subset with a larger share of vehicles driving backwards is excluded"]
     on_ramp_lanes: Annotated[dict[str, list[int]], "lanes that are on-ramps, by site"]
@@ -293,7 +293,7 @@ class ShownSettings(TypedDict, total=False):
 
 
 class Source(TypedDict):
-    """A dataset's origin."""
+    """Title, licence and citation of a dataset."""
 
     title: Annotated[str, "title of the dataset"]
     licence: Annotated[str, "licence of the dataset"]
@@ -301,14 +301,14 @@ class Source(TypedDict):
 
 
 class ProtocolDigest(TypedDict):
-    """The protocol of the run."""
+    """Name and digest of the run's protocol."""
 
     name: Annotated[str, "name of the protocol"]
     digest: Annotated[str, "hash of all its parameters"]
 
 
 class SourceFile(TypedDict):
-    """A source file."""
+    """Digest of one source file."""
 
     dataset: Dataset
     file: File
@@ -316,7 +316,7 @@ class SourceFile(TypedDict):
 
 
 class Provenance(TypedDict, total=False):
-    """What the report was made with."""
+    """Facts that make the report reproducible."""
 
     lake: Annotated[str, "name of the lake's folder"]
     lake_id: Annotated[str, "id given to the lake when it was made"]
@@ -335,7 +335,7 @@ class Provenance(TypedDict, total=False):
 
 
 class Quality(TypedDict):
-    """The whole document."""
+    """Everything that quality.json holds."""
 
     schema: Annotated[str, "version of this document"]
     headline: Headline

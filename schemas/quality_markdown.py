@@ -1,4 +1,4 @@
-"""The page of quality.json as Markdown, derived from `schemas.quality`: see `make docs`."""
+"""Page of quality.json as Markdown, derived from `schemas.quality`: see `make docs`."""
 
 import sys
 import types

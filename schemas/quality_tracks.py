@@ -30,7 +30,7 @@ class Headline(TypedDict):
 
 
 class StageProgress(TypedDict):
-    """How many subsets a stage has worked on."""
+    """Progress of one stage, in subsets."""
 
     stage: Annotated[str, "validate, repair, samples or split"]
     possible: Annotated[int, "subsets that the stage can work on"]
@@ -88,7 +88,7 @@ class RecordingFacts(TypedDict):
 
 
 class ThresholdValue(TypedDict):
-    """A rule's threshold."""
+    """Value of one threshold of a rule."""
 
     name: Annotated[str, "name of the setting"]
     value: Annotated[float, "value that validation used; see `provenance.thresholds_elsewhere`", "`unit`"]
@@ -97,7 +97,7 @@ class ThresholdValue(TypedDict):
 
 
 class Found(TypedDict):
-    """What a rule found; null where it was checked in no subset."""
+    """Counts of a rule's findings; null where it was checked in no subset."""
 
     subsets_checked: Annotated[int, "subsets in which the rule was checked"]
     subsets_all: Annotated[int, "subsets in all"]
@@ -110,19 +110,19 @@ class Found(TypedDict):
 
 
 class FoundInDataset(Found):
-    """What a rule found in a dataset."""
+    """Counts of a rule's findings in a dataset."""
 
     dataset: Dataset
 
 
 class FoundInSubset(FoundInDataset):
-    """What a rule found in a subset."""
+    """Counts of a rule's findings in a subset."""
 
     subset: Subset
 
 
 class RuleFindings(TypedDict):
-    """A rule, and what it found."""
+    """Declaration of a rule and its findings."""
 
     name: Annotated[str, "name as in `findings.rule`; rules that no entry breaks are listed too"]
     severity: Annotated[str, "error, warning or info"]
@@ -137,7 +137,7 @@ class RuleFindings(TypedDict):
 
 
 class SubsetScores(TypedDict):
-    """How feasible and consistent a subset's tracks are."""
+    """Feasibility and consistency of a subset's tracks."""
 
     dataset: Dataset
     subset: Subset
@@ -171,7 +171,7 @@ class SpeedQuantiles(TypedDict):
 
 
 class SpeedsOfEntries(SpeedQuantiles):
-    """Distribution over entries."""
+    """Distribution of speeds over entries."""
 
     entries: Annotated[int, "entries in the distribution"]
 
@@ -192,7 +192,7 @@ class SpeedBin(TypedDict):
 
 
 class Speeds(TypedDict):
-    """Recorded speeds."""
+    """Distributions of recorded speeds."""
 
     summary: list[SpeedsOfEntries]
     per_second: list[SpeedsPerSecond]
@@ -225,7 +225,7 @@ class Published(TypedDict):
 
 
 class SubsetStarts(TypedDict):
-    """How the tracks of a subset begin."""
+    """Track starts of one subset."""
 
     dataset: Dataset
     subset: Subset
@@ -291,7 +291,7 @@ class Assessed(TypedDict):
 
 
 class Starts(TypedDict):
-    """How tracks begin."""
+    """Track starts and their assessment."""
 
     subsets: list[SubsetStarts]
     positions: list[StartPosition]

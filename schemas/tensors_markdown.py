@@ -1,4 +1,4 @@
-"""The tensor folder as Markdown, from its declaration: see `make docs`."""
+"""Page of the tensor folder as Markdown, derived from its declaration: see `make docs`."""
 
 import sys
 
@@ -8,11 +8,11 @@ from tracklake.schemas.protocols import CSP
 from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION, Array
 
 LETTERS = {
-    "N": "rows: entries on the protocol's clock that stand in a part of the split, of subsets with samples",
+    "N": "rows: entries on the protocol's clock that are in a part of the split, of subsets with samples",
     "R": "runs: gap-free stretches of one vehicle's ticks inside one block",
     "S": "samples",
     "K": "(sample, neighbor) pairs",
-    "C": "scenes: moments at which somebody is a sample",
+    "C": "scenes: moments with at least one sample",
     "M": "vehicles in scenes",
 }
 

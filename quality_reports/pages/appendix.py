@@ -1,4 +1,4 @@
-"""The validating study's tables of speeds and errors, each row of the lake followed by the published one."""
+"""Tables of speeds and errors as in the validating study, each row of the lake followed by the published one."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -17,7 +17,7 @@ from tracklake.quality_reports.plots.axes import (
     make_ticks,
     wrap_svg,
 )
-from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade
+from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade_values
 from tracklake.schemas.arrays import Floats
 
 COLUMNS, ROWS = 1000, 140
@@ -114,7 +114,7 @@ def _draw_lane(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> str:
     """Draw the diagram of one lane."""
     x = Scale(grid.first_s, grid.first_s + grid.columns * grid.seconds, LEFT, WIDTH - RIGHT)
     y = Scale(grid.first_x_m, grid.first_x_m + grid.rows * grid.metres, TOP + HEIGHT, TOP)
-    image = encode_uri(grade(rasterise(grid, cells), 0, grid.top_mps))
+    image = encode_uri(grade_values(rasterise(grid, cells), 0, grid.top_mps))
     wide = WIDTH - LEFT - RIGHT
     time_s = grid.first_s + (marks["grid_column"].to_numpy() + 0.5) * MARK_COLUMNS * grid.seconds
     x_m = grid.first_x_m + (marks["grid_row"].to_numpy() + 0.5) * MARK_ROWS * grid.metres

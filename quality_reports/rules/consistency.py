@@ -6,7 +6,7 @@ from tracklake.quality_reports.rules.rule import DESIGN, PUNZO, Case, Limits, Ru
 
 
 def differ(first: pl.Expr, second: pl.Expr) -> pl.Expr:
-    """abs(first - second), rounded to 1e-4.
+    """Return abs(first - second), rounded to 1e-4.
 
     What differs by the threshold in the source's decimals must not exceed it by the last bit of a Float32.
     """
@@ -155,7 +155,8 @@ pick-ups; trucks: from vans to the longest combinations on European roads (25.25
 tracking error; motorcycles with theirs."""
 
 
-def _size_limits() -> tuple[Threshold, ...]:
+def _make_size_limits() -> tuple[Threshold, ...]:
+    """Make the thresholds of SIZES_M."""
     return tuple(
         Threshold(f"{name}_{side}_{end}_m", bound, "m")
         for name, sides in SIZES_M.items()
@@ -164,8 +165,8 @@ def _size_limits() -> tuple[Threshold, ...]:
     )
 
 
-def _beyond_bounds(limits: Limits) -> pl.Expr:
-    """How far length or width lies outside the bounds of the vehicle's class, m; null without a class or a size."""
+def _measure_excess(limits: Limits) -> pl.Expr:
+    """Measure how far length or width lies outside the bounds of the class, m; null without a class or a size."""
     excess = pl.lit(None, pl.Float32)
     for name, sides in SIZES_M.items():
         distances = [
@@ -184,13 +185,13 @@ IMPLAUSIBLE_SIZE = Rule(
     name="implausible_size",
     severity="warning",
     unit="m",
-    thresholds=_size_limits(),
+    thresholds=_make_size_limits(),
     meaning="the vehicle's length or width lies outside the generous bounds of its class; all its entries break the "
     "rule. The worst value is by how much",
     source=f"{DESIGN}; lengths and widths of road vehicles: Directive 96/53/EC (trucks 18.75 m and 2.55 m; 25.25 m for "
     "modular combinations), 23 CFR 658 (width 2.6 m)",
-    breaks=lambda limits: _beyond_bounds(limits) > 0,
-    value=_beyond_bounds,
+    breaks=lambda limits: _measure_excess(limits) > 0,
+    value=_measure_excess,
     extreme="max",
     compared="as recorded, in single precision",
     case=Case({"class": ("car", "car", "truck"), "length_m": (8.0, 8.01, 8.01)}, breaks=(1,)),

@@ -1,4 +1,4 @@
-"""The rules as Markdown, derived from their declarations: see `make docs`."""
+"""Page of the rules as Markdown, derived from their declarations: see `make docs`."""
 
 import sys
 from collections.abc import Iterator
@@ -14,10 +14,10 @@ Derived from `quality_reports/`; do not edit (`make docs` writes it).
 A finding is a run of consecutive entries of one vehicle that breaks one rule. Findings flag; nothing is deleted. Errors
 cannot be, warnings hardly can, infos are worth knowing. Thresholds are settings: `[thresholds]` in `tracklake.toml`.
 A rule is not checked where the source lacks a column that it reads, and the report says so. What equals a threshold in
-the source's decimals does not exceed it; how exactly values are compared stands with each rule.
+the source's decimals does not exceed it; each rule says how values are compared.
 
-In the examples a line is an entry, at the default thresholds. What they do not say: each entry is of a vehicle of its
-own, a car of 4 m x 2 m, in frame 1 of 25 Hz, in lane 1, at x = y = 0, at 20 m/s and no acceleration. An empty cell is
+In the examples a line is an entry, at the default thresholds. By default each entry belongs to another vehicle,
+a car of 4 m x 2 m, in frame 1 of 25 Hz, in lane 1, at x = y = 0, at 20 m/s and no acceleration. An empty cell is
 null.
 """
 

@@ -1,4 +1,4 @@
-"""The rules that entries are judged by: the list of them, their thresholds, Pandera checks and documentation."""
+"""Rules in use: their thresholds, Pandera checks and documentation."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -36,17 +36,17 @@ class ThresholdError(ValueError):
 
 
 def checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
-    """The rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
+    """Select the rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
     return tuple(rule for rule in rules if not set(rule.columns) & set(lacking))
 
 
 def columns_needed(rules: Sequence[Rule]) -> tuple[str, ...]:
-    """The columns of `tracks`, `vehicles` and `subsets` behind what the rules name."""
+    """Return the columns of `tracks`, `vehicles` and `subsets` that the rules need."""
     return tuple(dict.fromkeys(name for rule in rules for name in rule.columns))
 
 
 def columns_read(rules: Sequence[Rule]) -> tuple[str, ...]:
-    """The columns of prepared entries that any of the rules names, derived ones among them."""
+    """Return the columns of prepared entries that the rules name, derived ones included."""
     return tuple(dict.fromkeys(name for rule in rules for name in rule.reads))
 
 
@@ -69,8 +69,8 @@ def resolve(rules: Sequence[Rule], overrides: Mapping[str, float] | None = None)
 def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> pa.DataFrameSchema:
     """Return the rules as a Pandera schema over a collected frame of prepared entries: one custom check per rule.
 
-    Validate a DataFrame with `lazy=True` to hear of every rule; a LazyFrame would be checked for dtypes only. The
-    schema says whether entries break a rule; `quality_reports.rules.findings.find` says which, from the same
+    Validate a DataFrame with `lazy=True` to check every rule; a LazyFrame would be checked for dtypes only. The
+    schema tells whether entries break a rule; `quality_reports.rules.findings.find` finds which, by the same
     expressions.
 
     Raises:
@@ -86,7 +86,7 @@ def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | N
 def select_broken(
     entries: pl.DataFrame, rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None
 ) -> tuple[Rule, ...]:
-    """The rules that a subset's prepared entries break anywhere, by the Pandera checks.
+    """Select the rules that any of a subset's prepared entries breaks, by the Pandera checks.
 
     Raises:
         ThresholdError: see `resolve`.
@@ -100,7 +100,7 @@ def select_broken(
 
 
 def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
-    """One rule as a Pandera check: true where an entry does not break it."""
+    """Return a rule as a Pandera check, true where an entry does not break it."""
     return pa.Check(
         lambda data: data.lazyframe.select(~broken),
         name=rule.name,
@@ -110,7 +110,7 @@ def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
 
 
 def describe(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Rows of documentation, one per rule: name, severity, unit, thresholds, meaning, source, columns read.
+    """Describe each rule in a row: name, severity, unit, thresholds, meaning, source, columns read.
 
     Raises:
         ThresholdError: see `resolve`.

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tracklake.quality_reports.plots.axes import Scale, draw_line, find_range, format_number, make_ticks
-from tracklake.quality_reports.plots.rasters import EMPTY, LEVELS, encode_png, grade, make_palette
+from tracklake.quality_reports.plots.rasters import EMPTY, LEVELS, encode_png, grade_values, make_palette
 from tracklake.quality_reports.plots.time_space import COLUMNS, ROWS, Grid, draw_lanes, make_grid, rasterise
 from tracklake.quality_reports.summaries import query, query_frame
 
@@ -57,7 +57,7 @@ def test_the_palette_grows_lighter_step_by_step():
 
 def test_values_are_graded_from_the_first_colour_to_the_last():
     values = np.array([np.nan, -3.0, 0.0, 12.5, 25.0, 99.0])
-    assert grade(values, 0, 25).tolist() == [EMPTY, 1, 1, 128, LEVELS, LEVELS]
+    assert grade_values(values, 0, 25).tolist() == [EMPTY, 1, 1, 128, LEVELS, LEVELS]
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-2, 1e6), st.integers(2, 12))
