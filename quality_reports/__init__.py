@@ -1,1 +1,1 @@
-"""Data-quality rules, and the report that shows what they found."""
+"""Data-quality rules, and the report of their findings."""

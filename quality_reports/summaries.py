@@ -1,60 +1,105 @@
-"""The report's numbers: one SQL statement per file over the lake's views, gathered into plain values."""
+"""Numbers of the report: SQL statements over the lake's views, one per file, gathered into plain values."""
 
 import math
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from importlib.resources import files
 from pathlib import PurePath
-from typing import Any, Protocol, SupportsFloat, TypeAlias
+from typing import Any, Protocol, SupportsFloat, TypeAlias, TypeVar, cast
 
 import polars as pl
 
 from tracklake.quality_reports.published import SOURCE, list_published
 from tracklake.quality_reports.rules.registry import RULES, Rule, describe
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.quality import (
+    QUALITY_SCHEMA,
+    Completeness,
+    IngestedFile,
+    ModelScores,
+    Provenance,
+    Quality,
+    RejectedRow,
+    SampleDrops,
+    SourceFile,
+    SplitBalance,
+    SplitContext,
+    SplitLeakage,
+    SplitLeftOut,
+    SplitMember,
+    SplitRecipe,
+    Splits,
+    SplitShift,
+    SubsetSamples,
+)
+from tracklake.schemas.quality_tracks import (
+    Headline,
+    LeftOut,
+    PositionAssessment,
+    RecordingFacts,
+    RuleFindings,
+    SpeedBin,
+    SpeedsOfEntries,
+    SpeedsPerSecond,
+    StageProgress,
+    StartPosition,
+    Starts,
+    SubsetAssessment,
+    SubsetFacts,
+    SubsetScores,
+    SubsetStarts,
+)
 from tracklake.schemas.split_leakage import QUANTITIES
 from tracklake.schemas.start_assessments import ESTIMATORS
 
-QUALITY_SCHEMA = "tracklake/quality/1"
 SIGNIFICANT_DIGITS = 10
-"""A sum's last digits depend on the order in which threads add; beyond these the report would not repeat."""
+"""Digits to which fractions are rounded: a sum's last ones depend on the order in which threads add."""
 REJECTS_PER_FILE = 10
+"""Rejected lines that the report lists of each file."""
 REJECT_CHARACTERS = 300
+"""Longest text of a rejected line in the report, in characters."""
+
+T = TypeVar("T")
+Row = dict[str, Any]
+Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
+"""Values that JSON has."""
+Parameters = Mapping[str, Any]
+"""Values of a statement's $names."""
+UNCHECKED: Row = {
+    "subsets_checked": 0,
+    "subsets_all": 0,
+    **dict.fromkeys(("runs", "vehicles", "vehicle_share", "entries", "entry_share", "worst")),
+}
+"""Findings of a rule in a lake without subsets."""
 
 
 class Result(Protocol):
-    """What the report needs of a statement's result."""
+    """Result of a statement, as far as the report reads it."""
 
     @property
     def description(self) -> Sequence[Any] | None:
-        """A tuple per column, of which the first is its name."""
+        """Tuples that begin with a column's name."""
         ...
 
     def fetchall(self) -> list[Any]:
-        """All rows as tuples."""
+        """Return all rows as tuples."""
         ...
 
     def pl(self) -> pl.DataFrame:
-        """All rows as a frame."""
+        """Return all rows as a frame."""
         ...
 
 
 class Connection(Protocol):
-    """What the report needs of a lake's connection: DuckDB's own has it, and the read-only one of the lake."""
+    """Connection to a lake: DuckDB's own, or the lake's read-only one."""
 
     def execute(self, statement: str, parameters: Mapping[str, Any] = ..., /) -> Result:
         """Run a statement."""
         ...
 
 
-Row = dict[str, Any]
-Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
-"""What JSON knows."""
-Parameters = Mapping[str, Any]
-
-
-def statement(name: str) -> str:
-    """The text of `sql/<name>.sql`."""
+def read_statement(name: str) -> str:
+    """Return the text of `sql/<name>.sql`."""
     return (files("tracklake.quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
 
 
@@ -62,40 +107,40 @@ def query(connection: Connection, name: str, parameters: Parameters | None = Non
     """Run `sql/<name>.sql` and return its rows as dictionaries of plain values.
 
     Args:
-        connection: with the catalog's views.
-        name: the file's name without its suffix.
-        parameters: values of its $names.
+        connection: connection to a lake.
+        name: file name without its suffix.
+        parameters: values of the statement's $names.
     """
     # Not on a cursor: it would be a connection of its own, without the caller's local settings and registered frames.
-    result = connection.execute(statement(name), dict(parameters or {}))
+    result = connection.execute(read_statement(name), dict(parameters or {}))
     names = [column[0] for column in result.description or ()]
     return [dict(zip(names, map(plain, row), strict=True)) for row in result.fetchall()]
 
 
 def query_frame(connection: Connection, name: str, parameters: Parameters | None = None) -> pl.DataFrame:
-    """Run `sql/<name>.sql` and return its rows as a frame: for what is drawn, not printed.
+    """Run `sql/<name>.sql` and return its rows as a frame, for plots.
 
     Args:
-        connection: with the catalog's views.
-        name: the file's name without its suffix.
-        parameters: values of its $names.
+        connection: connection to a lake.
+        name: file name without its suffix.
+        parameters: values of the statement's $names.
     """
-    return connection.execute(statement(name), dict(parameters or {})).pl()
+    return connection.execute(read_statement(name), dict(parameters or {})).pl()
 
 
 def plain_row(row: Mapping[str, Any]) -> Row:
-    """A mapping with values that JSON knows; see `plain`."""
+    """Turn a mapping's values into what JSON has; see `plain`."""
     return {str(key): plain(value) for key, value in row.items()}
 
 
 def plain(value: object) -> Plain:
-    """Turn a value into what JSON knows.
+    """Turn a value into what JSON has.
 
     NaN and infinity become None, other fractions are rounded to SIGNIFICANT_DIGITS, paths and dates become text,
     tuples and sets lists.
 
     Raises:
-        TypeError: the value is of no such kind.
+        TypeError: JSON has nothing for the value.
     """
     if value is None or isinstance(value, bool | str | int):
         return value
@@ -120,96 +165,94 @@ def collect(
     *,
     rules: Sequence[Rule] = RULES,
     scores: Sequence[Mapping[str, Any]] | None = None,
-) -> Row:
-    """Gather every number of the report: what `quality.json` holds and the page shows.
+) -> Quality:
+    """Gather every number of the report: what `quality.json` holds and the pages show.
 
-    Rows are those of `sql/<name>.sql` (their first lines say what a row is); units are in the names; shares are
-    0 to 1; null means unknown or not done, never zero. Nothing here depends on the clock or on row order.
-
-    Returns a mapping with the keys
-        schema: "tracklake/quality/1"; its number grows when a key changes meaning or goes.
-        headline: one row of headline.sql.
-        stages: [{stage, possible, done}] in subsets; rows of stages.sql.
-        left_out: [{dataset, stages, reason, subsets}]; rows of left_out.sql.
-        subsets: rows of subsets.sql.
-        rules: [{name, severity, unit, thresholds: [{name, value, default, unit}], meaning, source, columns,
-            total, datasets: [..], subsets: [..]}]; the last three are rows of findings.sql: runs, vehicles,
-            vehicle_share, entries, entry_share, worst, subsets_checked, subsets_all.
-        speeds: {summary: rows of speeds.sql, per_second: rows of speeds_per_second.sql, histogram: rows of
-            speed_histogram.sql}.
-        recordings: rows of recordings.sql.
-        subset_scores: rows of subset_scores.sql.
-        published: {source, figures: fields of quality_reports.published.Published}.
-        starts: {subsets: rows of starts.sql, positions: rows of start_positions.sql, assessed: {subsets: rows of
-            assessed_subsets.sql, positions: rows of assessed_positions.sql}}.
-        samples: {subsets: rows of samples.sql, drops: rows of sample_drops.sql}.
-        splits: {recipes, balance, members, leakage, context, shifts, left_out: rows of split_<name>.sql}.
-        completeness: rows of completeness.sql.
-        ingestion: {files: rows of ingested_files.sql, rejects: rows of rejects.sql}.
-        model_scores: [{model, part, rows: [{seconds, rmse_m, n}]}], empty unless given.
-        provenance: as given, and source_files: rows of source_files.sql.
+    The result depends neither on the clock nor on the order of rows.
 
     Args:
-        connection: with the views tracks, vehicles, subsets, findings, start_cutoffs, missing_starts,
-            start_assessments, samples, sample_drops, neighbors, the tables of splits, completeness, ingest_log,
-            rejects and sample_counts; they may be empty.
-        provenance: anything worth citing: lake, tracklake, versions, settings...; `thresholds`, where given, are the
-            overrides that validation ran with (of most recordings; `thresholds_elsewhere` those of the others).
-        rules: what validation judged by.
-        scores: what evaluation found.
+        connection: connection to a lake; its views may be empty.
+        provenance: facts worth citing (lake, versions, settings); `thresholds`, where present, are the overrides that
+            validation used for most recordings, `thresholds_elsewhere` those of the other recordings.
+        rules: rules that validation used.
+        scores: results of evaluation, as `schemas.quality.ModelScores`.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
+    source_files = _query_rows(connection, "source_files", SourceFile)
     return {
         "schema": QUALITY_SCHEMA,
-        "headline": query(connection, "headline")[0],
-        "stages": query(connection, "stages"),
-        "left_out": query(connection, "left_out"),
-        "subsets": query(connection, "subsets"),
-        "rules": _rules(connection, rules, provenance.get("thresholds") or {}),
+        "headline": _query_rows(connection, "headline", Headline)[0],
+        "stages": _query_rows(connection, "stages", StageProgress),
+        "left_out": _query_rows(connection, "left_out", LeftOut),
+        "subsets": _query_rows(connection, "subsets", SubsetFacts),
+        "rules": _collect_rules(connection, rules, provenance.get("thresholds") or {}),
         "speeds": {
-            "summary": query(connection, "speeds"),
-            "per_second": query(connection, "speeds_per_second"),
-            "histogram": query(connection, "speed_histogram"),
+            "summary": _query_rows(connection, "speeds", SpeedsOfEntries),
+            "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
+            "histogram": _query_rows(connection, "speed_histogram", SpeedBin),
         },
-        "recordings": query(connection, "recordings"),
-        "subset_scores": query(connection, "subset_scores"),
+        "recordings": _query_rows(connection, "recordings", RecordingFacts),
+        "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
         "published": {"source": SOURCE, "figures": list_published()},
-        "starts": {
-            "subsets": query(connection, "starts"),
-            "positions": query(connection, "start_positions"),
-            "assessed": {
-                "subsets": query(connection, "assessed_subsets", {"estimators": list(ESTIMATORS)}),
-                "positions": query(connection, "assessed_positions", {"estimators": list(ESTIMATORS)}),
-            },
+        "starts": _collect_starts(connection),
+        "samples": {
+            "subsets": _query_rows(connection, "samples", SubsetSamples),
+            "drops": _query_rows(connection, "sample_drops", SampleDrops),
         },
-        "samples": {"subsets": query(connection, "samples"), "drops": query(connection, "sample_drops")},
-        "splits": {
-            "recipes": query(connection, "split_recipes"),
-            "balance": query(connection, "split_balance", {"parts": list(PARTS)}),
-            "members": query(connection, "split_members", {"parts": list(PARTS)}),
-            "leakage": query(connection, "split_leakage", {"parts": list(PARTS)}),
-            "context": query(connection, "split_context", {"parts": list(PARTS)}),
-            "shifts": query(connection, "split_shifts", {"parts": list(PARTS), "quantities": list(QUANTITIES)}),
-            "left_out": query(connection, "split_left_out"),
-        },
-        "completeness": query(connection, "completeness"),
+        "splits": _collect_splits(connection),
+        "completeness": _query_rows(connection, "completeness", Completeness),
         "ingestion": {
-            "files": query(connection, "ingested_files"),
-            "rejects": query(
+            "files": _query_rows(connection, "ingested_files", IngestedFile),
+            "rejects": _query_rows(
                 connection,
                 "rejects",
+                RejectedRow,
                 {"rejects_per_file": REJECTS_PER_FILE, "reject_characters": REJECT_CHARACTERS},
             ),
         },
-        "model_scores": plain(list(scores or ())),
-        "provenance": {**plain_row(provenance), "source_files": query(connection, "source_files")},
+        "model_scores": [cast("ModelScores", plain_row(each)) for each in scores or ()],
+        "provenance": cast("Provenance", {**plain_row(provenance), "source_files": source_files}),
     }
 
 
-def _rules(connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]) -> list[Row]:
-    """Each rule's declaration, with what was found in the whole lake, per dataset and per subset."""
+def _query_rows(connection: Connection, name: str, _row: type[T], parameters: Parameters | None = None) -> list[T]:
+    """Run `sql/<name>.sql`, whose columns are the keys of a row type of `schemas.quality`."""
+    return cast("list[T]", query(connection, name, parameters))
+
+
+def _collect_starts(connection: Connection) -> Starts:
+    """Gather how tracks begin, and how good repair windows are."""
+    estimators = {"estimators": list(ESTIMATORS)}
+    return {
+        "subsets": _query_rows(connection, "starts", SubsetStarts),
+        "positions": _query_rows(connection, "start_positions", StartPosition),
+        "assessed": {
+            "subsets": _query_rows(connection, "assessed_subsets", SubsetAssessment, estimators),
+            "positions": _query_rows(connection, "assessed_positions", PositionAssessment, estimators),
+        },
+    }
+
+
+def _collect_splits(connection: Connection) -> Splits:
+    """Gather the splits: recipes, balance and leakage."""
+    parts = {"parts": list(PARTS)}
+    return {
+        "recipes": _query_rows(connection, "split_recipes", SplitRecipe),
+        "balance": _query_rows(connection, "split_balance", SplitBalance, parts),
+        "members": _query_rows(connection, "split_members", SplitMember, parts),
+        "leakage": _query_rows(connection, "split_leakage", SplitLeakage, parts),
+        "context": _query_rows(connection, "split_context", SplitContext, parts),
+        "shifts": _query_rows(connection, "split_shifts", SplitShift, {**parts, "quantities": list(QUANTITIES)}),
+        "left_out": _query_rows(connection, "split_left_out", SplitLeftOut),
+    }
+
+
+def _collect_rules(
+    connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]
+) -> list[RuleFindings]:
+    """Gather each rule's declaration and its findings in the whole lake, per dataset and per subset."""
     rows = query(connection, "findings", {"rules": [rule.name for rule in rules]})
     extremes = {rule.name: "least" if rule.extreme == "min" else "greatest" for rule in rules}
     found: dict[str, list[Row]] = {rule.name: [] for rule in rules}
@@ -217,25 +260,16 @@ def _rules(connection: Connection, rules: Sequence[Rule], thresholds: Mapping[st
         name = row.pop("rule")
         least_and_greatest = {"least": row.pop("least"), "greatest": row.pop("greatest")}
         found[name].append({**row, "worst": least_and_greatest[extremes[name]]})
-    nothing = dict.fromkeys(("runs", "vehicles", "vehicle_share", "entries", "entry_share", "worst"))
-    return [
-        {
-            **declared,
-            "total": next(
-                (_without(row, "dataset", "subset") for row in found[declared["name"]] if row["dataset"] is None),
-                {"subsets_checked": 0, "subsets_all": 0, **nothing},
-            ),
-            "datasets": [
-                _without(row, "subset")
-                for row in found[declared["name"]]
-                if row["dataset"] is not None and row["subset"] is None
-            ],
-            "subsets": [row for row in found[declared["name"]] if row["subset"] is not None],
-        }
-        for declared in describe(rules, thresholds)
-    ]
+    collected = []
+    for declared in describe(rules, thresholds):
+        own = found[declared["name"]]
+        total = [_omit(row, "dataset", "subset") for row in own if row["dataset"] is None]
+        datasets = [_omit(row, "subset") for row in own if row["dataset"] is not None and row["subset"] is None]
+        subsets = [row for row in own if row["subset"] is not None]
+        collected.append({**declared, "total": (total or [UNCHECKED])[0], "datasets": datasets, "subsets": subsets})
+    return cast("list[RuleFindings]", collected)
 
 
-def _without(row: Row, *names: str) -> Row:
-    """The row without some of its columns."""
+def _omit(row: Row, *names: str) -> Row:
+    """Return the row without some of its columns."""
     return {key: value for key, value in row.items() if key not in names}

@@ -1,4 +1,4 @@
-"""What every table of the lake is. Nothing but polars and pandera is imported here."""
+"""Declarations of every table of the lake and of quality.json; nothing heavier than polars and pandera is imported."""
 
 from tracklake.schemas.columns import StructureError, Table, column
 from tracklake.schemas.completeness import COMPLETENESS
@@ -15,7 +15,7 @@ from tracklake.schemas.tracks import TRACKS
 from tracklake.schemas.vehicles import VEHICLE_STARTS, VEHICLES
 
 SCHEMA_VERSION = 1
-"""Counts changes of the tables below that an older lake cannot be read with."""
+"""Version of the tables below; it grows when an older lake can no longer be read."""
 
 TABLES: tuple[Table, ...] = (
     TRACKS,

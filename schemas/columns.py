@@ -1,4 +1,4 @@
-"""Units, dtypes and what a table is.
+"""Declaration of tables: columns, dtypes, units, keys and structural rules.
 
 A table is declared once, as data: its columns, dtypes, meanings, units, key and structural rules. The writer, the
 catalog, the validation and the documentation all read that one declaration.
@@ -42,7 +42,7 @@ def column(
     lt: float | None = None,
     isin: tuple[str, ...] | None = None,
 ) -> pa.Column:
-    """Declare one column.
+    """Declare one column of a table.
 
     Args:
         dtype: Polars dtype, exact.
@@ -81,7 +81,7 @@ PROTOCOL = column(pl.String, "named, hashed recipe of sampling, split and metric
 
 
 def key_increases(key: tuple[str, ...]) -> pl.Expr:
-    """True where a row's key is lexicographically greater than that of the row before (and in the first row).
+    """Return an expression that is true where a row's key is lexicographically greater than that of the row before.
 
     One such check over a whole table proves that it is sorted, that its key is unique and that frames increase
     within a vehicle, for the price of one comparison per key column.
@@ -97,7 +97,7 @@ _Translation = Callable[[pl.Expr, Mapping[str, Any]], pl.Expr]
 
 
 def _compare(statistic: str, holds: Callable[[pl.Expr, Any], pl.Expr], end: str) -> _Translation:
-    """A bound, held against the column's least or greatest value; a column without values keeps every bound."""
+    """Compare a bound with the column's least or greatest value; a column without values keeps every bound."""
     return lambda values, given: holds(getattr(values, end)(), given[statistic]).fill_null(value=True)
 
 
@@ -108,23 +108,24 @@ _AS_EXPRESSION: dict[str, _Translation] = {
     "less_than": _compare("max_value", operator.lt, "max"),
     "isin": lambda values, given: values.is_in(list(given["allowed_values"])).all(),
 }
-"""Pandera's checks by name as one truth about a whole column."""
+"""Translations of Pandera's checks, by name, to one boolean per column."""
 
 
 def _unknown(_values: pl.Expr, _given: Mapping[str, Any]) -> pl.Expr:
+    """Return false for a check without translation, so that Pandera runs it."""
     return pl.lit(value=False)
 
 
 @dataclass(frozen=True, eq=False)  # declared once and compared by identity, so that a table can be a key
 class Table:
-    """One table of the lake, declared.
+    """Declaration of one table of the lake.
 
     Args:
-        name: what SQL calls it.
-        meaning: what one row is.
-        key: unique, and the order in which every file is sorted.
-        columns: in order.
-        partition: the hive folders; these columns stand in a file's path and not in the file.
+        name: name in SQL.
+        meaning: description of one row.
+        key: columns that are unique together and by which every file is sorted.
+        columns: declared columns, in order.
+        partition: columns of the hive folders, which are in a file's path and not in the file.
     """
 
     name: str
@@ -140,7 +141,7 @@ class Table:
 
     @cached_property
     def schema(self) -> pa.DataFrameSchema:
-        """The table as a pandera schema: exactly these columns, no silent casts, the key sorted and unique."""
+        """Pandera schema of the table: exactly these columns, no silent casts, the key sorted and unique."""
         return pa.DataFrameSchema(
             columns=dict(self.columns),
             checks=[
@@ -174,7 +175,7 @@ class Table:
         return frozenset(name for name, declared in self.columns.items() if not declared.nullable)
 
     def empty(self) -> pl.DataFrame:
-        """A frame of no rows."""
+        """Return a frame without rows."""
         return pl.DataFrame(schema=self.dtypes)
 
     def conform(self, frame: pl.LazyFrame) -> pl.LazyFrame:
@@ -200,9 +201,9 @@ class Table:
 
     @cached_property
     def _holds(self) -> pl.Expr:
-        """True for a frame that the schema admits: its checks in one pass, where Pandera takes one for each.
+        """Expression that is true for a valid frame: all checks in one pass, where Pandera takes one for each.
 
-        Pandera then says what is wrong with a frame that it does not admit; a check that is not translated here leaves
+        Pandera then explains what is wrong with an invalid frame; a check that is not translated here leaves
         every frame to it.
         """
         rules = [key_increases(self.key).all()]
@@ -216,7 +217,7 @@ class Table:
         return pl.all_horizontal(rules)
 
     def describe(self) -> list[dict[str, str]]:
-        """Rows of documentation: column, dtype, unit, null, meaning."""
+        """Describe each column in a row: column, dtype, unit, null, meaning."""
         return [
             {
                 "column": name,

@@ -1,4 +1,4 @@
-"""`completeness`: what publishers and metadata announce of a recording, beside what was found."""
+"""`completeness`: figures that publishers and metadata announce, beside those of the lake."""
 
 import polars as pl
 
@@ -17,7 +17,7 @@ MEASURES = {
     "first_frames_differ": "vehicles whose first row is of another frame than announced",
     "last_frames_differ": "vehicles whose last row is of another frame than announced",
 }
-"""What is counted over a recording. `vehicles_...` and `..._differ` are expected to be 0."""
+"""Measures of a recording by name; `vehicles_...` and `..._differ` are expected to be 0."""
 
 PUBLISHED_TOTALS: dict[str, dict[str, int]] = {
     "i-80-1600": {"vehicles": 2_052, "entries": 1_262_678},
@@ -34,7 +34,7 @@ COMPLETENESS = Table(
     "One row per (recording, measure, authority): how much there should be and how much was found. Measures: "
     + "; ".join(f"`{name}`: {meaning}" for name, meaning in MEASURES.items())
     + ". Which vehicles they are: `SELECT * FROM vehicles WHERE entries <> entries_announced` (on arterials a vehicle "
-    "that turns stands in several subsets, whose entries add up; here they are counted together).",
+    "that turns is in several subsets, whose entries add up; here they are counted together).",
     key=("recording", "measure", "authority"),
     partition=("dataset",),
     columns={
@@ -48,7 +48,7 @@ COMPLETENESS = Table(
             isin=AUTHORITIES,
         ),
         "expected": column(pl.Int64, "as announced; null where the files do not say", nullable=True, ge=0),
-        "found": column(pl.Int64, "in the lake; null where it cannot be told", nullable=True, ge=0),
+        "found": column(pl.Int64, "figure of the lake; null where it is unknown", nullable=True, ge=0),
         "agrees": column(pl.Boolean, "found = expected; null where either is unknown", nullable=True),
         "rows_dropped": column(
             pl.Int64,

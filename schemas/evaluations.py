@@ -1,12 +1,12 @@
-"""`evaluations`: what `tracklake evaluate` writes, long form; measured rows, and published ones marked as such.
+"""`evaluations`: results of `tracklake evaluate` in long form, measured rows and published ones.
 
 It is a file of the lake's folder (`evaluations/<protocol>.csv`), and no table of the lake: runs are trained, renamed
 and deleted without the lake's knowing, so nothing here is kept up to date.
 
 Every figure of a measured row is over the same n samples: those of the part, the dataset and the group whose position
 is known at `seconds`. A future is known from its first tick on without a gap, so they are known at every tick before as
-well. Errors are those of the one place that a model says (of several alternatives, the most probable one's); the
-density is judged by `nll_nats` alone. How n samples become one figure is told by `average`:
+well. Errors are those of the predicted position (of several alternatives, of the most probable one); the density
+is judged by `nll_nats` alone. `average` is how n samples become one figure:
 
 - `samples`: the mean over them; every sample counts the same, so a vehicle that is seen for long counts more.
 - `vehicles`: the mean over each vehicle's own samples, then the mean over the vehicles; every vehicle counts the same.
@@ -22,7 +22,7 @@ from tracklake.schemas.columns import PARTS, Table, column
 ORIGINS = ("measured", "published")
 AVERAGES = ("samples", "vehicles")
 EVERYTHING = "all"
-"""The dataset and the group of rows that leave nothing out."""
+"""Name of the dataset and the group that hold all samples."""
 
 FINDING_GROUPS = {
     "warning": ("findings=touched", "findings=untouched"),
@@ -35,10 +35,12 @@ _OF_TICK = "at `seconds`"
 
 
 def _metres(description: str) -> pa.Column:
+    """Declare a column of distances."""
     return column(pl.Float64, description, unit="m", nullable=True, ge=0)
 
 
 def _share(description: str) -> pa.Column:
+    """Declare a column of shares."""
     return column(pl.Float64, description, nullable=True, ge=0, le=1)
 
 
@@ -67,7 +69,7 @@ _FIGURES = {
 }
 
 FIGURES = tuple(_FIGURES)
-"""What is measured, by column."""
+"""Columns of the measured figures."""
 
 EVALUATIONS = Table(
     "evaluations",

@@ -1,4 +1,4 @@
-"""`ingest_log` and `rejects`: what became of every row read."""
+"""`ingest_log` and `rejects`: the account of every row read."""
 
 import polars as pl
 
@@ -9,14 +9,14 @@ REASON_COUNT = pl.Struct({"reason": pl.String(), "rows": pl.Int64()})
 INGEST_LOG = Table(
     "ingest_log",
     "One row per (source file, recording): rows_read = rows_kept + rows_dropped, always. Lines that cannot be "
-    "one of a file's several recordings stand in a row whose recording is null.",
+    "one of a file's several recordings are in a row whose recording is null.",
     key=("file",),
     partition=("dataset",),
     columns={
         "dataset": DATASET,
         "recording": column(
             pl.String,
-            "which recording the rows belong to; null = cannot be told",
+            "recording of the rows; null = unknown",
             nullable=True,
         ),
         "file": column(pl.String, "path as given to ingest"),
@@ -24,7 +24,7 @@ INGEST_LOG = Table(
         "dialect": column(pl.String, "how the file was read"),
         "rows_read": column(pl.Int64, "data rows (headers apart)", ge=0),
         "rows_kept": column(pl.Int64, "rows that became entries (or metadata)", ge=0),
-        "rows_dropped": column(pl.Int64, "rows that stand in rejects", ge=0),
+        "rows_dropped": column(pl.Int64, "rows written to rejects", ge=0),
         "dropped_by_reason": column(pl.List(REASON_COUNT), "rows dropped, by reason"),
     },
 )
@@ -39,7 +39,7 @@ REJECTS = Table(
         "dataset": DATASET,
         "recording": column(
             pl.String,
-            "which recording the row belongs to; null = cannot be told",
+            "recording of the row; null = unknown",
             nullable=True,
         ),
         "file": column(pl.String, "path as given to ingest"),

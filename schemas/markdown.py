@@ -1,13 +1,16 @@
-"""The tables as Markdown, derived from their declarations: `python -m tracklake.schemas.markdown > docs/tables.md`."""
+"""Page of the tables as Markdown, and Markdown tables for the other derived pages: see `make docs`."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from tracklake.schemas import SCHEMA_VERSION, TABLES, Table
 from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 RAW_TABLES = (RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS)
+
+HEADINGS = ("column", "dtype", "unit", "null", "bounds", "meaning")
+"""Titles above the declaration of a table."""
 
 HEAD = f"""# Tables
 
@@ -19,18 +22,30 @@ stage has not run. Every file is sorted by its table's key, which is unique with
 
 RAW_HEAD = """## Raw files
 
-The columns read, under the publishers' names and in their units. A line outside the bounds stands in `rejects`.
+The columns read, under the publishers' names and in their units. A line outside the bounds is written to `rejects`.
 """
 
 
+def format_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table; a bar in a cell becomes a slash.
+
+    Args:
+        headings: titles of the columns.
+        rows: cells, as many as headings.
+    """
+    cells = (headings, ("---",) * len(headings), *rows)
+    return [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in cells]
+
+
 def write_tables() -> str:
-    """The whole page."""
-    parts = [HEAD, *(_section(table, "##") for table in TABLES), RAW_HEAD]
-    parts += [_section(table, "###") for table in RAW_TABLES]
+    """Write the whole page."""
+    parts = [HEAD, *(_write_section(table, "##") for table in TABLES), RAW_HEAD]
+    parts += [_write_section(table, "###") for table in RAW_TABLES]
     return "\n".join(parts)
 
 
-def _section(table: Table, level: str) -> str:
+def _write_section(table: Table, level: str) -> str:
+    """Write the section of a table."""
     partition = f", partitioned by {', '.join(table.partition)}" if table.partition else ""
     return "\n".join(
         [
@@ -40,24 +55,22 @@ def _section(table: Table, level: str) -> str:
             "",
             f"Key: {', '.join(table.key)}{partition}.",
             "",
-            *_rows(table),
+            *format_table(HEADINGS, _describe(table)),
             "",
         ]
     )
 
 
-def _rows(table: Table) -> Iterator[str]:
-    headings = ("column", "dtype", "unit", "null", "bounds", "meaning")
-    yield f"| {' | '.join(headings)} |"
-    yield f"|{' --- |' * len(headings)}"
+def _describe(table: Table) -> Iterator[tuple[str, ...]]:
+    """Yield the cells of each column's row."""
     for row in table.describe():
         low, high = table.bounds.get(row["column"], (None, None))
-        bounds = "" if low is high is None else f"{_bound(low)} to {_bound(high)}"
-        cells = (f"`{row['column']}`", row["dtype"], row["unit"], row["null"], bounds, row["meaning"])
-        yield f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+        bounds = "" if low is high is None else f"{_format_bound(low)} to {_format_bound(high)}"
+        yield f"`{row['column']}`", row["dtype"], row["unit"], row["null"], bounds, row["meaning"]
 
 
-def _bound(value: float | None) -> str:
+def _format_bound(value: float | None) -> str:
+    """Format a bound; None is no bound."""
     return "any" if value is None else f"{value:,g}"
 
 

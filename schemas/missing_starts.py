@@ -1,4 +1,4 @@
-"""`start_cutoffs` and `missing_starts`: where tracks should begin, and what is missing of those that begin late."""
+"""`start_cutoffs` and `missing_starts`: where tracks should begin, and the missing parts of late ones."""
 
 import polars as pl
 

@@ -14,15 +14,15 @@ HEADLINES: Mapping[Headline, str] = {
     "rmse-by-axis": "the same along the road, and across it",
     "mae": "mean distance between predicted and true place",
 }
-"""What the published tables state, and what stands first in ours."""
+"""Errors by name that published tables state and that ours show first."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How prediction origins are drawn from the tracks, what is predicted, and how it is judged.
+    """Recipe of prediction origins, predicted futures and metrics.
 
     Args:
-        name: what the tables call it.
+        name: name in the tables.
         rate_hz: ticks per second; tick k lies at time_s = k / rate_hz.
         history_s: a sample needs this much track before it, without a gap.
         horizon_s: how far the future is predicted; what is missing of it is masked.
@@ -50,12 +50,12 @@ class Protocol:
 
     @property
     def history_ticks(self) -> int:
-        """H: positions of a history, the sample's own included (16 at 5 Hz, 31 at 10 Hz)."""
+        """Positions of a history, H, the sample's own included (16 at 5 Hz, 31 at 10 Hz)."""
         return round(self.history_s * self.rate_hz) + 1
 
     @property
     def horizon_ticks(self) -> int:
-        """F: positions of a future (25 at 5 Hz)."""
+        """Positions of a future, F (25 at 5 Hz)."""
         return round(self.horizon_s * self.rate_hz)
 
     @property
@@ -76,12 +76,13 @@ class Protocol:
 
     @property
     def sampling_digest(self) -> str:
-        """The same of what samples depend on: every parameter but the split, its share, and how it is judged."""
+        """First 12 hex digits of the sha256 of the parameters that samples depend on."""
         others = ("train_share", "scored_s", "headline")
         return _digest({name: value for name, value in asdict(self).items() if name not in others} | {"split": ""})
 
 
 def _digest(values: dict[str, object]) -> str:
+    """Return the first 12 hex digits of the sha256 of some values."""
     return hash_values(values, 12)
 
 
@@ -106,7 +107,7 @@ PROTOCOLS = {
         ),
     )
 }
-"""The first is what is taken where nobody says otherwise."""
+"""Protocols by name; the first is the default."""
 
 MEANINGS: Mapping[str, str] = {
     "csp": "The windows of convolutional social pooling (Deo and Trivedi 2018), on a split that does not leak: "
@@ -125,4 +126,4 @@ MEANINGS: Mapping[str, str] = {
     "10 Hz, 70 % of the recordings for training, mean absolute errors at every half second. Left open, and set by us: "
     "which recordings train (drawn by `split_seed`), how short a future may be; its own recordings are not public.",
 }
-"""Of each protocol: what it repeats, and what its source leaves open."""
+"""Meaning of each protocol: its source, and the choices that the source leaves open."""

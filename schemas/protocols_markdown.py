@@ -1,22 +1,22 @@
-"""The protocols as Markdown, from their declaration: see `make docs`."""
+"""Page of the protocols as Markdown, derived from their declarations: see `make docs`."""
 
 import sys
-from collections.abc import Sequence
 
+from tracklake.schemas.markdown import format_table
 from tracklake.schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
 
 HEAD = """# Protocols
 
 Derived from `schemas/protocols.py`; do not edit (`make docs` writes it).
 
-A protocol is a named recipe of sampling, split and metrics, hashed: two figures may stand in one table only where the
+A protocol is a named recipe of sampling, split and metrics, hashed: two figures are comparable only where the
 digests of their protocols agree. `tracklake run SOURCE --protocol NAME` makes samples, split and tensors of it (the
 setting `protocol`, or TRACKLAKE_PROTOCOL); `train`, `evaluate` and `export` take the same flag. The settings
 `min_future_s`, `drop_error_findings`, `nearest` and `split` change a protocol, and its digest with it.
 """
 
 OWN_SHARES = {"csp-2018": 0.7}
-"""Splits that do not ask how much is to train."""
+"""Training shares of splits that ignore the protocol's, 0 to 1."""
 
 HEADINGS = (
     "protocol", "rate Hz", "history s", "horizon s", "H", "F", "least future s", "split", "trains", "scored at s",
@@ -25,9 +25,8 @@ HEADINGS = (
 
 
 def write_protocols() -> str:
-    """The whole page."""
-    lines = [HEAD, _row(HEADINGS), _row(("---",) * len(HEADINGS))]
-    lines += [_row(_describe(protocol)) for protocol in PROTOCOLS.values()]
+    """Write the whole page."""
+    lines = [HEAD, *format_table(HEADINGS, map(_describe, PROTOCOLS.values()))]
     lines += ["", "H and F are positions of a history, the sample's own included, and of a future. Headlines:", ""]
     lines += [f"- `{name}`: {meaning}" for name, meaning in HEADLINES.items()]
     for name in PROTOCOLS:
@@ -36,6 +35,7 @@ def write_protocols() -> str:
 
 
 def _describe(protocol: Protocol) -> tuple[str, ...]:
+    """Return the cells of a protocol's row."""
     trains = OWN_SHARES.get(protocol.split, protocol.train_share)
     return (
         f"`{protocol.name}`",
@@ -51,10 +51,6 @@ def _describe(protocol: Protocol) -> tuple[str, ...]:
         f"`{protocol.headline}`",
         f"`{protocol.digest}`",
     )
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

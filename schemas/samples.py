@@ -1,4 +1,4 @@
-"""`samples`, what was left out of them (`sample_drops`, `sample_counts`), and `neighbors`: who stands around them."""
+"""`samples`, the entries that are none (`sample_drops`, `sample_counts`), and the `neighbors` of samples."""
 
 import polars as pl
 
@@ -80,7 +80,7 @@ SAMPLE_COUNTS = Table(
             "nearest free cell of the lane",
             ge=0,
         ),
-        "crowded_out": column(pl.Int64, "of the collisions: found no free cell, and stand nowhere", ge=0),
+        "crowded_out": column(pl.Int64, "collisions without a free cell, which are dropped", ge=0),
     },
 )
 
@@ -101,7 +101,7 @@ NEIGHBORS = Table(
             ge=0,
             lt=CELLS,
         ),
-        "neighbor_id": column(pl.Int32, "who stands there", ge=0),
+        "neighbor_id": column(pl.Int32, "vehicle in the cell", ge=0),
         "dx_m": column(pl.Float32, "neighbor's x_m - own x_m", unit="m"),
     },
 )

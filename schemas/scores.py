@@ -1,4 +1,4 @@
-"""`vehicle_scores` and `subset_scores`: how much of a track and of a subset can be believed."""
+"""`vehicle_scores` and `subset_scores`: how reliable tracks and subsets are."""
 
 import polars as pl
 

@@ -1,11 +1,11 @@
-"""What the parts of a split have in common, how far apart they are, and how they differ: measured, not promised."""
+"""`split_leakage`, `split_context`, `split_shifts`: what the parts of a split share, and how they differ."""
 
 import polars as pl
 
 from tracklake.schemas.columns import DATASET, PARTS, Table, column
 
 QUANTITIES = ("flow", "speed", "left", "right", "brake")
-"""Whose distributions are compared: veh/lane/s, m/s, and 0 or 1 for each sample's maneuver."""
+"""Quantities whose distributions are compared: veh/lane/s, m/s, and 0 or 1 for each sample's maneuver."""
 
 _SPLIT = column(pl.String, "the split's name")
 _PART = column(pl.String, "one part: train or val", isin=PARTS)
@@ -32,12 +32,12 @@ SPLIT_LEAKAGE = Table(
         "frames": column(pl.Int64, "frames of a subset in which the other part has entries", ge=0),
         "scenes_shared": column(pl.Int64, "moments of a subset at which both parts have samples", ge=0),
         "scenes": column(pl.Int64, "moments of a subset at which the other part has samples", ge=0),
-        "context_shared": column(pl.Int64, "neighbors of samples of either part that stand in the other one", ge=0),
+        "context_shared": column(pl.Int64, "neighbors of samples of either part that are in the other one", ge=0),
         "context": column(pl.Int64, "neighbors of the samples of both parts", ge=0),
         "nearest_s": column(
             pl.Float64,
             "least time between an entry of one part and an entry of the other in the same subset; null where no "
-            "subset stands in both; recordings that follow one another in clock time are not compared",
+            "subset is in both; recordings that follow one another in clock time are not compared",
             unit="s",
             nullable=True,
             ge=0,

@@ -1,4 +1,4 @@
-"""Recipes of splits: what each is made by, the parameters that apply, and a hash of them."""
+"""Recipes of splits: their parameters, and a hash of them."""
 
 import json
 import math
@@ -28,18 +28,18 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     CSP_2018: (),
     BY_RECORDING: ("train_share", "validation", "seed"),
 }
-"""What each split is made by, besides the subsets and their samples (which are the protocol's)."""
+"""Parameters of each split, besides the subsets and the protocol's samples."""
 
 LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
 """Splits that claim that nothing of one part is reachable from another."""
 
 
 VALIDATION_SHARE = 0.1
-"""Of a part `val`."""
+"""Share of the part `val`, 0 to 1."""
 
 
 def find_shares(train_share: float, *, validation: bool) -> dict[str, int]:
-    """Shares of the parts in thousandths: whole numbers, so that a share is met or missed exactly.
+    """Return the shares of the parts in thousandths, as whole numbers, so that they compare exactly.
 
     Args:
         train_share: what trains where there is no part `val`.
@@ -57,7 +57,7 @@ def find_shares(train_share: float, *, validation: bool) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class SplitRecipe:
-    """What a split is made by.
+    """Parameters that a split is made by.
 
     Args:
         name: of SPLIT_NAMES.
@@ -87,12 +87,12 @@ class SplitRecipe:
 
     @property
     def claims_no_leakage(self) -> bool:
-        """Whether the run fails where parts share anything."""
+        """True where the run fails if parts share anything."""
         return self.name in LEAKAGE_FREE
 
     @property
     def window_s(self) -> float:
-        """History and future: two samples farther apart in time have no moment in common."""
+        """Length of history and future together, in seconds; samples farther apart share no moment."""
         return self.history_s + self.horizon_s
 
     @property
@@ -102,7 +102,7 @@ class SplitRecipe:
 
     @property
     def parameters(self) -> str:
-        """The name and every parameter that the split is made by, as JSON."""
+        """Name and parameters of the split, as JSON."""
         values = asdict(self)
         return json.dumps({name: values[name] for name in ("name", *PARAMETERS[self.name])}, sort_keys=True)
 

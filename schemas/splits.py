@@ -1,4 +1,4 @@
-"""`splits`, what they are made by, and how alike the parts are: who trains, who evaluates, who does neither."""
+"""`splits`, their recipes, the balance of their parts, and the vehicles that are in none."""
 
 import polars as pl
 

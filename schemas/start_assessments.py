@@ -1,4 +1,4 @@
-"""`start_assessments`: how good the estimates of missing starts are, measured on tracks that were cut on purpose."""
+"""`start_assessments`: errors of the estimates of missing starts, measured on tracks that were cut."""
 
 import polars as pl
 
@@ -31,7 +31,7 @@ START_ASSESSMENTS = Table(
             pl.Int64, "cut off, from the first entry at or beyond the cut-off to the start, all tracks together", ge=0
         ),
         "frames_covered": column(pl.Int64, "of them, those within the window", ge=0),
-        "frames_excess": column(pl.Int64, "within the windows in vain: the vehicle was not yet at the cut-off", ge=0),
+        "frames_excess": column(pl.Int64, "excess within the windows: the vehicle was not yet at the cut-off", ge=0),
         "coverage": column(
             pl.Float64, "frames_covered / frames_missing; null where none are", nullable=True, ge=0, le=1
         ),

@@ -11,7 +11,7 @@ ARRAYS_FILE = "arrays.safetensors"
 INDEX_FILE = "index.json"
 
 TENSORS_VERSION = 3
-"""Counts changes of the two files that older readers cannot read."""
+"""Version of the two files; it grows when older readers cannot read them."""
 
 POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
 
@@ -20,7 +20,7 @@ How positions are stored. As int16 they are whole steps from the subset's centre
 road decimetres or centimetres (these reach 327 m either way: longer roads are refused), across it millimetres."""
 
 STEPS_M = {"int16-decimetres": (0.1, 0.001), "int16-centimetres": (0.01, 0.001)}
-"""Of int16 positions: metres per step along and across the road."""
+"""Metres per step of int16 positions, along and across the road."""
 
 SAFETENSORS_DTYPES = {
     "float32": "F32",
@@ -30,7 +30,7 @@ SAFETENSORS_DTYPES = {
     "int8": "I8",
     "uint8": "U8",
 }
-"""What the format calls NumPy's dtypes, of those used here."""
+"""Names of NumPy's dtypes in the safetensors format."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class Array:
     counts: str = ""
 
     def sizes(self, letters: dict[str, int]) -> tuple[int, ...]:
-        """The shape in numbers."""
+        """Return the shape in numbers."""
         axes = (axis.partition("+") for axis in self.shape)
         return tuple(letters[name] + int(more or 0) if name.isalpha() else int(name) for name, _, more in axes)
 
     def stored_as(self, storage: str) -> str:
-        """NumPy's name of the dtype under one of POSITION_STORAGES."""
+        """Return NumPy's name of the dtype under one of POSITION_STORAGES."""
         return self.dtype if self.dtype != "position" else storage.partition("-")[0]
 
 
@@ -109,12 +109,12 @@ ARRAYS = (
 
 ORDER = """\
 A run is a gap-free stretch of one vehicle's ticks inside one block of the split; rows are sorted by (subset,
-vehicle_id, tick), runs stand in that order and one after the other. Pairs are sorted by (sample, cell). A scene is
+vehicle_id, tick), runs are stored in that order, one after the other. Pairs are sorted by (sample, cell). A scene is
 every vehicle of one (subset, block, tick) at which one of them at least is a sample; scenes are sorted by those three.
 """
 
 MOST_TICKS = 255
-"""H and F are at most this: known ticks are stored in a byte."""
+"""Greatest H and F, in ticks: known ticks are stored in a byte."""
 
 INDEX_KEYS = {
     "version": "a whole number",
@@ -129,7 +129,7 @@ INDEX_KEYS = {
     "samples_by_part": "counts by name",
     "split_recipe": "an object or null",
 }
-"""Each key and the kind of its value."""
+"""Keys of the index and the kinds of their values."""
 
 INDEX_MEANING = """\
 What `index.json` holds: the version; the split's name; the protocol's parameters and digest; how positions are stored;
@@ -147,7 +147,7 @@ SUBSET_KEYS = {
     "last_lane": "a whole number",
     "width_m": "a number",
 }
-"""Likewise of each subset."""
+"""Keys of each subset in the index and the kinds of their values."""
 
 SUBSET_MEANING = """\
 Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,
@@ -156,4 +156,4 @@ the map taken from the whole recording, later moments included); width_m of the 
 12 ft a lane)."""
 
 NOMINAL_LANE_M = 3.6576
-"""12 ft: taken for a lane's width where no markings are known, to mirror positions and for the lanes of scenes."""
+"""Width of a lane without known markings, in metres (12 ft), for mirrored positions and the lanes of scenes."""

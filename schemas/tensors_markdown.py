@@ -1,17 +1,18 @@
-"""The tensor folder as Markdown, from its declaration: see `make docs`."""
+"""Page of the tensor folder as Markdown, derived from its declaration: see `make docs`."""
 
 import sys
 
 from tracklake.schemas import tensors
+from tracklake.schemas.markdown import format_table
 from tracklake.schemas.protocols import CSP
-from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION
+from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, STEPS_M, SUBSET_KEYS, TENSORS_VERSION, Array
 
 LETTERS = {
-    "N": "rows: entries on the protocol's clock that stand in a part of the split, of subsets with samples",
+    "N": "rows: entries on the protocol's clock that are in a part of the split, of subsets with samples",
     "R": "runs: gap-free stretches of one vehicle's ticks inside one block",
     "S": "samples",
     "K": "(sample, neighbor) pairs",
-    "C": "scenes: moments at which somebody is a sample",
+    "C": "scenes: moments with at least one sample",
     "M": "vehicles in scenes",
 }
 
@@ -32,19 +33,22 @@ Shapes, order and units of the batches gathered from them (numpy, torch, or on a
 
 
 def write_tensors_page() -> str:
-    """The whole page."""
+    """Write the whole page."""
     lines = [HEAD, *(f"- {letter}: {meaning}" for letter, meaning in LETTERS.items())]
-    lines += ["", "## Arrays", "", "| array | dtype | shape | meaning |", "| --- | --- | --- | --- |"]
-    for array in ARRAYS:
-        dtype = "float32 or int16" if array.dtype == "position" else array.dtype
-        lines.append(f"| `{array.name}` | {dtype} | ({', '.join(array.shape)}) | {array.meaning} |")
+    lines += ["", "## Arrays", "", *format_table(("array", "dtype", "shape", "meaning"), map(_describe, ARRAYS))]
     lines += ["", tensors.ORDER.strip(), "", "## Positions as int16", "", tensors.STORAGE, ""]
-    lines += ["| storage | m per step along | m per step across |", "| --- | --- | --- |"]
-    lines += [f"| {storage} | {along:g} | {across:g} |" for storage, (along, across) in STEPS_M.items()]
+    steps = ((storage, f"{along:g}", f"{across:g}") for storage, (along, across) in STEPS_M.items())
+    lines += format_table(("storage", "m per step along", "m per step across"), steps)
     lines += ["", "## The index", "", tensors.INDEX_MEANING, ""]
     lines += [f"Keys: {', '.join(f'`{key}`' for key in INDEX_KEYS)}.", "", tensors.SUBSET_MEANING, ""]
     lines += [f"Keys: {', '.join(f'`{key}`' for key in SUBSET_KEYS)}.", ""]
     return "\n".join(lines)
+
+
+def _describe(array: Array) -> tuple[str, ...]:
+    """Return the cells of an array's row."""
+    dtype = "float32 or int16" if array.dtype == "position" else array.dtype
+    return f"`{array.name}`", dtype, f"({', '.join(array.shape)})", array.meaning
 
 
 if __name__ == "__main__":

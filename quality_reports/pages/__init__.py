@@ -1,1 +1,1 @@
-"""The report's pages and documents."""
+"""Pages and documents of the report."""

@@ -1,9 +1,7 @@
-"""What differs between two lakes as a page: self-contained, in the report's style."""
-
-from markupsafe import Markup
+"""Page of the differences between two lakes: self-contained, in the report's style."""
 
 from tracklake.quality_reports.pages.lake_differences import COUNTED
-from tracklake.quality_reports.pages.rendering import format_cell, make_environment, read_style
+from tracklake.quality_reports.pages.rendering import format_cell, make_environment
 from tracklake.quality_reports.summaries import Row
 
 MINUS = "\N{MINUS SIGN}"
@@ -13,19 +11,18 @@ def render_comparison(compared: Row, report: str | None = None) -> str:
     """Render the differences between two lakes as a page; everything but our own style sheet is escaped.
 
     Args:
-        compared: with `lake`, and where they are known `lake_id` and `compared` (when), in the facts of each side.
+        compared: result of `compare`; the facts of each side hold `lake` and, where known, `lake_id` and `compared`
+            (the time).
         report: address of the report to link to, relative to the page.
     """
     environment = make_environment()
     environment.filters.update(value=format_value, difference=format_difference)
     sides = {side: {"lake": "", "lake_id": "", "compared": "", **compared[side]} for side in ("then", "now")}
-    return environment.get_template("compare.html.j2").render(
-        **{**compared, **sides}, counted=COUNTED, report=report, style=Markup(read_style())
-    )
+    return environment.get_template("compare.html.j2").render(**{**compared, **sides}, counted=COUNTED, report=report)
 
 
 def format_value(value: object) -> str:
-    """Put a figure of any kind into words: six digits of a fraction, all of a whole number, a dash for null."""
+    """Format a figure of any kind: six digits of a fraction, all digits of a whole number, a dash for null."""
     if isinstance(value, bool):
         return format_cell(value, "bool")
     if isinstance(value, int):
@@ -36,6 +33,6 @@ def format_value(value: object) -> str:
 
 
 def format_difference(change: Row) -> str:
-    """The difference with its sign; nothing where there is none, or none that is a number."""
+    """Format a difference with its sign; return nothing where there is none."""
     difference = change["difference"]
     return f"+{format_value(difference)}" if difference and difference > 0 else format_value(difference or "")

@@ -1,4 +1,4 @@
-"""What the subsets' pages are called."""
+"""File names of the subsets' pages."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,18 +7,19 @@ from typing import Any
 from tracklake.schemas.hashing import hash_text
 
 FOLDER = "subsets"
-"""Of the pages, beside the overview."""
+"""Folder of the subsets' pages, beside the overview."""
 LONGEST_NAME = 80
+"""Longest file name before its suffix, in characters."""
 
 
 def name_pages(subsets: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], str]:
-    """The file name of every subset's page by (dataset, subset): the subset's name where that may be a file's name.
+    """Name the file of every subset's page, by (dataset, subset), after the subset where that is a safe file name.
 
     Other characters than ASCII letters, digits, dots, hyphens and underscores are written as ~ and two digits a byte;
     long names are cut. Names that would be the same file, also where letters' case is ignored, get a suffix.
 
     Args:
-        subsets: dataset and subset of each.
+        subsets: rows with dataset and subset.
     """
     names = {(row["dataset"], row["subset"]): _name_file(row["subset"]) for row in subsets}
     taken = [name.lower() for name in names.values()]
@@ -29,6 +30,7 @@ def name_pages(subsets: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], st
 
 
 def _name_file(subset: str) -> str:
+    """Return a safe file name for a subset, without suffix."""
     safe = re.sub(
         r"[^A-Za-z0-9._-]|^\.",
         lambda found: "".join(f"~{byte:02x}" for byte in found[0].encode("utf-8", "surrogatepass")),
@@ -38,4 +40,5 @@ def _name_file(subset: str) -> str:
 
 
 def _hash(*texts: str) -> str:
+    """Return a short digest of some texts."""
     return hash_text("\0".join(texts), 8)

@@ -1,17 +1,19 @@
-"""How the report's pages are rendered: autoescaped templates, and how single values are put into words."""
+"""Templates of the report's pages, and the formats of single values."""
 
 import unicodedata
+from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 DASH = "\N{EN DASH}"
-"""What a table shows where a number is unknown or was not computed."""
+"""Text of a number that is unknown or was not computed."""
 
 
 def make_environment() -> jinja2.Environment:
-    """The templates' environment: everything but markup of our own is escaped; a name that is missing is an error."""
+    """Make the templates' environment: text is escaped, a missing name is an error, `style` is the style sheet."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("tracklake.quality_reports", "templates"),
         autoescape=True,
@@ -29,24 +31,21 @@ def make_environment() -> jinja2.Environment:
         labelled=label_sums,
         unit=_unit,
     )
+    style = (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
+    environment.globals["style"] = Markup(style)
     return environment
 
 
-def read_style() -> str:
-    """The pages' style sheet."""
-    return (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
-
-
-def label_sums(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with `label`: its subset, or `all` where it sums up the dataset."""
+def label_sums(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Add `label` to a row: its subset, or `all of` the dataset that it sums up."""
     return {**row, "label": row["subset"] if row["subset"] is not None else f"all of {row['dataset']}"}
 
 
 def format_cell(value: object, kind: str = "text") -> str:
-    """Put one value of a table into words: a dash for null, thousands separated, shares as percentages.
+    """Format one value of a table: a dash for null, thousands separated, shares as percentages.
 
     Args:
-        value: a plain value.
+        value: plain value.
         kind: text, int, percent, bool, duration, or f0 to f4 for that many decimals.
     """
     if value is None:
@@ -61,6 +60,7 @@ def format_cell(value: object, kind: str = "text") -> str:
 
 
 def _format_number(value: float, kind: str) -> str:
+    """Format a number of some kind."""
     if kind == "int":
         return _integer(value)
     if kind == "percent":
@@ -71,7 +71,7 @@ def _format_number(value: float, kind: str) -> str:
 
 
 def visible(text: str) -> str:
-    """Show what would not be seen or would rearrange the line: control, format and surrogate characters as escapes."""
+    """Write control, format and surrogate characters, which are invisible or rearrange a line, as escapes."""
     return "".join(
         character if unicodedata.category(character) not in {"Cc", "Cf", "Cs"} else ascii(character)[1:-1]
         for character in text
@@ -79,7 +79,7 @@ def visible(text: str) -> str:
 
 
 def format_duration(seconds: float | None) -> str:
-    """Seconds as hours and minutes, minutes, or seconds."""
+    """Format seconds as hours and minutes, minutes, or seconds."""
     if seconds is None:
         return DASH
     if seconds < 120:
@@ -89,7 +89,7 @@ def format_duration(seconds: float | None) -> str:
 
 
 def flatten(value: object, prefix: str = "") -> list[tuple[str, str]]:
-    """A nested mapping as (dotted name, text) pairs, in its own order."""
+    """Return a nested mapping as (dotted name, text) pairs, in its own order."""
     if isinstance(value, dict):
         return [pair for key, each in value.items() for pair in flatten(each, f"{prefix}.{key}" if prefix else key)]
     if isinstance(value, list) and any(isinstance(each, dict) for each in value):
@@ -98,17 +98,17 @@ def flatten(value: object, prefix: str = "") -> list[tuple[str, str]]:
 
 
 def _unit(symbol: str) -> str:
-    """A unit as it is printed: m/s2 with its exponent raised."""
+    """Format a unit, its exponents raised."""
     return symbol.replace("s2", "s\N{SUPERSCRIPT TWO}").replace("s3", "s\N{SUPERSCRIPT THREE}")
 
 
 def _integer(value: float | None) -> str:
-    """A whole number with thousands separated."""
+    """Format a whole number with thousands separated."""
     return DASH if value is None else f"{value:,.0f}"
 
 
 def _fixed(value: float | None, decimals: int) -> str:
-    """A number with fixed decimals and a true minus sign; what rounds to zero carries none."""
+    """Format a number with fixed decimals and a true minus sign, which zero does not carry."""
     if value is None:
         return DASH
     text = f"{value:,.{decimals}f}"
@@ -118,7 +118,7 @@ def _fixed(value: float | None, decimals: int) -> str:
 
 
 def _percent(share: float | None) -> str:
-    """A share as a percentage; one too small for two decimals is not shown as nothing."""
+    """Format a share as a percentage; one too small for two decimals is shown as such."""
     if share is None:
         return DASH
     if 0 < share < 0.00005:

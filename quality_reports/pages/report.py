@@ -1,4 +1,4 @@
-"""The quality report: `index.html`, self-contained, and the same numbers as `quality.json`."""
+"""Quality report: `index.html`, self-contained, and the same numbers as `quality.json`."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -11,30 +11,31 @@ from markupsafe import Markup
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
 from tracklake.quality_reports.pages.assessments import tabulate_assessments
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
-from tracklake.quality_reports.pages.rendering import flatten, make_environment, read_style
+from tracklake.quality_reports.pages.rendering import flatten, make_environment
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.rules.registry import RULES, Rule
-from tracklake.quality_reports.summaries import Connection, Row, collect
+from tracklake.quality_reports.summaries import Connection, collect
+from tracklake.schemas.quality import Provenance, Quality
 
 
 @dataclass(frozen=True)
 class Report:
-    """A rendered report.
+    """Texts and numbers of a rendered report.
 
     Args:
-        html: the page; it fetches nothing.
-        quality: the page's numbers as plain values; its keys are those of `quality_reports.summaries.collect`.
-        splits_html: the page of the splits; None where there are none.
+        html: page of the overview; it fetches nothing.
+        quality: numbers of the page.
+        splits_html: page of the splits; None where there are none.
     """
 
     html: str
-    quality: dict[str, Any]
+    quality: Quality
     splits_html: str | None = None
 
     @property
     def json(self) -> str:
-        """The text of `quality.json`: the numbers, strictly JSON, ending in a newline."""
+        """Text of `quality.json`: strict JSON that ends in a newline."""
         return json.dumps(self.quality, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -49,11 +50,11 @@ def build_report(
     """Query the lake's views and render the report.
 
     Args:
-        connection: with the catalog's views; see `quality_reports.summaries.collect`.
-        provenance: lake, tracklake, versions, settings, created...: shown as given; `thresholds` are the overrides.
-        rules: what validation judged by.
-        scores: [{model, part, rows: [{seconds, rmse_m, n}]}], where models were evaluated.
-        pages: file names of the subsets' pages that there are, by (dataset, subset); None: of all subsets.
+        connection: connection to a lake.
+        provenance: facts that the report shows; see `quality_reports.summaries.collect`.
+        rules: rules that validation used.
+        scores: results of evaluation, as `schemas.quality.ModelScores`.
+        pages: file names of the existing subsets' pages, by (dataset, subset); None: every subset has one.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
@@ -62,23 +63,22 @@ def build_report(
     return Report(html=render(quality, pages), quality=quality, splits_html=render_splits(quality))
 
 
-def render(quality: Row, pages: Mapping[tuple[str, str], str] | None = None) -> str:
-    """Render the page from what `collect` returns. Everything but our own style sheet and plots is escaped."""
+def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
+    """Render the page; everything but our own style sheet and plots is escaped."""
     pages = name_pages(quality["subsets"]) if pages is None else pages
     return (
         make_environment()
         .get_template("report.html.j2")
         .render(
             **quality,
-            style=Markup(read_style()),
-            drawings=_drawings(quality),
+            drawings=_draw_plots(quality),
             stage={row["stage"]: row for row in quality["stages"]},
             found_in={
                 (rule["name"], row["dataset"], row["subset"]): row
                 for rule in quality["rules"]
                 for row in rule["subsets"]
             },
-            settings=flatten(_without_known(quality["provenance"])),
+            settings=flatten(_omit_files(quality["provenance"])),
             compared_speeds=compare_speeds(quality),
             counted_errors=count_errors(quality),
             compared_splits=compare_splits(quality["splits"]),
@@ -91,15 +91,15 @@ def render(quality: Row, pages: Mapping[tuple[str, str], str] | None = None) -> 
     )
 
 
-def _without_known(provenance: Row) -> Row:
-    """What the provenance table lists: everything but the files, which have a table of their own."""
+def _omit_files(provenance: Provenance) -> dict[str, object]:
+    """Return the provenance without the source files, which have a table of their own."""
     return {key: value for key, value in provenance.items() if key != "source_files"}
 
 
-def _drawings(quality: Row) -> dict[str, Any]:
-    """The page's plots by name, as markup; None where there is nothing to draw."""
+def _draw_plots(quality: Quality) -> dict[str, Any]:
+    """Draw the page's plots, by name, as markup; None where there are no data."""
     speeds, starts, splits = quality["speeds"], quality["starts"], quality["splits"]
-    # The others stand on the page of splits.
+    # Plots of other splits are on the page of splits.
     beside = {row["split"] for row in splits["recipes"] if not row["trains"]}
     parts = dict.fromkeys((row["split"], row["dataset"]) for row in splits["balance"] if row["split"] not in beside)
     return {

@@ -1,16 +1,17 @@
-"""The page of the splits: what their parts share, how far they are apart, and how they differ, side by side."""
+"""Page of the splits, side by side: what their parts share, how far apart they are, how they differ."""
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 
-from tracklake.quality_reports.pages.rendering import make_environment, read_style
+from tracklake.quality_reports.pages.rendering import make_environment
 from tracklake.quality_reports.plots import charts as plots
+from tracklake.quality_reports.summaries import Row
+from tracklake.schemas.quality import Quality, SplitBalance, Splits
 
 SPLITS_PAGE = "splits.html"
-"""Beside the overview."""
+"""File name of the page, beside the overview."""
 TRAIN, EVAL = "train", "eval"
 SHARED = {
     "vehicles": "vehicles",
@@ -18,13 +19,11 @@ SHARED = {
     "scenes": "scenes with training samples",
     "cut": "neighbors cut off",
 }
-"""What is drawn of the evaluation part, and what it is called."""
-
-Row = dict[str, Any]
+"""Drawn shares of the evaluation part, and their names."""
 
 
-def render_splits(quality: Row) -> str | None:
-    """Render the page from what `quality_reports.summaries.collect` returns; None where there are no splits."""
+def render_splits(quality: Quality) -> str | None:
+    """Render the page of the splits; None where there are none."""
     splits = quality["splits"]
     compared = compare_splits(splits)
     if not splits["recipes"]:
@@ -35,12 +34,11 @@ def render_splits(quality: Row) -> str | None:
         make_environment()
         .get_template("splits.html.j2")
         .render(
-            style=Markup(read_style()),
             provenance=quality["provenance"],
             compared=compared,
-            shared_plot=Markup(plots.draw_shared(_shares(compared), names)) if compared else None,
+            shared_plot=Markup(plots.draw_shared(_list_shares(compared), names)) if compared else None,
             shift_plot=Markup(plots.draw_shifts(shifts, names)) if shifts else None,
-            told=tell(compared),
+            leaking=find_leaking(compared),
             splits=[
                 {
                     **recipe,
@@ -51,7 +49,7 @@ def render_splits(quality: Row) -> str | None:
                     },
                     "flows": [
                         (dataset, Markup(plots.draw_split(splits["members"], splits["balance"], name, dataset)))
-                        for name, dataset in _datasets(splits["balance"], recipe["split"])
+                        for name, dataset in _list_datasets(splits["balance"], recipe["split"])
                     ],
                 }
                 for recipe in splits["recipes"]
@@ -60,11 +58,8 @@ def render_splits(quality: Row) -> str | None:
     )
 
 
-def compare_splits(splits: Row) -> list[Row]:
-    """Put the splits side by side: of each dataset, what stands in eval beside what stands in train.
-
-    Args:
-        splits: as `quality_reports.summaries.collect` returns it.
+def compare_splits(splits: Splits) -> list[Row]:
+    """Put the splits side by side, with what train and eval share in each dataset.
 
     Returns:
         split, dataset, claims_no_leakage, trains, the columns of split_leakage.sql, cut_share of eval's neighbors,
@@ -101,13 +96,13 @@ def compare_splits(splits: Row) -> list[Row]:
     return sorted(rows, key=lambda row: (row["dataset"], order.index(row["split"])))
 
 
-def tell(compared: Sequence[Row]) -> list[Row]:
-    """The rows of splits that share something or cut context, for sentences: those that flatter."""
+def find_leaking(compared: Sequence[Row]) -> list[Row]:
+    """Find the splits whose parts share vehicles, frames or scenes: which flatters a model."""
     return [row for row in compared if row["frames_shared"] or row["vehicles_shared"] or row["scenes_shared"]]
 
 
-def _shares(compared: Sequence[Row]) -> list[Row]:
-    """Rows of `plots.draw_shared`."""
+def _list_shares(compared: Sequence[Row]) -> list[Row]:
+    """List the rows of `plots.draw_shared`."""
     return [
         {"split": row["split"], "dataset": row["dataset"], "what": what, "percent": 100 * (row[f"{name}_share"] or 0)}
         for row in compared
@@ -115,5 +110,6 @@ def _shares(compared: Sequence[Row]) -> list[Row]:
     ]
 
 
-def _datasets(balance: Sequence[Row], split: str) -> list[tuple[str, str]]:
+def _list_datasets(balance: Sequence[SplitBalance], split: str) -> list[tuple[str, str]]:
+    """List (split, dataset) of the datasets that a split divides."""
     return list(dict.fromkeys((row["split"], row["dataset"]) for row in balance if row["split"] == split))

@@ -1,42 +1,45 @@
-"""One page per subset beside the overview: its facts, findings, time-space diagrams, flow, worst examples, scores."""
+"""Pages of single subsets: facts, findings, time-space diagrams, flow, worst examples, scores."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from markupsafe import Markup
 
 from tracklake.quality_reports.pages.examples import find_examples
 from tracklake.quality_reports.pages.page_names import name_pages
-from tracklake.quality_reports.pages.rendering import make_environment, read_style
+from tracklake.quality_reports.pages.rendering import make_environment
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.plots.flow import draw_flow
-from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, lay_grid
+from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, make_grid
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+from tracklake.schemas.quality import Quality
+from tracklake.schemas.quality_tracks import SubsetFacts
+
+T = TypeVar("T", bound=Mapping[str, Any])
 
 INTERVALS_S = (5.0, 10.0, 30.0, 60.0)
-"""Lengths of the intervals of flow, density and speed: the longest of which a recording has at least FEWEST."""
+"""Possible lengths of the intervals of flow, density and speed, in seconds."""
 FEWEST = 15
+"""Least number of intervals in a recording."""
 MOST_ROWS = 10
-"""Rows of a table of single vehicles."""
-
-MAIN_KEYS = ("dataset", "subset")
+"""Most rows of a table of single vehicles."""
 
 
 def render_pages(
     connection: Connection,
-    quality: Row,
+    quality: Quality,
     *,
     rules: Sequence[Rule] = RULES,
     names: Mapping[tuple[str, str], str] | None = None,
 ) -> Iterator[tuple[str, str]]:
-    """Render the subsets' pages one after another, as (file name, html): they are many, and large.
+    """Render the subsets' pages one after another, as (file name, html).
 
     Args:
-        connection: with the catalog's views and its macros flow_density and lane_changes.
-        quality: the overview's numbers, as `quality_reports.summaries.collect` returns them, of these subsets at least.
-        rules: what validation judged by.
-        names: of the files by (dataset, subset), where there are other subsets besides.
+        connection: connection to a lake.
+        quality: numbers of these subsets.
+        rules: rules that validation used.
+        names: file names by (dataset, subset); None: from the names of these subsets.
     """
     template = make_environment().get_template("subset.html.j2")
     names = names or name_pages(quality["subsets"])
@@ -45,11 +48,10 @@ def render_pages(
         {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
     ]
     for subset in quality["subsets"]:
-        content = {**_select(quality, subset), **_ask(connection, subset, declared)}
+        content = {**_select_figures(quality, subset), **_query_subset(connection, subset, declared)}
         yield (
             names[subset["dataset"], subset["subset"]],
             template.render(
-                style=Markup(read_style()),
                 subset=subset,
                 provenance=quality["provenance"],
                 **content,
@@ -57,11 +59,12 @@ def render_pages(
         )
 
 
-def _select(quality: Row, subset: Row) -> Row:
-    """What the overview knows of a subset already."""
+def _select_figures(quality: Quality, subset: SubsetFacts) -> Row:
+    """Select the figures of a subset from the overview's."""
 
-    def of_subset(rows: Sequence[Row]) -> list[Row]:
-        return [row for row in rows if all(row[key] == subset[key] for key in MAIN_KEYS)]
+    def of_subset(rows: Sequence[T]) -> list[T]:
+        """Select the subset's rows."""
+        return [row for row in rows if _get_key(row) == _get_key(subset)]
 
     positions = of_subset(quality["starts"]["positions"])
     starts = of_subset(quality["starts"]["subsets"])
@@ -90,15 +93,20 @@ def _select(quality: Row, subset: Row) -> Row:
     }
 
 
-def _ask(connection: Connection, subset: Row, rules: Sequence[Row]) -> Row:
-    """What only the lake knows, with the plots of it."""
-    where = {key: subset[key] for key in MAIN_KEYS}
+def _get_key(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the dataset and the subset of a row."""
+    return row["dataset"], row["subset"]
+
+
+def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[Row]) -> Row:
+    """Query the figures that only the subset's page shows, with their plots."""
+    where = {"dataset": subset["dataset"], "subset": subset["subset"]}
     extent = query(connection, "subset_extent", where)[0]
     limited = {**where, "most": MOST_ROWS}
     seconds = choose_interval(subset["seconds"])
     return {
         "extent": extent,
-        **_draw(connection, where, extent, seconds),
+        **_draw_plots(connection, where, extent, seconds),
         "seconds": seconds,
         "speeds": query(connection, "subset_speeds", where),
         "lane_changes": query(connection, "subset_lane_changes", where),
@@ -113,15 +121,15 @@ def _ask(connection: Connection, subset: Row, rules: Sequence[Row]) -> Row:
 
 
 def choose_interval(seconds: float) -> float:
-    """The length of the intervals, s, for a recording of so many seconds."""
+    """Choose the longest interval, in seconds, of which a recording has at least FEWEST."""
     return max((length for length in INTERVALS_S if seconds / length >= FEWEST), default=INTERVALS_S[0])
 
 
-def _draw(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
-    """The subset's plots, as markup; empty or None where it has no entries."""
+def _draw_plots(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
+    """Draw the subset's plots as markup; empty or None where it has no entries."""
     if not extent["entries"]:
         return {"diagrams": [], "legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
-    grid = lay_grid(extent)
+    grid = make_grid(extent)
     cells = query_frame(connection, "subset_time_space", {**where, **grid.parameters()})
     marks = query_frame(connection, "subset_errors", {**where, **grid.parameters(MARK_COLUMNS, MARK_ROWS)})
     intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
@@ -137,4 +145,5 @@ def _draw(connection: Connection, where: Mapping[str, str], extent: Row, seconds
 
 
 def _is_measured(intervals: Sequence[Row]) -> bool:
+    """Tell whether any interval has a flow."""
     return any(row["flow_veh_per_h"] is not None for row in intervals)

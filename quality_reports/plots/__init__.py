@@ -1,1 +1,1 @@
-"""The report's plots as SVG text."""
+"""Plots of the report as SVG text."""

@@ -1,4 +1,4 @@
-"""The report's plots: Altair charts of rows already aggregated by SQL, as SVG text.
+"""Altair charts of the report: plots of rows already aggregated by SQL, as SVG text.
 
 Every function takes rows of one or two statements of `sql/` and returns one `<svg>` element, the same bytes for the
 same rows, that fetches nothing. The page's style sheet (`templates/report.css`) maps the theme's colours onto the
@@ -6,7 +6,7 @@ reader's, by their values.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import altair as alt
@@ -16,7 +16,7 @@ from tracklake.quality_reports.plots.rasters import VIRIDIS
 from tracklake.schemas.chart_theme import BLUE, GREEN, INK, MUTED, ORANGE, make_config
 from tracklake.schemas.start_assessments import ESTIMATORS
 
-Row = dict[str, Any]
+Row = Mapping[str, Any]
 
 SERIES = (BLUE, ORANGE, GREEN)
 
@@ -31,11 +31,11 @@ CONFIG = make_config(background="transparent", padding=4, label=11, title=12, he
 WIDTH = 760
 ROW_HEIGHT = 18
 LABEL_LIMIT = 190
-"""Pixels that a subset's name may take beside a plot; the table below gives it whole."""
+"""Longest name of a subset beside a plot, in pixels; tables show it whole."""
 
 
 def draw_speed_histogram(histogram: Sequence[Row], summary: Sequence[Row]) -> str:
-    """Recorded speed per dataset: share of its entries by bin of 1 m/s, with median and 95 % range.
+    """Draw the recorded speed per dataset: share of its entries by bin of 1 m/s, with median and 95 % range.
 
     Args:
         histogram: rows of speed_histogram.sql.
@@ -73,7 +73,7 @@ def draw_speed_histogram(histogram: Sequence[Row], summary: Sequence[Row]) -> st
 
 
 def draw_speed_ranges(summary: Sequence[Row]) -> str:
-    """Recorded speed per subset: extremes (thin), 95 % range (thick) and median (tick).
+    """Draw the recorded speed per subset: extremes (thin), 95 % range (thick) and median (tick).
 
     Args:
         summary: rows of speeds.sql.
@@ -93,7 +93,7 @@ def draw_speed_ranges(summary: Sequence[Row]) -> str:
 
 
 def draw_start_positions(positions: Sequence[Row], starts: Sequence[Row]) -> str:
-    """Where tracks begin, per freeway subset: one mark per 2 m, its area the number of vehicles; a tick at the cut-off.
+    """Draw where tracks begin in each freeway subset: a mark per 2 m, sized by vehicles, and a tick at the cut-off.
 
     Args:
         positions: rows of start_positions.sql.
@@ -134,7 +134,7 @@ def draw_start_positions(positions: Sequence[Row], starts: Sequence[Row]) -> str
 
 
 def draw_assessments(positions: Sequence[Row]) -> str:
-    """How good repair windows are by where tracks start: coverage and excess per estimator, a row of two per data set.
+    """Draw coverage and excess of repair windows by the tracks' starts: a row of two plots per dataset.
 
     Args:
         positions: rows of assessed_positions.sql.
@@ -176,7 +176,7 @@ def draw_assessments(positions: Sequence[Row]) -> str:
                         .properties(title=dataset)
                         for figure, title, zero in (
                             ("coverage", "covered (% of missing time)", False),
-                            ("excess", "in vain (% of missing time)", True),
+                            ("excess", "excess (% of missing time)", True),
                         )
                     )
                 )
@@ -187,12 +187,12 @@ def draw_assessments(positions: Sequence[Row]) -> str:
 
 
 def name_estimator(name: str) -> str:
-    """What an estimator is called on plots and in tables."""
+    """Return an estimator's name for plots and tables."""
     return name.replace("_", " ")
 
 
 def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, dataset: str) -> str:
-    """How alike the parts of one dataset's split are: each subset's flow, each part's weighted mean and deviation.
+    """Draw the flow of a split's subsets by part, with each part's weighted mean and deviation.
 
     Args:
         members: rows of split_members.sql.
@@ -236,7 +236,7 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
 
 
 def draw_shared(shared: Sequence[Row], splits: Sequence[str]) -> str:
-    """What part of the evaluation is also in training, per dataset: one bar per split and kind of thing.
+    """Draw the shares of the evaluation part that are also in training, per dataset and split.
 
     Args:
         shared: split, dataset, what, percent.
@@ -261,7 +261,7 @@ def draw_shared(shared: Sequence[Row], splits: Sequence[str]) -> str:
 
 
 def draw_shifts(shifts: Sequence[Row], splits: Sequence[str]) -> str:
-    """How far training and evaluation differ, per dataset and quantity: one mark per split.
+    """Draw how far training and evaluation differ, per dataset and quantity: one mark per split.
 
     Args:
         shifts: rows of split_shifts.sql, of one pair of parts.
@@ -296,7 +296,7 @@ _ROW_HEADER = alt.Header(labelColor=INK, labelAngle=0, labelAlign="left", labelF
 
 
 def draw_fundamental(intervals: Sequence[Row]) -> str:
-    """The fundamental diagram: flow against density, one plot per lane and one mark per interval, coloured by speed.
+    """Draw the fundamental diagram, flow against density: a plot per lane, a mark per interval, coloured by speed.
 
     Args:
         intervals: rows of subset_flow.sql.
@@ -323,27 +323,27 @@ def draw_fundamental(intervals: Sequence[Row]) -> str:
 
 
 def name_lane(lane: int | None) -> str:
-    """What a lane is called on plots."""
+    """Return a lane's name for plots."""
     return "no lane" if lane is None else f"lane {lane}"
 
 
 def _names(rows: Sequence[Row], column: str) -> list[str]:
-    """The distinct values of a column, in order of appearance."""
+    """Return the distinct values of a column, in order of appearance."""
     return list(dict.fromkeys(row[column] for row in rows))
 
 
 def _data(rows: Iterable[Row]) -> alt.InlineData:
-    """Rows as a chart's inline data."""
+    """Return rows as a chart's inline data."""
     return alt.InlineData(values=list(rows))
 
 
 def _subset_axis(rows: Sequence[Row]) -> alt.Y:
-    """The vertical axis of plots with one line per subset, in the table's order."""
+    """Return the vertical axis of plots with one line per subset, in the table's order."""
     return alt.Y("subset:N", title=None, sort=_names(rows, "subset"), axis=alt.Axis(labelLimit=LABEL_LIMIT, grid=True))
 
 
 def _height(rows: Sequence[Row]) -> int:
-    """Pixels for one line per subset."""
+    """Return the height for one line per subset, in pixels."""
     return ROW_HEIGHT * max(2, len(_names(rows, "subset")))
 
 

@@ -1,21 +1,22 @@
-"""Flow, density and speed over time, one line of plots per lane: drawn plainly, as every subset's page has them."""
+"""Plots of flow, density and speed over time, one row of plots per lane."""
 
 from collections.abc import Sequence
 
 import polars as pl
 
-from tracklake.quality_reports.plots.axes import Scale, draw_frame, draw_line, wrap_svg
+from tracklake.quality_reports.plots.axes import Scale, draw_frame, draw_line, draw_path, wrap_svg
 from tracklake.quality_reports.plots.charts import FLOW, Row, name_lane
 from tracklake.schemas.chart_theme import BLUE, INK
 
 PANEL_WIDTH, PANEL_HEIGHT, LEFT, TOP, BOTTOM, APART = 250, 80, 58, 40, 38, 20
+"""Size of a plot, the margins around it, and the space between two, in pixels."""
 
 
 def draw_flow(intervals: Sequence[Row]) -> str:
-    """Flow, density and speed against time, side by side, one line of plots per lane; scales are shared by the lanes.
+    """Draw flow, density and speed against time side by side, one row of plots per lane, on scales shared by the lanes.
 
     Args:
-        intervals: rows of subset_flow.sql, at least one; not all of their flows null.
+        intervals: rows of subset_flow.sql, at least one of them with a flow.
     """
     data = pl.DataFrame(list(intervals), infer_schema_length=None).with_columns(
         middle_s=pl.col("start_s") + pl.col("interval_s") / 2
@@ -37,10 +38,6 @@ def draw_flow(intervals: Sequence[Row]) -> str:
             drawn.append(draw_frame(x, y, "time (s)", title, x_ticks=6, y_ticks=4))
             path = draw_line(points, x, y, column, "middle_s")
             dots = draw_line(points.with_columns(follows=pl.lit(value=False)), x, y, column, "middle_s")
-            for shape, width in ((path, 1.4), (dots, 4)):
-                drawn.append(
-                    f'<path d="{shape}" fill="none" stroke="{BLUE}" stroke-width="{width}" stroke-linecap="round" '
-                    'stroke-linejoin="round"/>'
-                )
+            drawn += [draw_path(path, BLUE, 1.4), draw_path(dots, BLUE, 4)]
     size = len(FLOW) * (PANEL_WIDTH + LEFT + APART), len(lanes) * (PANEL_HEIGHT + BOTTOM + TOP)
     return wrap_svg(*size, "Flow, density and speed over time", "".join(drawn))

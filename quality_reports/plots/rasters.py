@@ -1,4 +1,4 @@
-"""Rasters: a grid of numbers as a PNG with a palette, and the palette: from few bytes, without an imaging library."""
+"""Rasters: grids of numbers as PNG images with a palette, without an imaging library."""
 
 import base64
 import struct
@@ -7,19 +7,19 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-Indices = NDArray[np.uint8]
+from tracklake.schemas.arrays import Bytes, Floats
 
 VIRIDIS = ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b")
 """Ten equal steps of matplotlib's viridis less the last: perceptually uniform, told apart by colour-blind readers, and
-in order of lightness on any printer. Its last yellow would hardly be seen on white."""
+in order of lightness on any printer. The last yellow is left out because it is hardly visible on white."""
 EMPTY = 0
-"""The palette's entry of cells without a value: transparent."""
+"""Palette entry of cells without a value, which is transparent."""
 LEVELS = 255
-"""The others, from the least value to the greatest."""
+"""Number of the other palette entries, from the least value to the greatest."""
 
 
 def make_palette() -> NDArray[np.uint8]:
-    """The colours as (256, 4) RGBA: EMPTY transparent, then LEVELS steps of VIRIDIS, linear between its anchors."""
+    """Make the colours as (256, 4) RGBA: EMPTY transparent, then LEVELS steps, linear between VIRIDIS's anchors."""
     anchors = np.array([[int(text[place : place + 2], 16) for place in (0, 2, 4)] for text in VIRIDIS], np.float64)
     steps = np.linspace(0, len(anchors) - 1, LEVELS)
     colours = np.zeros((LEVELS + 1, 4), np.uint8)
@@ -29,14 +29,14 @@ def make_palette() -> NDArray[np.uint8]:
     return colours
 
 
-def grade(values: NDArray[np.float64], least: float, greatest: float) -> Indices:
-    """Palette entries of values: 1 at `least` and below, 255 at `greatest` and above, EMPTY where not a number."""
+def grade_values(values: Floats, least: float, greatest: float) -> Bytes:
+    """Return palette entries of values: 1 up to `least`, 255 from `greatest` on, EMPTY for NaN."""
     share = np.clip((values - least) / (greatest - least), 0, 1)
     return np.where(np.isnan(share), EMPTY, 1 + np.round(np.nan_to_num(share) * (LEVELS - 1))).astype(np.uint8)
 
 
-def encode_png(indices: Indices) -> bytes:
-    """A PNG of palette entries (H, W), the first row uppermost; the same bytes for the same entries.
+def encode_png(indices: Bytes) -> bytes:
+    """Encode palette entries (H, W) as a PNG, the first row uppermost; the same entries give the same bytes.
 
     Source: Portable Network Graphics (PNG) Specification, W3C: colour type 3, bit depth 8, filter 0.
     """
@@ -56,6 +56,6 @@ def encode_png(indices: Indices) -> bytes:
     )
 
 
-def encode_uri(indices: Indices) -> str:
-    """The PNG as a data URI."""
+def encode_uri(indices: Bytes) -> str:
+    """Encode palette entries as a data URI of their PNG."""
     return "data:image/png;base64," + base64.b64encode(encode_png(indices)).decode("ascii")

@@ -1,4 +1,4 @@
-"""Time-space diagrams: one raster per lane, coloured by mean speed, with the cells that hold errors marked."""
+"""Time-space diagrams: one raster per lane, coloured by mean speed, with marks where errors were found."""
 
 import math
 from collections.abc import Mapping
@@ -8,35 +8,47 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from tracklake.quality_reports.plots.axes import Scale, draw_frame, wrap_svg, write_points
-from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade
-from tracklake.schemas.chart_theme import MUTED
+from tracklake.quality_reports.plots.axes import (
+    Scale,
+    draw_frame,
+    draw_path,
+    draw_text,
+    format_points,
+    make_ticks,
+    wrap_svg,
+)
+from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade_values
+from tracklake.schemas.arrays import Floats
 
 COLUMNS, ROWS = 1000, 140
-"""Cells at most: about one per pixel across, and along the road."""
+"""Most cells of a raster, in time and along the road."""
 LEAST_SECONDS, LEAST_METRES = 0.2, 1.0
-"""No finer: entries are 0.04 or 0.1 s and up to some metres apart, and gaps between them would look like data."""
+"""Least size of a cell; in smaller ones the gaps between entries, 0.04 or 0.1 s apart, would look like data."""
 MARK_COLUMNS, MARK_ROWS = 8, 7
-"""Cells of the raster that share one mark, so that marks can be told apart and are bounded in number."""
+"""Cells of the raster, in time and along the road, that share one mark; this bounds the number of marks."""
 MARK_PIXELS = 3
-"""Half of a mark's width."""
+"""Half of a mark's width, in pixels."""
 SPEED_STEP_MPS = 5
+"""Step of the colour scale's upper end, in m/s."""
 PANEL, HALO, MARK = "#f4f6f8", "#ffffff", "#000000"
 LEFT, RIGHT, TOP, WIDTH, HEIGHT, BOTTOM = 52, 14, 24, 1000, 140, 40
+"""Margins and size of a diagram, in pixels; WIDTH includes the margins."""
+CROSS = "l6 6m0-6l-6 6"
+"""Path of a mark from its upper left corner."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the cells of a subset's diagrams lie.
+    """Cells of a subset's diagrams.
 
     Args:
-        first_s: the first column's beginning.
-        seconds: of a column.
-        columns: how many.
-        first_x_m: the first row's beginning.
-        metres: of a row.
-        rows: how many.
-        top_mps: the colour scale ends here.
+        first_s: beginning of the first column.
+        seconds: length of a column.
+        columns: number of columns.
+        first_x_m: beginning of the first row.
+        metres: length of a row.
+        rows: number of rows.
+        top_mps: upper end of the colour scale.
     """
 
     first_s: float
@@ -48,16 +60,16 @@ class Grid:
     top_mps: float
 
     def parameters(self, columns: int = 1, rows: int = 1) -> dict[str, float]:
-        """What subset_time_space.sql and subset_errors.sql take, for cells of so many columns and rows."""
+        """Return the parameters of the statements that count cells of so many columns and rows."""
         cell = {"seconds": self.seconds * columns, "metres": self.metres * rows}
         return {"first_s": self.first_s, "first_x_m": self.first_x_m, **cell}
 
 
-def lay_grid(extent: Mapping[str, Any]) -> Grid:
-    """The grid of a subset: its whole recording and road, in at most COLUMNS x ROWS cells.
+def make_grid(extent: Mapping[str, Any]) -> Grid:
+    """Divide a subset's recording and road into at most COLUMNS x ROWS cells.
 
     Args:
-        extent: the row of subset_extent.sql; not of an empty subset.
+        extent: row of subset_extent.sql, of a subset with entries.
     """
     duration, length = extent["last_s"] - extent["first_s"], extent["last_x_m"] - extent["first_x_m"]
     # A little more than the extent, so that the last entry lies within the last cell.
@@ -75,29 +87,22 @@ def lay_grid(extent: Mapping[str, Any]) -> Grid:
 
 
 def draw_lanes(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> list[tuple[int | None, str]]:
-    """The diagrams as (lane, svg), the leftmost lane first; lane is None for entries without one.
+    """Draw the diagrams as (lane, svg), the leftmost lane first; lane is None for entries without one.
 
     Args:
-        grid: where the cells lie.
+        grid: cells of the subset.
         cells: lane, grid_column, grid_row, speed_mps: rows of subset_time_space.sql.
         marks: lane, grid_column, grid_row: rows of subset_errors.sql on cells of MARK_COLUMNS by MARK_ROWS.
     """
-    lanes = cells["lane"].unique().sort().to_list()
-    return [
-        (
-            lane,
-            _draw_lane(
-                grid,
-                cells.filter(pl.col("lane").eq_missing(pl.lit(lane))),
-                marks.filter(pl.col("lane").eq_missing(pl.lit(lane))),
-            ),
-        )
-        for lane in lanes
-    ]
+    drawn = []
+    for lane in cells["lane"].unique().sort().to_list():
+        in_lane = pl.col("lane").eq_missing(pl.lit(lane))
+        drawn.append((lane, _draw_lane(grid, cells.filter(in_lane), marks.filter(in_lane))))
+    return drawn
 
 
-def rasterise(grid: Grid, cells: pl.DataFrame) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Speeds as (rows, columns), the road's end uppermost; NaN in cells without entries."""
+def rasterise(grid: Grid, cells: pl.DataFrame) -> Floats:
+    """Return speeds as (rows, columns), the road's end uppermost; NaN in cells without entries."""
     speeds = np.full((grid.rows, grid.columns), np.nan)
     row = np.clip(cells["grid_row"].to_numpy(), 0, grid.rows - 1)
     column = np.clip(cells["grid_column"].to_numpy(), 0, grid.columns - 1)
@@ -106,17 +111,18 @@ def rasterise(grid: Grid, cells: pl.DataFrame) -> np.ndarray[Any, np.dtype[np.fl
 
 
 def _draw_lane(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> str:
+    """Draw the diagram of one lane."""
     x = Scale(grid.first_s, grid.first_s + grid.columns * grid.seconds, LEFT, WIDTH - RIGHT)
     y = Scale(grid.first_x_m, grid.first_x_m + grid.rows * grid.metres, TOP + HEIGHT, TOP)
-    image = encode_uri(grade(rasterise(grid, cells), 0, grid.top_mps))
+    image = encode_uri(grade_values(rasterise(grid, cells), 0, grid.top_mps))
     wide = WIDTH - LEFT - RIGHT
     time_s = grid.first_s + (marks["grid_column"].to_numpy() + 0.5) * MARK_COLUMNS * grid.seconds
     x_m = grid.first_x_m + (marks["grid_row"].to_numpy() + 0.5) * MARK_ROWS * grid.metres
     # The last cells may reach beyond the raster.
-    at = write_points(
-        np.minimum(x.place_all(time_s), x.end) - MARK_PIXELS, np.maximum(y.place_all(x_m), y.end) - MARK_PIXELS
+    at = format_points(
+        np.minimum(x.to_pixels(time_s), x.end) - MARK_PIXELS, np.maximum(y.to_pixels(x_m), y.end) - MARK_PIXELS
     )
-    crosses = "".join(f"M{point}l6 6m0-6l-6 6" for point in at.tolist())
+    crosses = "".join(f"M{point}{CROSS}" for point in at.tolist())
     return wrap_svg(
         WIDTH,
         TOP + HEIGHT + BOTTOM,
@@ -124,33 +130,31 @@ def _draw_lane(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> str:
         f'<rect x="{LEFT}" y="{TOP}" width="{wide}" height="{HEIGHT}" fill="{PANEL}"/>'
         + draw_frame(x, y, "time since the recording began (s)", "position (m)", x_ticks=10, y_ticks=5)
         + f'<image x="{LEFT}" y="{TOP}" width="{wide}" height="{HEIGHT}" preserveAspectRatio="none" '
-        f'style="image-rendering:pixelated" href="{image}"/>'
-        + "".join(
-            f'<path d="{crosses}" fill="none" stroke="{colour}" stroke-width="{stroke}" stroke-linecap="round"/>'
-            for colour, stroke in ((HALO, 3.6), (MARK, 1.6))
-            if crosses
-        ),
+        f'style="image-rendering:pixelated" href="{image}"/>' + (_draw_marks(crosses) if crosses else ""),
     )
+
+
+def _draw_marks(crosses: str) -> str:
+    """Draw marks with a halo around them."""
+    return draw_path(crosses, HALO, 3.6) + draw_path(crosses, MARK, 1.6)
 
 
 def draw_scale(grid: Grid) -> str:
-    """The legend of the diagrams: the colour of every speed, and the mark."""
+    """Draw the legend of the diagrams: the colours of speeds, and the mark."""
     x = Scale(0, grid.top_mps, 12, 332)
     strip = encode_uri(np.arange(1, LEVELS + 1, dtype=np.uint8)[None, :])
     labels = "".join(
-        f'<text x="{x.place(value):.1f}" y="36" text-anchor="middle" fill="{MUTED}">{value:g}</text>'
-        for value in x.ticks(6)
+        draw_text(f"{x.to_pixels(value):.1f}", 36, f"{value:g}", anchor="middle")
+        for value in make_ticks(x.low, x.high, 6)
     )
-    cross = "M470 12l6 6m0-6l-6 6"
+    cell = f"mean speed in a cell of {grid.seconds:.2g} s by {grid.metres:.2g} m (m/s)"
     return wrap_svg(
         760,
         56,
         "Legend: colour of mean speed, and the mark of errors",
         f'<image x="12" y="8" width="320" height="14" preserveAspectRatio="none" href="{strip}"/>{labels}'
-        f'<text x="172" y="51" text-anchor="middle" fill="{MUTED}">mean speed in a cell of {grid.seconds:.2g} s by '
-        f"{grid.metres:.2g} m (m/s)</text>"
-        f'<rect x="461" y="5" width="24" height="20" fill="{PANEL}"/>'
-        f'<path d="{cross}" fill="none" stroke="{HALO}" stroke-width="3.6" stroke-linecap="round"/>'
-        f'<path d="{cross}" fill="none" stroke="{MARK}" stroke-width="1.6" stroke-linecap="round"/>'
-        f'<text x="493" y="19" fill="{MUTED}">findings of severity error near here</text>',
+        + draw_text(172, 51, cell, anchor="middle")
+        + f'<rect x="461" y="5" width="24" height="20" fill="{PANEL}"/>'
+        + _draw_marks(f"M470 12{CROSS}")
+        + draw_text(493, 19, "findings of severity error near here"),
     )

@@ -1,23 +1,22 @@
-"""Derived columns that follow a vehicle from entry to entry: jumps, gaps, jerk, lane changes."""
+"""Derived columns that compare the entries of one track: jumps, gaps, jerk, lane changes."""
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tracklake.quality_reports.rules.scene import NOBODY, Flags, Floats, Scene
-
-Singles = NDArray[np.float32]
+from tracklake.quality_reports.rules.scene import ABSENT, Scene
+from tracklake.schemas.arrays import Flags, Floats, Singles
 
 CLOCK_HZ = 10.0
-"""The rate on which jerk is taken (DESIGN section 5)."""
+"""Rate at which jerk is measured (DESIGN section 5)."""
 TICKS = 10
-"""Jerks in one second."""
+"""Number of jerks in one second."""
 NO_CHANGE_MPS2 = 5e-5
-"""Less is no change of a recorded acceleration: they have two decimals, the Float32 of 100 m/s2 errs by 4e-6."""
+"""Least change of a recorded acceleration that counts, in m/s²; the Float32 of 100 m/s² errs by 4e-6."""
 
 
 def measure_jumps(scene: Scene) -> Floats:
-    """abs(dx - dt (v1 + v2) / 2) to the entry before, m, rounded to 1 um; NaN without an entry one frame before."""
+    """Measure abs(dx - dt (v1 + v2) / 2) to the entry before, m, to 1 um; NaN without an entry one frame before."""
     x, speed = scene.tracks["x_m"].to_numpy(), scene.tracks["speed_mps"].to_numpy().astype(np.float64)
     jump = np.full(scene.height, np.nan)
     jump[1:] = np.abs(np.diff(x) - (speed[1:] + speed[:-1]) / 2 / scene.frame_rate_hz)
@@ -27,7 +26,7 @@ def measure_jumps(scene: Scene) -> Floats:
 
 
 def count_skipped_frames(scene: Scene) -> NDArray[np.int32]:
-    """Frames missing between an entry and the one before of its track; 0 in a track's first entry."""
+    """Count the frames missing between an entry and the one before of its track; 0 in a track's first entry."""
     skipped = np.zeros(scene.height, np.int32)
     skipped[1:] = np.diff(scene.frame) - 1
     skipped[scene.begins] = 0
@@ -35,22 +34,21 @@ def count_skipped_frames(scene: Scene) -> NDArray[np.int32]:
 
 
 def measure_jerk(scene: Scene) -> Floats:
-    """(a(t) - a(t - 0.1 s)) / 0.1 s of the recorded acceleration, m/s3, to 0.001; NaN where either is missing."""
-    change = _past(scene, 0).astype(np.float64) - _past(scene, 1)
+    """Measure (a(t) - a(t - 0.1 s)) / 0.1 s of the recorded acceleration, m/s³, to 0.001; NaN without either."""
+    change = _get_past(scene, 0).astype(np.float64) - _get_past(scene, 1)
     return np.round(change * CLOCK_HZ, 3)
 
 
 def count_jerk_reversals(scene: Scene) -> NDArray[np.int8]:
-    """How often jerk changes its sign among the ten values, 0.1 s apart, of the second that ends at an entry.
+    """Count the changes of sign among the ten jerks, 0.1 s apart, of the second that ends at an entry.
 
-    A jerk of zero has no sign and is passed over, as is one that is missing: at a track's beginning and after a frame
-    gap the second is shorter.
+    Jerks of zero and missing ones are skipped: at a track's beginning and after a frame gap the second is shorter.
     """
     reversals = np.zeros(scene.height, np.int8)
     sign = np.zeros(scene.height, np.int8)
-    before = _past(scene, TICKS)
+    before = _get_past(scene, TICKS)
     for tick in range(TICKS - 1, -1, -1):
-        now = _past(scene, tick)
+        now = _get_past(scene, tick)
         change = now - before
         new = (change > NO_CHANGE_MPS2).view(np.int8) - (change < -NO_CHANGE_MPS2).view(np.int8)
         reversals += (new * sign) < 0
@@ -59,8 +57,8 @@ def count_jerk_reversals(scene: Scene) -> NDArray[np.int8]:
     return reversals
 
 
-def _past(scene: Scene, tick: int) -> Singles:
-    """The recorded acceleration `tick` tenths of a second before each entry; NaN where it is missing.
+def _get_past(scene: Scene, tick: int) -> Singles:
+    """Return the recorded acceleration `tick` tenths of a second before each entry; NaN where it is missing.
 
     At 25 Hz every other tick lies between two frames; the value there is linear between theirs (their mean). Rates at
     which it lies elsewhere between frames have none: nothing is interpolated over longer.
@@ -79,7 +77,7 @@ def _past(scene: Scene, tick: int) -> Singles:
 
 
 def _shift(values: Singles, rows: int) -> Singles:
-    """The values so many rows before, NaN where there are none."""
+    """Return the values so many rows before, NaN where there are none."""
     if rows == 0:
         return values.copy()
     shifted = np.full(len(values), np.nan, np.float32)
@@ -88,9 +86,9 @@ def _shift(values: Singles, rows: int) -> Singles:
 
 
 def measure_lane_stays(scene: Scene) -> Floats:
-    """Seconds a vehicle spends in a lane that it enters from and leaves to one and the same other lane; else NaN.
+    """Measure the seconds that a vehicle stays in a lane between two stays in one other lane; NaN for other stays.
 
-    A frame gap ends a stay without saying where to, and a stay that is not seen from its beginning has none.
+    A stay that begins or ends at a frame gap or at the end of the track has no length.
     """
     stays = np.full(scene.height, np.nan)
     if not scene.height:
@@ -103,13 +101,13 @@ def measure_lane_stays(scene: Scene) -> Floats:
     of, follows = lane[begins], entered[begins]
     between = np.zeros(len(begins), np.bool_)
     between[1:-1] = follows[1:-1] & follows[2:] & (of[:-2] == of[2:])
-    between[1:-1] &= (of[1:-1] != NOBODY) & (of[2:] != NOBODY)
+    between[1:-1] &= (of[1:-1] != ABSENT) & (of[2:] != ABSENT)
     seconds = np.where(between, entries / scene.frame_rate_hz, np.nan)
     return np.repeat(seconds, entries)
 
 
 def measure_way_out_of_lane(scene: Scene) -> Floats:
-    """How far y_m lies outside the markings of the entry's lane, m, to 1 mm; 0 inside; NaN where they are unknown."""
+    """Measure how far y_m lies outside the markings of the entry's lane, m, to 1 mm; 0 inside; NaN if unknown."""
     if scene.lane_markings_m is None or len(scene.lane_markings_m) < 2:
         return np.full(scene.height, np.nan)
     markings = np.asarray(scene.lane_markings_m, np.float64)
@@ -120,6 +118,6 @@ def measure_way_out_of_lane(scene: Scene) -> Floats:
     return np.where(known, np.round(outside, 3), np.nan)
 
 
-def spread_trait(scene: Scene, column: str) -> pl.Series:
-    """A column of `vehicles`, for each entry."""
-    return scene.traits[column].gather(scene.place)
+def repeat_trait(scene: Scene, column: str) -> pl.Series:
+    """Repeat a column of `vehicles` for each entry."""
+    return scene.traits[column].gather(scene.track)

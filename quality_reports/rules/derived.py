@@ -1,4 +1,4 @@
-"""The columns that rules read beside those of `tracks`, each declared once; computed only where a rule reads them."""
+"""Derived columns that rules read besides those of `tracks`, declared once and computed on demand."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ class Derived:
     """A column computed from a subset's entries, vehicles and facts.
 
     Args:
-        build: subset -> one value per entry; NaN becomes null.
-        reads: the columns of `tracks`, `vehicles` and `subsets` that it is made of.
+        build: function from a subset to one value per entry; NaN becomes null.
+        reads: columns of `tracks`, `vehicles` and `subsets` that it needs.
     """
 
     build: Callable[[Scene], NDArray[Any] | pl.Series]
@@ -33,7 +33,7 @@ class Derived:
 
 
 DERIVED: dict[str, Derived] = {
-    **{name: Derived(partial(along.spread_trait, column=name), ("vehicle_id", name)) for name in VEHICLE_COLUMNS},
+    **{name: Derived(partial(along.repeat_trait, column=name), ("vehicle_id", name)) for name in VEHICLE_COLUMNS},
     "jump_m": Derived(along.measure_jumps, MOTION),
     "frames_skipped": Derived(along.count_skipped_frames, ("vehicle_id", "frame")),
     "jerk_mps3": Derived(along.measure_jerk, ACCELERATION),
@@ -48,11 +48,11 @@ DERIVED: dict[str, Derived] = {
         within.measure_recorded_gaps, ("vehicle_id", "leader_id", "headway_recorded_m", "gap_m", "length_m")
     ),
 }
-"""By name; what a value is stands with the function that computes it."""
+"""Derived columns by name; the functions document the values."""
 
 
 def trace(names: Iterable[str]) -> tuple[str, ...]:
-    """The columns of `tracks`, `vehicles` and `subsets` behind these columns, each once, in order of appearance."""
+    """Return the columns of `tracks`, `vehicles` and `subsets` behind some columns, in order of appearance."""
     found: dict[str, None] = {}
     for name in names:
         found.update(dict.fromkeys(DERIVED[name].reads if name in DERIVED else (name,)))
@@ -63,14 +63,15 @@ def prepare(scene: Scene, names: Iterable[str]) -> pl.DataFrame:
     """Add derived columns to a subset's tracks.
 
     Args:
-        scene: the subset; its tracks have the columns that the wanted ones read.
-        names: columns wanted, of `tracks` or DERIVED; what `tracks` has already is left as it is.
+        scene: subset whose tracks have the columns that the wanted ones read.
+        names: wanted columns of `tracks` or DERIVED.
     """
     wanted = [name for name in dict.fromkeys(names) if name in DERIVED]
     return scene.tracks.with_columns(_as_series(name, DERIVED[name].build(scene)) for name in wanted)
 
 
 def _as_series(name: str, values: NDArray[Any] | pl.Series) -> pl.Series:
+    """Return values as a series in which NaN has become null."""
     series = values.alias(name) if isinstance(values, pl.Series) else pl.Series(name, values)
     # A comparison with null is null, which breaks no rule; one with NaN would hold.
     return series.fill_nan(None) if series.dtype.is_float() else series

@@ -1,4 +1,4 @@
-"""One subset judged: prepared once, checked by every rule that can be, its findings and scores."""
+"""Evaluation of the rules on one subset: its findings and scores."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from tracklake.quality_reports.rules.scores import COLUMNS_SCORED, score_subset,
 
 @dataclass(frozen=True)
 class Judgement:
-    """What validation finds out about a subset.
+    """Results of validation of a subset.
 
     Args:
         findings: `findings`.
@@ -46,10 +46,10 @@ def judge(
     """Judge a subset by the rules.
 
     Args:
-        scene: its entries, with the columns of `tracks_needed`, vehicles and facts.
+        scene: subset with the columns of `tracks_needed`.
         lacking: columns that its source does not have (see `quality_reports.rules.scene.find_lacking`).
         thresholds: overrides by name.
-        rules: to judge by.
+        rules: rules to judge by.
 
     Raises:
         SubsetOrderError: see `quality_reports.rules.findings.find`.
@@ -61,10 +61,10 @@ def judge(
     unchecked = tuple(rule for rule in rules if rule not in checked)
     scored = [name for name in COLUMNS_SCORED if not set(trace([name])) & set(lacking)]
     entries = prepare(scene, [*columns_read(checked), *scored])
-    broken = select_broken(entries, checked, _of(checked, limits))
-    vehicle_scores = score_vehicles(entries, broken, _of(broken, limits))
+    broken = select_broken(entries, checked, _select_limits(checked, limits))
+    vehicle_scores = score_vehicles(entries, broken, _select_limits(broken, limits))
     return Judgement(
-        findings=find(entries, broken, _of(broken, limits)),
+        findings=find(entries, broken, _select_limits(broken, limits)),
         vehicle_scores=vehicle_scores,
         subset_scores=score_subset(entries.drop(set(lacking), strict=False), vehicle_scores, unchecked, limits),
         unchecked=unchecked,
@@ -72,12 +72,12 @@ def judge(
 
 
 def tracks_needed(rules: Sequence[Rule] = RULES) -> tuple[str, ...]:
-    """The columns of `tracks` that judging by these rules reads."""
+    """Return the columns of `tracks` that `judge` needs for these rules."""
     elsewhere = {*VEHICLE_COLUMNS, *SUBSET_COLUMNS}
     names = ["dataset", "subset", "vehicle_id", "frame", *columns_needed(rules), *trace(COLUMNS_SCORED)]
     return tuple(name for name in dict.fromkeys(names) if name not in elsewhere)
 
 
-def _of(rules: Sequence[Rule], limits: Mapping[str, float]) -> dict[str, float]:
-    """The thresholds of these rules."""
+def _select_limits(rules: Sequence[Rule], limits: Mapping[str, float]) -> dict[str, float]:
+    """Select the thresholds of some rules."""
     return {name: limits[name] for rule in rules for name in rule.defaults}

@@ -1,4 +1,4 @@
-"""Findings: runs of entries that break a rule, and what they decide about a whole subset."""
+"""Findings: runs of entries that break a rule, and the exclusion of subsets."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,11 +9,11 @@ from tracklake.schemas import FINDINGS, SUBSET_STATUS
 from tracklake.schemas.columns import key_increases
 
 MAX_BACKWARD_SHARE = 0.01
-"""A subset is excluded when more than this share of its vehicles have an entry of negative speed (DESIGN section 5)."""
+"""Greatest share of vehicles with an entry of negative speed in a subset that is kept (DESIGN section 5)."""
 
 
 class SubsetOrderError(ValueError):
-    """The frame is not one subset's tracks sorted by vehicle_id, frame: runs in it would mean nothing."""
+    """A frame does not hold one subset's tracks sorted by vehicle_id, frame."""
 
 
 def find(
@@ -26,7 +26,7 @@ def find(
     Args:
         tracks: ONE subset's entries, sorted by vehicle_id, frame, with the columns that the rules name (see
             `quality_reports.rules.derived.prepare` for the derived ones).
-        rules: the rules to judge by.
+        rules: rules to check.
         thresholds: overrides of the rules' thresholds by name.
 
     Returns:
@@ -40,12 +40,12 @@ def find(
     require_one_sorted_subset(tracks)
     if not rules or tracks.is_empty():
         return FINDINGS.empty()
-    runs = [_runs(tracks.lazy(), rule, limits) for rule in rules]
+    runs = [_find_runs(tracks.lazy(), rule, limits) for rule in rules]
     return FINDINGS.conform(pl.concat(runs)).sort(FINDINGS.key).collect()
 
 
-def _runs(tracks: pl.LazyFrame, rule: Rule, limits: Mapping[str, float]) -> pl.LazyFrame:
-    """The runs that break one rule.
+def _find_runs(tracks: pl.LazyFrame, rule: Rule, limits: Mapping[str, float]) -> pl.LazyFrame:
+    """Find the runs that break one rule.
 
     Among breaking entries alone, neighbours of one vehicle with adjacent frames are consecutive in the track too, so
     the runs are found after the filter, on the few rows that are left.

@@ -1,4 +1,4 @@
-"""The rules that entries are judged by: the list of them, their thresholds, Pandera checks and documentation."""
+"""Rules in use: their thresholds, Pandera checks and documentation."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -8,26 +8,8 @@ import pandera.polars as pa
 import polars as pl
 from pandera.errors import SchemaErrors
 
-from tracklake.quality_reports.rules.motion import (
-    BACKWARD,
-    FRAME_GAP,
-    HIGH_ACCELERATION,
-    HIGH_JERK,
-    JERK_FLICKER,
-    LOW_CONSTANT_SPEED,
-    POSITION_JUMP,
-    SPEED_MISMATCH,
-)
-from tracklake.quality_reports.rules.place import (
-    HEADWAY_MISMATCH,
-    IMPLAUSIBLE_SIZE,
-    LANE_FLICKER,
-    LEADER_MISMATCH,
-    NEGATIVE_HEADWAY,
-    NEGATIVE_HEADWAY_RECORDED,
-    OUTSIDE_LANE,
-    OVERLAP,
-)
+from tracklake.quality_reports.rules.consistency import CONSISTENCY_RULES
+from tracklake.quality_reports.rules.plausibility import PLAUSIBILITY_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
 from tracklake.schemas.errors import UsageError
 
@@ -46,25 +28,8 @@ __all__ = [
     "select_broken",
 ]
 
-RULES: tuple[Rule, ...] = (
-    NEGATIVE_HEADWAY,
-    NEGATIVE_HEADWAY_RECORDED,
-    HIGH_ACCELERATION,
-    LOW_CONSTANT_SPEED,
-    BACKWARD,
-    POSITION_JUMP,
-    FRAME_GAP,
-    OVERLAP,
-    SPEED_MISMATCH,
-    HIGH_JERK,
-    JERK_FLICKER,
-    LANE_FLICKER,
-    LEADER_MISMATCH,
-    HEADWAY_MISMATCH,
-    IMPLAUSIBLE_SIZE,
-    OUTSIDE_LANE,
-)
-"""The rules in use, in the order of the report."""
+RULES: tuple[Rule, ...] = (*PLAUSIBILITY_RULES, *CONSISTENCY_RULES)
+"""Rules in use, in the order of the report."""
 
 
 class ThresholdError(UsageError):
@@ -72,17 +37,17 @@ class ThresholdError(UsageError):
 
 
 def checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
-    """The rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
+    """Select the rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
     return tuple(rule for rule in rules if not set(rule.columns) & set(lacking))
 
 
 def columns_needed(rules: Sequence[Rule]) -> tuple[str, ...]:
-    """The columns of `tracks`, `vehicles` and `subsets` behind what the rules name."""
+    """Return the columns of `tracks`, `vehicles` and `subsets` that the rules need."""
     return tuple(dict.fromkeys(name for rule in rules for name in rule.columns))
 
 
 def columns_read(rules: Sequence[Rule]) -> tuple[str, ...]:
-    """The columns of prepared entries that any of the rules names, derived ones among them."""
+    """Return the columns of prepared entries that the rules name, derived ones included."""
     return tuple(dict.fromkeys(name for rule in rules for name in rule.reads))
 
 
@@ -105,8 +70,8 @@ def resolve(rules: Sequence[Rule], overrides: Mapping[str, float] | None = None)
 def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> pa.DataFrameSchema:
     """Return the rules as a Pandera schema over a collected frame of prepared entries: one custom check per rule.
 
-    Validate a DataFrame with `lazy=True` to hear of every rule; a LazyFrame would be checked for dtypes only. The
-    schema says whether entries break a rule; `quality_reports.rules.findings.find` says which, from the same
+    Validate a DataFrame with `lazy=True` to check every rule; a LazyFrame would be checked for dtypes only. The
+    schema tells whether entries break a rule; `quality_reports.rules.findings.find` finds which, by the same
     expressions.
 
     Raises:
@@ -122,7 +87,7 @@ def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | N
 def select_broken(
     entries: pl.DataFrame, rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None
 ) -> tuple[Rule, ...]:
-    """The rules that a subset's prepared entries break anywhere, by the Pandera checks.
+    """Select the rules that any of a subset's prepared entries breaks, by the Pandera checks.
 
     Raises:
         ThresholdError: see `resolve`.
@@ -136,7 +101,7 @@ def select_broken(
 
 
 def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
-    """One rule as a Pandera check: true where an entry does not break it."""
+    """Return a rule as a Pandera check, true where an entry does not break it."""
     return pa.Check(
         lambda data: data.lazyframe.select(~broken),
         name=rule.name,
@@ -146,7 +111,7 @@ def _check(rule: Rule, broken: pl.Expr) -> pa.Check:
 
 
 def describe(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """Rows of documentation, one per rule: name, severity, unit, thresholds, meaning, source, columns read.
+    """Describe each rule in a row: name, severity, unit, thresholds, meaning, source, columns read.
 
     Raises:
         ThresholdError: see `resolve`.

@@ -1,4 +1,4 @@
-"""What a rule is: a declaration from which checks, findings, report rows and documentation follow."""
+"""Declaration of a rule, from which checks, findings, report rows and documentation follow."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +10,17 @@ from tracklake.quality_reports.rules.derived import trace
 
 Severity = Literal["error", "warning", "info"]
 Limits = Mapping[str, float]
-"""Thresholds by name."""
+"""Values of thresholds by name."""
+
+DESIGN = "docs/DESIGN.md, section 5"
+COIFMAN = "Coifman and Li (2017)"
+PUNZO = "Punzo, Borzacchiello and Ciuffo (2011)"
+"""Sources that several rules cite."""
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A number that a rule compares with: a setting.
+    """A setting that a rule compares values with.
 
     Args:
         name: the setting's name, unit included.
@@ -30,14 +35,14 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Case:
-    """A few entries just beyond a rule's thresholds and just within, worked out by hand: its example and its test.
+    """Entries just beyond a rule's thresholds and just within: its example and its test.
 
     Args:
-        entries: values by column of `tracks` and `vehicles`, one per entry. What is not said: each entry is of a
-            vehicle of its own (a car, 4 m x 2 m) in frame 1, in lane 1, at x = y = 0, 20 m/s, neither speeding up nor
-            slowing down; anything else is null.
-        breaks: the places of those that break the rule.
-        frame_rate_hz: of the source.
+        entries: values by column of `tracks` and `vehicles`, one per entry. By default each entry belongs to
+            another vehicle (a car, 4 m x 2 m) in frame 1, in lane 1, at x = y = 0, 20 m/s, without acceleration;
+            other columns are null.
+        breaks: indices of the entries that break the rule.
+        frame_rate_hz: frame rate of the source.
         lane_markings_m: y_m of the lane markings, leftmost first.
     """
 
@@ -49,7 +54,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Rule:
-    """What is wrong with an entry, declared.
+    """A rule that entries should not break.
 
     Args:
         name: as in `findings.rule`.
@@ -82,22 +87,22 @@ class Rule:
 
     @property
     def defaults(self) -> dict[str, float]:
-        """Threshold names and defaults."""
+        """Defaults of the thresholds by name."""
         return {threshold.name: threshold.default for threshold in self.thresholds}
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """The columns of prepared entries that its expressions name, derived ones among them."""
+        """Columns of prepared entries that its expressions name, derived ones included."""
         names = self.breaks(self.defaults).meta.root_names() + self.measure(self.defaults).meta.root_names()
         return tuple(dict.fromkeys(names))
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of `tracks`, `vehicles` and `subsets` that it needs; where one is lacking, it is not checked."""
+        """Columns of `tracks`, `vehicles` and `subsets` that it needs; without one of them it is not checked."""
         return trace(self.reads)
 
     def broken(self, thresholds: Limits) -> pl.Expr:
-        """True where an entry breaks the rule, else false, never null.
+        """Return an expression: true where an entry breaks the rule, else false, never null.
 
         Args:
             thresholds: every threshold of the rule by name (see `quality_reports.rules.registry.resolve`).
@@ -105,12 +110,12 @@ class Rule:
         return self.breaks(thresholds).fill_null(value=False)
 
     def measure(self, thresholds: Limits) -> pl.Expr:
-        """The rule's value of an entry, in its unit."""
+        """Return the expression of the rule's value, in its unit."""
         return self.value(thresholds) if callable(self.value) else self.value
 
 
 def recorded(limit: float) -> pl.Expr:
-    """A threshold as Float32, the dtype of recorded speeds, accelerations and sizes.
+    """Return a threshold as Float32, the dtype of recorded speeds, accelerations and sizes.
 
     They have two decimals at the source, so a value often is the threshold: it must equal it. As Float64 it would not:
     the Float32 next to 3.05 is less than 3.05 and the one next to 0.1 greater than 0.1.

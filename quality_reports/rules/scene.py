@@ -1,4 +1,4 @@
-"""One subset as arrays: its entries, its vehicles and what is known of its road and camera."""
+"""One subset as arrays: its entries, its vehicles, its road and its camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from tracklake.schemas.arrays import Floats, Integers
 
-NOBODY = -1
-"""Row or vehicle that is not there."""
+ABSENT = -1
+"""Index of a row, track or lane that does not exist."""
 UNITS_PER_M = 10_000
-"""Positions are put in order and compared as whole tenths of a millimetre; files have 0.3 mm (0.001 ft) or 1 cm."""
+"""Units of compared positions in a metre: tenths of a millimetre; files have 0.3 mm (0.001 ft) or 1 cm."""
 VEHICLE_COLUMNS = ("length_m", "width_m", "class")
 """Columns of `vehicles` that rules may read."""
 SUBSET_COLUMNS = ("frame_rate_hz", "lane_markings_m")
@@ -25,13 +23,13 @@ SUBSET_COLUMNS = ("frame_rate_hz", "lane_markings_m")
 
 @dataclass(frozen=True)
 class Scene:
-    """What the derived columns of a subset are computed from. Nothing in it is changed.
+    """Input of a subset's derived columns; it is never changed.
 
     Args:
         tracks: ONE subset's entries, sorted by vehicle_id, frame, each pair once.
         vehicles: vehicle_id and VEHICLE_COLUMNS of that subset, each id once; a vehicle that is not in it is of unknown
             size and class.
-        frame_rate_hz: of the source.
+        frame_rate_hz: frame rate of the source.
         lane_markings_m: y_m of the lane markings, leftmost first; None where unknown.
     """
 
@@ -47,34 +45,34 @@ class Scene:
 
     @cached_property
     def vehicle_id(self) -> NDArray[np.int32]:
-        """(N,) of each entry."""
+        """Vehicle of each entry, (N,)."""
         return self.tracks["vehicle_id"].to_numpy()
 
     @cached_property
     def frame(self) -> NDArray[np.int32]:
-        """(N,) of each entry."""
+        """Frame of each entry, (N,)."""
         return self.tracks["frame"].to_numpy()
 
     @cached_property
-    def begins(self) -> Ints:
-        """(V,) row of each track's first entry."""
+    def begins(self) -> Integers:
+        """Row of each track's first entry, (V,)."""
         if not self.height:
             return np.empty(0, np.int64)
         return np.flatnonzero(np.concatenate([[True], self.vehicle_id[1:] != self.vehicle_id[:-1]]))
 
     @cached_property
-    def ends(self) -> Ints:
-        """(V,) row after each track's last entry."""
+    def ends(self) -> Integers:
+        """Row after each track's last entry, (V,)."""
         return np.append(self.begins[1:], self.height)
 
     @cached_property
-    def place(self) -> NDArray[np.int32]:
-        """(N,) which track an entry is of, counted from 0."""
+    def track(self) -> NDArray[np.int32]:
+        """Track of each entry, counted from 0, (N,)."""
         return np.repeat(np.arange(len(self.begins), dtype=np.int32), self.ends - self.begins)
 
     @cached_property
     def age(self) -> NDArray[np.int32]:
-        """(N,) entries before this one without a frame missing: 0 in a track's first entry and after a frame gap."""
+        """Entries since the track's first one or its last frame gap, (N,)."""
         rows = np.arange(self.height, dtype=np.int32)
         follows = np.zeros(self.height, np.bool_)
         follows[1:] = (self.vehicle_id[1:] == self.vehicle_id[:-1]) & (self.frame[1:] - self.frame[:-1] == 1)
@@ -82,71 +80,71 @@ class Scene:
         return age
 
     @cached_property
-    def x_units(self) -> Ints:
-        """(N,) x_m in tenths of a millimetre."""
+    def x_units(self) -> Integers:
+        """Position x_m in tenths of a millimetre, (N,)."""
         x: Floats = self.tracks["x_m"].to_numpy()
         return np.rint(x * UNITS_PER_M).astype(np.int64)
 
     @cached_property
-    def leader(self) -> Ints:
-        """(N,) track of the recorded leader, NOBODY where none is recorded or it has no track."""
-        return self._find_tracks(self.tracks["leader_id"].fill_null(NOBODY).to_numpy())
+    def leader(self) -> Integers:
+        """Track of the recorded leader, ABSENT where none is recorded or it has no track, (N,)."""
+        return self._find_tracks(self.tracks["leader_id"].fill_null(ABSENT).to_numpy())
 
     @cached_property
     def lane(self) -> NDArray[np.int32]:
-        """(N,) lane, NOBODY where it is unknown."""
-        return self.tracks["lane"].cast(pl.Int32).fill_null(NOBODY).to_numpy()
+        """Lane of each entry, ABSENT where it is unknown, (N,)."""
+        return self.tracks["lane"].cast(pl.Int32).fill_null(ABSENT).to_numpy()
 
     @cached_property
     def traits(self) -> pl.DataFrame:
-        """(V,) rows of VEHICLE_COLUMNS, one per track, null where unknown."""
+        """VEHICLE_COLUMNS of each track, null where unknown, (V,)."""
         tracks = pl.DataFrame({"vehicle_id": self.vehicle_id[self.begins]}, schema={"vehicle_id": pl.Int32})
         return tracks.join(self.vehicles, on="vehicle_id", how="left", maintain_order="left").select(VEHICLE_COLUMNS)
 
     def measurements(self, column: str) -> NDArray[Any]:
-        """(N,) a column of floats in its own dtype, NaN where null."""
+        """Return a column of floats in its own dtype, NaN where null, (N,)."""
         values: NDArray[Any] = self.tracks[column].fill_null(np.nan).to_numpy()
         return values
 
     def trait(self, column: str) -> NDArray[np.float32]:
-        """(V + 1,) length_m or width_m of each track, NaN where unknown; NaN for NOBODY, which is the last."""
+        """Return length_m or width_m of each track, NaN where unknown, and NaN for ABSENT as the last, (V + 1,)."""
         known: NDArray[np.float32] = self.traits[column].cast(pl.Float32).fill_null(np.nan).to_numpy()
         return np.append(known, np.float32(np.nan))
 
     @cached_property
-    def leader_row(self) -> Ints:
-        """(N,) the recorded leader's entry in the same frame, NOBODY where it has none."""
-        led = np.flatnonzero(self.leader != NOBODY)
+    def leader_row(self) -> Integers:
+        """Row of the recorded leader's entry in the same frame, ABSENT where it has none, (N,)."""
+        led = np.flatnonzero(self.leader != ABSENT)
         track, frame = self.leader[led], self.frame[led]
         first, last = self.begins[track], self.ends[track] - 1
         # A track without gaps has its entry of that frame so many rows after its first.
         guess = np.clip(first + (frame.astype(np.int64) - self.frame[first]), first, last)
         hit = self.frame[guess] == frame
-        rows = np.full(self.height, NOBODY, np.int64)
+        rows = np.full(self.height, ABSENT, np.int64)
         rows[led[hit]] = guess[hit]
-        missed = np.flatnonzero(~hit & (frame > self.frame[first]) & (frame < self.frame[last]))
-        if missed.size:
+        unmatched = np.flatnonzero(~hit & (frame > self.frame[first]) & (frame < self.frame[last]))
+        if unmatched.size:
             span = int(self.frame.max()) + 1
-            wanted = track[missed] * span + frame[missed]
-            keys = self.place.astype(np.int64) * span + self.frame
+            wanted = track[unmatched] * span + frame[unmatched]
+            keys = self.track.astype(np.int64) * span + self.frame
             found = np.searchsorted(keys, wanted)
             there = keys[found] == wanted
-            rows[led[missed[there]]] = found[there]
+            rows[led[unmatched[there]]] = found[there]
         return rows
 
-    def _find_tracks(self, ids: NDArray[np.int32]) -> Ints:
-        """The tracks of these vehicles, NOBODY where there is none; ids stay the same over long stretches."""
+    def _find_tracks(self, ids: NDArray[np.int32]) -> Integers:
+        """Find the tracks of vehicles, ABSENT where there is none; ids stay the same over long stretches."""
         if not self.height:
             return np.empty(0, np.int64)
         begins = np.flatnonzero(np.concatenate([[True], ids[1:] != ids[:-1]]))
         known, wanted = self.vehicle_id[self.begins], ids[begins]
         found = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
-        tracks = np.where(known[found] == wanted, found, NOBODY)
+        tracks = np.where(known[found] == wanted, found, ABSENT)
         return np.repeat(tracks, np.diff(begins, append=self.height))
 
 
 def find_lacking(vehicles: pl.DataFrame, facts: pl.DataFrame) -> frozenset[str]:
-    """The columns of `tracks`, `vehicles` and `subsets` that one subset's source does not have.
+    """Find the columns of `tracks`, `vehicles` and `subsets` that one subset's source does not have.
 
     Args:
         vehicles: the subset's `vehicles`.

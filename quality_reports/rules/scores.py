@@ -1,4 +1,4 @@
-"""Scores: the share of a track and of a subset that breaks no rule, and how consistent a subset is in itself.
+"""Scores: shares of tracks and subsets that break no rule, and the consistency of a subset.
 
 After Punzo, Borzacchiello and Ciuffo (2011), who judge trajectories by feasibility (jerk), internal consistency
 (recorded speeds and accelerations against positions) and platoon consistency (spacing between vehicles), and Coifman
@@ -16,7 +16,7 @@ COLUMNS_SCORED = (
     "speed_mps", "speed_10hz_mps", "accel_mps2", "accel_10hz_mps2", "jerk_mps3", "jerk_reversals", "recorded_gap_m",
     "gap_m", "leader_ahead_m",
 )  # fmt: skip
-"""What `score_subset` compares, of prepared entries; what of it is absent is not compared."""
+"""Columns of prepared entries that `score_subset` compares where they are present."""
 
 
 def score_vehicles(
@@ -26,7 +26,7 @@ def score_vehicles(
 
     Args:
         entries: ONE subset's prepared entries, sorted by vehicle_id, frame.
-        rules: those that could be checked.
+        rules: rules that could be checked.
         thresholds: overrides by name.
 
     Raises:
@@ -63,7 +63,7 @@ def score_subset(
 
     Args:
         entries: ONE subset's prepared entries, with those of COLUMNS_SCORED that its source has.
-        vehicle_scores: of its vehicles.
+        vehicle_scores: scores of its vehicles.
         unchecked: rules that could not be checked.
         thresholds: overrides by name; high_jerk_mps3 and jerk_flicker_changes count here.
 
@@ -107,8 +107,10 @@ def score_subset(
 
 
 def _difference(first: str, second: str) -> pl.Expr:
+    """Return the difference of two columns."""
     return pl.col(first).cast(pl.Float64) - pl.col(second).cast(pl.Float64)
 
 
 def _root_mean_square(values: pl.Expr) -> pl.Expr:
+    """Return the root of the mean square."""
     return (values**2).mean().sqrt()

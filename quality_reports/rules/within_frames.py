@@ -1,13 +1,14 @@
-"""Derived columns that compare the vehicles of one frame: overlaps, the nearest ahead, headways."""
+"""Derived columns that compare the vehicles of one frame: overlaps, nearest vehicles ahead, headways."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracklake.quality_reports.rules.scene import NOBODY, UNITS_PER_M, Flags, Floats, Ints, Scene
+from tracklake.quality_reports.rules.scene import ABSENT, UNITS_PER_M, Scene
+from tracklake.schemas.arrays import Flags, Floats, Integers
 
 
-def sort_rows(*keys: NDArray[np.integer]) -> Ints:
-    """Rows in the order of the keys, the first most significant; rows with equal keys in any order.
+def sort_rows(*keys: NDArray[np.integer]) -> Integers:
+    """Sort rows by keys, the first most significant; rows with equal keys come in any order.
 
     The keys are packed into one whole number, which sorts many times faster than one key after another; where their
     ranges are too wide for 63 bits, they are sorted one after another.
@@ -30,14 +31,14 @@ def sort_rows(*keys: NDArray[np.integer]) -> Ints:
 
 
 def measure_overlaps(scene: Scene) -> Floats:
-    """How deep an entry's box lies in that of another vehicle in the same frame, m, to 1 mm.
+    """Measure how deep an entry's box lies in that of another vehicle in the same frame, m, to 1 mm.
 
     Depth is the least distance that one of the two would have to move, along or across the road, to be clear of the
     other; of several overlaps the deepest. 0 = none: touching is not overlapping. Boxes reach back from the front
     centre by the length and half the width to either side. NaN where the own size is unknown; others of unknown size
-    are passed over.
+    are skipped.
     """
-    length, width = (scene.trait(name)[scene.place] for name in ("length_m", "width_m"))
+    length, width = (scene.trait(name)[scene.track] for name in ("length_m", "width_m"))
     known = ~(np.isnan(length) | np.isnan(width))
     rows = np.flatnonzero(known)
     # In the order of (frame, x), those that can reach into a vehicle's rear are the ones right before it.
@@ -68,11 +69,11 @@ def measure_overlaps(scene: Scene) -> Floats:
 
 
 def measure_nearest_ahead(scene: Scene) -> Floats:
-    """Distance from an entry's front to the next front ahead in its lane, m; NaN where there is none.
+    """Measure the distance from an entry's front to the next front ahead in its lane, m; NaN where there is none.
 
     A vehicle exactly abreast (to 0.1 mm) is not ahead.
     """
-    rows = np.flatnonzero(scene.lane != NOBODY)
+    rows = np.flatnonzero(scene.lane != ABSENT)
     order = sort_rows(scene.frame[rows], scene.lane[rows], scene.x_units[rows])
     rows = rows[order]
     frame, lane, x = scene.frame[rows], scene.lane[rows], scene.x_units[rows]
@@ -94,24 +95,24 @@ def measure_nearest_ahead(scene: Scene) -> Floats:
 
 
 def measure_leader_ahead(scene: Scene) -> Floats:
-    """Distance from an entry's front to its recorded leader's, m, negative behind; NaN where that has no entry."""
-    seen = scene.leader_row != NOBODY
+    """Measure the distance from an entry's front to its recorded leader's, m, negative behind; NaN if unknown."""
+    seen = scene.leader_row != ABSENT
     apart = (scene.x_units[scene.leader_row] - scene.x_units) / UNITS_PER_M
     return np.where(seen, apart, np.nan)
 
 
 def is_leader_in_lane(scene: Scene) -> Floats:
-    """1 where the recorded leader is in the entry's lane, 0 where it is in another; NaN where that is unknown."""
+    """Return 1 where the recorded leader is in the entry's lane, 0 where it is in another, NaN where unknown."""
     other = scene.lane[scene.leader_row]
-    seen = (scene.leader_row != NOBODY) & (other != NOBODY) & (scene.lane != NOBODY)
+    seen = (scene.leader_row != ABSENT) & (other != ABSENT) & (scene.lane != ABSENT)
     return np.where(seen, (other == scene.lane).astype(np.float64), np.nan)
 
 
 def measure_recorded_gaps(scene: Scene) -> Floats:
-    """The recorded headway as a gap from bumper to bumper, m, to 1 mm; NaN where the leader's length is unknown.
+    """Measure the recorded headway as a gap from bumper to bumper, m, to 1 mm; NaN without the leader's length.
 
-    Sources record headways from front to front or from bumper to bumper. Which, the subset's positions say: the reading
-    that is nearer to gap_m in the median; undecided, from front to front.
+    Sources record headways from front to front or from bumper to bumper. The reading that is nearer to gap_m in the
+    subset's median is used; if neither is, from front to front.
     """
     headway = scene.measurements("headway_recorded_m").astype(np.float64)
     gap = scene.measurements("gap_m")

@@ -1,4 +1,4 @@
--- Per split and subset: the part it stands in; where blocks of it stand in several, those with their blocks.
+-- Per split and subset: its part; where its blocks are in several parts, those with their blocks.
 -- $parts: their names in order.
 WITH blocks AS (
     SELECT split, dataset, subset, part, count(*) AS blocks FROM splits GROUP BY split, dataset, subset, part

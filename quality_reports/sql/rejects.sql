@@ -1,4 +1,4 @@
--- The first $rejects_per_file dropped rows of every file, as they stand in it, cut after $reject_characters.
+-- The first $rejects_per_file dropped rows of every file, as in the file, cut after $reject_characters.
 SELECT
     dataset, file, recording, line, reason, left(text, $reject_characters) AS text,
     length(text) > $reject_characters AS cut, count(*) OVER (PARTITION BY dataset, file) AS rejects_in_file

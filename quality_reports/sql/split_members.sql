@@ -1,4 +1,4 @@
--- Per split, subset and part: which blocks stand there.
+-- Per split, subset and part: its blocks.
 -- $parts: their names in order.
 SELECT
     split, splits.dataset, splits.subset, any_value(site) AS site, any_value(direction) AS direction, part,

@@ -8,6 +8,7 @@ import altair as alt
 import vl_convert
 
 from tracklake.schemas.chart_theme import PAPER, make_config
+from tracklake.schemas.errors import UsageError
 
 Row = dict[str, Any]
 Layers = alt.LayerChart | alt.FacetChart
@@ -46,10 +47,10 @@ class Drawing:
             suffix: one of SUFFIXES, in any case.
 
         Raises:
-            ValueError: another suffix.
+            UsageError: another suffix.
         """
         if suffix.lower() not in SUFFIXES:
-            raise ValueError(f"expected a file whose name ends in {' or '.join(SUFFIXES)}, got `{suffix}`")
+            raise UsageError(f"expected a file whose name ends in {' or '.join(SUFFIXES)}, got `{suffix}`")
         if suffix.lower() == ".png":
             png: bytes = vl_convert.vegalite_to_png(self.to_vega_lite(), scale=PNG_SCALE)
             return png

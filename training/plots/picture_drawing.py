@@ -7,6 +7,7 @@ from typing import Any
 import altair as alt
 
 from tracklake.schemas.chart_theme import BLUE, GREEN, INK, MUTED, ORANGE, PAPER, PURPLE
+from tracklake.schemas.errors import UsageError
 from tracklake.training.plots.charts import Drawing, Layers
 from tracklake.training.plots.picture import Picture
 from tracklake.training.plots.picture_rows import (
@@ -52,11 +53,11 @@ def draw_picture(picture: Picture) -> Drawing:
     """Draw a sample.
 
     Raises:
-        ValueError: no model, or more than MOST_MODELS.
+        UsageError: no model, or more than MOST_MODELS.
     """
     models = picture.models
     if not 1 <= len(models) <= MOST_MODELS:
-        raise ValueError(f"a drawing shows 1 to {MOST_MODELS} models, got {len(models)}: {', '.join(models)}")
+        raise UsageError(f"a drawing shows 1 to {MOST_MODELS} models, got {len(models)}: {', '.join(models)}")
     view = choose_view(picture)
     axes, series = _Axes.make(picture, view), _Series.make(models)
     rows = {

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.batches import Flags, Integers
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples, truth_of_ego
@@ -102,7 +102,7 @@ def pick_samples(
     if pick != "worst":
         return random.permutation(found)[:count]
     if judge is None:
-        raise ValueError("`worst` needs a model to judge by")
+        raise UsageError("`worst` needs a model to judge by")
     if len(found) > MOST_SEARCHED:
         found = np.sort(random.choice(found, MOST_SEARCHED, replace=False))
     distance = measure_last_distance(folder, found, judge)

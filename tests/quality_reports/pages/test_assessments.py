@@ -79,7 +79,7 @@ def test_the_page_shows_them_side_by_side(assessed_report):
     assert "01-lower 6 10.0 80.00 % 30.00 % 80.00 % 30.00 % 60.00 % 10.00 % 80.00 % 30.00 %" in text
     assert "all of highd 7 20.0 90.00 % 15.00 %" in text
     assert "40 highd 2 4.0 75.00 % 25.00 %" in text
-    for title in ("start beyond the cut-off (m)", "covered (% of missing time)", "in vain (% of missing time)"):
+    for title in ("start beyond the cut-off (m)", "covered (% of missing time)", "excess (% of missing time)"):
         assert title in section
     style = re.search(r"<style>(.*?)</style>", assessed_report.html, flags=re.DOTALL).group(1)
     drawing = plots.draw_assessments(assessed_report.quality["starts"]["assessed"]["positions"])

@@ -8,7 +8,7 @@ import pytest
 
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.rules.registry import ThresholdError
-from tracklake.quality_reports.summaries import QUALITY_SCHEMA
+from tracklake.schemas.quality import QUALITY_SCHEMA
 
 
 def row(rows: list[dict], **wanted) -> dict:

@@ -12,7 +12,7 @@ from page_elements import HOSTILE, parse, spoil_texts
 from tracklake.quality_reports.pages.rendering import DASH, flatten, format_cell, format_duration, visible
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.plots import charts as plots
-from tracklake.quality_reports.summaries import plain, statement
+from tracklake.quality_reports.summaries import plain, read_statement
 
 
 def test_no_name_injects_markup(open_lake, small_lake):
@@ -75,8 +75,8 @@ def test_every_statement_says_what_a_row_is():
     names = sorted(path.stem for path in folder.glob("*.sql"))
     assert len(names) >= 15
     for name in names:
-        assert statement(name).startswith("-- "), name
-        assert len(duckdb.extract_statements(statement(name))) == 1, f"{name}: one statement per file"
+        assert read_statement(name).startswith("-- "), name
+        assert len(duckdb.extract_statements(read_statement(name))) == 1, f"{name}: one statement per file"
 
 
 @pytest.mark.parametrize(

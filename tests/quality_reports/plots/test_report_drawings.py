@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracklake.quality_reports.plots.axes import Scale, draw_line, make_ticks, widen, write_number
-from tracklake.quality_reports.plots.rasters import EMPTY, LEVELS, encode_png, grade, make_palette
-from tracklake.quality_reports.plots.time_space import COLUMNS, ROWS, Grid, draw_lanes, lay_grid, rasterise
+from tracklake.quality_reports.plots.axes import Scale, draw_line, find_range, format_number, make_ticks
+from tracklake.quality_reports.plots.rasters import EMPTY, LEVELS, encode_png, grade_values, make_palette
+from tracklake.quality_reports.plots.time_space import COLUMNS, ROWS, Grid, draw_lanes, make_grid, rasterise
 from tracklake.quality_reports.summaries import query, query_frame
 
 
@@ -57,7 +57,7 @@ def test_the_palette_grows_lighter_step_by_step():
 
 def test_values_are_graded_from_the_first_colour_to_the_last():
     values = np.array([np.nan, -3.0, 0.0, 12.5, 25.0, 99.0])
-    assert grade(values, 0, 25).tolist() == [EMPTY, 1, 1, 128, LEVELS, LEVELS]
+    assert grade_values(values, 0, 25).tolist() == [EMPTY, 1, 1, 128, LEVELS, LEVELS]
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-2, 1e6), st.integers(2, 12))
@@ -74,8 +74,8 @@ def test_ticks_are_round_and_within(low, span, most):
 def test_ticks_by_hand():
     assert make_ticks(0, 66, 10) == [0, 10, 20, 30, 40, 50, 60]
     assert make_ticks(-0.3, 0.9, 4) == [0, 0.5]
-    assert write_number(-1250.0) == "\N{MINUS SIGN}1,250"
-    assert widen(3.0, 3.0, 2.0) == pytest.approx((1.9, 4.1))
+    assert format_number(-1250.0) == "\N{MINUS SIGN}1,250"
+    assert find_range(pl.Series([3.0, None, 3.0]), 2.0) == pytest.approx((1.9, 4.1))
 
 
 def test_a_line_breaks_at_gaps_and_missing_values():
@@ -113,7 +113,7 @@ def test_cells_hold_the_mean_speed_of_their_entries(open_lake, entries):
     other = {**where, "subset": "01-lower", "vehicle_id": 0, "frame": 1, "time_s": 0.0, "x_m": 9e3, "speed_mps": 99.0}
     lake = open_lake(tracks=[{**where, "y_m": 0.0, **row} for row in rows] + [{"y_m": 0.0, **other}])
     extent = query(lake, "subset_extent", where)[0]
-    grid = lay_grid(extent)
+    grid = make_grid(extent)
     assert grid.columns <= COLUMNS
     assert grid.rows <= ROWS
     cells = query_frame(lake, "subset_time_space", {**where, **grid.parameters()})

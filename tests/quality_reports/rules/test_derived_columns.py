@@ -10,7 +10,7 @@ from rule_scenes import ANY_SURFACE, change, driver, scene_of
 from tracklake.pipeline.synthetic.expected_findings import Surface
 from tracklake.quality_reports.rules import within_frames
 from tracklake.quality_reports.rules.derived import DERIVED, prepare, trace
-from tracklake.quality_reports.rules.scene import NOBODY
+from tracklake.quality_reports.rules.scene import ABSENT
 
 HALF_TICKS = Surface(rate_hz=25.0)
 
@@ -155,7 +155,7 @@ def test_leaders_are_looked_up_in_their_own_frame_across_gaps():
     expected = [None] * 4 + [92.0, 92.0, None, None] + [92.0] * 5 + [None]
     assert column(scene, "leader_ahead_m")[8:] == expected
     assert column(scene, "leader_in_lane")[8:] == [None if each is None else 1.0 for each in expected]
-    assert (scene.leader[:8] == NOBODY).all()
+    assert (scene.leader[:8] == ABSENT).all()
 
 
 @pytest.mark.parametrize("from_fronts", [True, False])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 from drawn_moment import OWN, OWN_SAMPLE, open_moment, sure
 
+from tracklake.schemas.errors import UsageError
 from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
 from tracklake.training.plots.picture import take_picture
 from tracklake.training.plots.picture_drawing import MODEL_COLOURS, MODEL_SHAPES, describe_marks, draw_picture
@@ -101,7 +102,7 @@ def test_a_png_is_twice_as_large_and_begins_as_one(drawing, svg):
 
 
 def test_other_files_are_not_drawn(drawing):
-    with pytest.raises(ValueError, match=r"expected a file whose name ends in \.svg or \.png, got `\.pdf`"):
+    with pytest.raises(UsageError, match=r"expected a file whose name ends in \.svg or \.png, got `\.pdf`"):
         drawing.render(".pdf")
 
 
@@ -175,7 +176,7 @@ def test_lanes_without_markings_are_named_nominal_and_names_are_no_markup(tmp_pa
 
 def test_more_models_than_colours_are_refused(folder):
     models = [sure(f"model {number}") for number in range(5)]
-    with pytest.raises(ValueError, match="shows 1 to 4 models, got 5: model 0"):
+    with pytest.raises(UsageError, match="shows 1 to 4 models, got 5: model 0"):
         draw_picture(draw(folder, *models))
-    with pytest.raises(ValueError, match="shows 1 to 4 models, got 0"):
+    with pytest.raises(UsageError, match="shows 1 to 4 models, got 0"):
         draw_picture(draw(folder))

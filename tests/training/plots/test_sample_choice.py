@@ -8,6 +8,7 @@ import pytest
 from drawn_moment import FAR_SAMPLE, OWN_SAMPLE, open_moment
 from tensor_tables import TINY, random_clock, sample_everything, split_row, write
 
+from tracklake.schemas.errors import UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.sample_choice import NoSampleError, find_sample, measure_last_distance, pick_samples
 from tracklake.training.runs.forecasters import open_forecaster
@@ -125,5 +126,5 @@ def test_the_worst_is_searched_among_some_of_very_many(many, monkeypatch):
 
 
 def test_the_worst_needs_a_model(folder):
-    with pytest.raises(ValueError, match="needs a model to judge by"):
+    with pytest.raises(UsageError, match="needs a model to judge by"):
         pick_samples(folder, "eval", "worst")
