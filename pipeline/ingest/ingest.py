@@ -13,7 +13,7 @@ from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, write_table
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import count_reasons, to_rejects
-from tracklake.pipeline.sources.csv.raw_files import unpacked_bytes
+from tracklake.pipeline.sources.csv import measure_unpacked
 from tracklake.pipeline.sources.source import Canonical, Part
 from tracklake.pipeline.stages.stage import Job, make_entry, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
@@ -184,7 +184,7 @@ def build(root: Path, job: Job) -> Entry:
         return _build_unassigned(root, job, files[0])
     if needs_spill(job):
         return _build_recording(root, job, [_spilled_part(root, file, recording) for file in files])
-    with ROOM.taken(sum(map(unpacked_bytes, files))):
+    with ROOM.taken(sum(map(measure_unpacked, files))):
         return _build_recording(root, job, [Part(file) for file in files])
 
 

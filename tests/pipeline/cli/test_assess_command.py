@@ -13,7 +13,7 @@ from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.lake import connect, load, open_for_writing
 from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, Order, Outcome
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.sources.csv.raw_files import hash_raw
+from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.stages import assess, repair
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.pipeline.transforms.starts.assessment import POSITIONS_M
