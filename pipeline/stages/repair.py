@@ -5,7 +5,7 @@ from pathlib import Path
 from tracklake.pipeline.lake import Entry, LakeFile, Manifest, load, scan, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import Job, make_entry, make_job, recordings
-from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
+from tracklake.pipeline.transforms.starts.late_starts import classify_starts, estimate_missing_starts
 from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, SUBSETS, TRACKS, VEHICLE_STARTS, VEHICLES
 
 VERSION = 2
@@ -35,7 +35,7 @@ def build(root: Path, job: Job, settings: Settings) -> Entry:
         vehicles = scan(root, manifest, VEHICLES, **values).collect()
         facts = scan(root, manifest, SUBSETS, **values).collect().row(0, named=True)
         on_ramps = settings.on_ramp_lanes.get(facts["site"], facts["on_ramp_lanes"])
-        starts, cutoffs = judge_starts(
+        starts, cutoffs = classify_starts(
             vehicles,
             dataset=dataset,
             subset=subset,

@@ -156,8 +156,7 @@ def test_members_that_cannot_be_read_are_refused_once_for_all_and_the_others_go_
         "Unpack nested.zip and give the folder.",
         "odd.zip/data/export.csv: compressed by method 12. Expected 0 (stored) or 8 (deflated). "
         "Unpack odd.zip and give the folder.",
-        "twice.zip/a.csv and 1 more: 2 members have this name. Expected one. "
-        "Unpack twice.zip and give the folder.",
+        "twice.zip/a.csv and 1 more: 2 members have this name. Expected one. Unpack twice.zip and give the folder.",
     ]
 
 
