@@ -20,7 +20,7 @@ import polars as pl
 
 from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.sources.assemble import assemble_subset
+from tracklake.pipeline.sources.assembly import assemble_subset
 from tracklake.pipeline.sources.source import RawFile, Subset
 from tracklake.pipeline.stages.planner import Planner, build_job
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME

@@ -10,8 +10,8 @@ from tracklake.pipeline.cli.session import command, read_settings
 
 if TYPE_CHECKING:
     from tracklake.pipeline.cli.console import Terminal
-    from tracklake.pipeline.export.csp.export import CspExport
-    from tracklake.pipeline.export.windows.export import Format
+    from tracklake.pipeline.export.csp.result import CspExport
+    from tracklake.pipeline.export.windows.result import Format
     from tracklake.pipeline.settings import Settings
 
 app = typer.Typer(help="Write the lake's data in other projects' formats.", no_args_is_help=True)
@@ -44,7 +44,8 @@ def csp(
 ) -> None:
     """The files that conv-social-pooling's preprocess_data.m writes, value for value unless --clean is given."""
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.export.csp.export import CspOptions, export_csp
+        from tracklake.pipeline.export.csp.export import export_csp
+        from tracklake.pipeline.export.csp.result import CspOptions
         from tracklake.schemas.columns import DATASETS
 
         if dataset not in (None, *DATASETS):

@@ -1,1 +1,1 @@
-"""The lake in the formats of other projects."""
+"""Exports of a lake to the formats of other projects."""

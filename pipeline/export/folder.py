@@ -1,13 +1,12 @@
-"""Files of an export: all of them in their place, or none."""
+"""Files of an export, which appear in their folder together or not at all."""
 
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tracklake.schemas.errors import TracklakeError, explain_file_errors
-from tracklake.schemas.files import sync
+from tracklake.schemas.files import name_unfinished, sync
 
 
 class ExportError(TracklakeError):
@@ -15,25 +14,25 @@ class ExportError(TracklakeError):
 
 
 def refuse_taken(out: Path, names: Sequence[str], *, force: bool, lake: Path) -> None:
-    """Refuse a place where the export would spoil something, before any work is done for it.
+    """Refuse a folder where the export would overwrite something, before any work is done.
 
     Args:
-        out: the folder; it may hold other things.
-        names: of the files.
-        force: whether files of these names may be replaced.
-        lake: in which nothing but the lake's own files stands.
+        out: folder of the export; it may hold other files.
+        names: names of the files.
+        force: whether existing files of these names may be replaced.
+        lake: folder of the lake, which holds only the lake's own files.
 
     Raises:
-        ExportError: a file, the lake, or a folder that holds one of the names.
+        ExportError: the folder is a file, lies in the lake, cannot be written to, or holds one of the names.
     """
     if out.exists() and not out.is_dir():
         raise ExportError(f"{out}: is a file; the export needs a folder. Name another with --out.")
-    place = out.resolve()
-    nearest = next(folder for folder in (place, *place.parents) if folder.exists())
+    target = out.resolve()
+    nearest = next(folder for folder in (target, *target.parents) if folder.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-        raise ExportError(f"{out}: nothing can be put there, for {nearest} is no folder to write in. Name another.")
-    if place.is_relative_to(lake.resolve()):
-        raise ExportError(f"{out}: lies in the lake, which sweeps what is not its own. Name another folder with --out.")
+        raise ExportError(f"{out}: {nearest} is not a folder that can be written to. Name another with --out.")
+    if target.is_relative_to(lake.resolve()):
+        raise ExportError(f"{out}: lies in the lake, which deletes other files. Name another folder with --out.")
     folders = [name for name in names if (out / name).is_dir()]
     if folders:
         raise ExportError(f"{out}: holds folders named {', '.join(folders)}. Name another folder with --out.")
@@ -43,15 +42,15 @@ def refuse_taken(out: Path, names: Sequence[str], *, force: bool, lake: Path) ->
 
 
 def write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) -> None:
-    """Write files aside and move them into a folder when all are complete.
+    """Write files into a hidden folder and move them into `out` when all are complete.
 
-    A new folder appears with all of them in one step. In one that is there, which may hold other things or be a disk of
-    its own, they are renamed one after the other; if that fails, what stood there is put back.
+    A new folder appears with all files at once. In an existing folder, which may hold other files or be a disk of its
+    own, the files are renamed one after the other; if that fails, the previous files are restored.
 
     Args:
-        out: the folder, made where it is missing.
-        names: of the files that `write` makes.
-        write: fills the folder it is given.
+        out: folder of the export, created if missing.
+        names: names of the files that `write` makes.
+        write: function that writes the files into a given folder.
 
     Raises:
         FileAccessError: the disk is full, or rights are missing.
@@ -62,17 +61,17 @@ def write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) 
 
 def _write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) -> None:
     out = out.resolve()
-    there = out.is_dir()
-    if not there:
+    exists = out.is_dir()
+    if not exists:
         out.parent.mkdir(parents=True, exist_ok=True)
-    aside = (out if there else out.parent) / f".{out.name}.{uuid.uuid4().hex}.tmp"
+    aside = name_unfinished(out / out.name if exists else out)
     aside.mkdir()
     try:
         write(aside)
         for name in names:
             sync(aside / name)
-        if there:
-            _move_in(aside, out, names)
+        if exists:
+            _move_files(aside, out, names)
         else:
             aside.replace(out)
         sync(out)
@@ -81,7 +80,7 @@ def _write_files(out: Path, names: Sequence[str], write: Callable[[Path], None])
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _move_in(aside: Path, out: Path, names: Sequence[str]) -> None:
+def _move_files(aside: Path, out: Path, names: Sequence[str]) -> None:
     before = aside / "before"
     before.mkdir()
     try:
@@ -90,7 +89,7 @@ def _move_in(aside: Path, out: Path, names: Sequence[str]) -> None:
                 (out / name).replace(before / name)
             (aside / name).replace(out / name)
     except BaseException:
-        # How far it came is seen from where the files are.
+        # A file's location tells whether it had been moved.
         for name in names:
             if (before / name).exists():
                 (before / name).replace(out / name)

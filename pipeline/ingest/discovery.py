@@ -11,15 +11,21 @@ from pathlib import Path, PurePosixPath
 
 from tracklake.pipeline.lake.manifest import MANIFEST
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
-from tracklake.pipeline.sources.csv.archives import ENDING, Contents, is_archive, list_members
-from tracklake.pipeline.sources.csv.raw_files import hash_raw, read_head
+from tracklake.pipeline.sources.csv import (
+    ARCHIVE_SUFFIX,
+    ArchiveContents,
+    hash_raw,
+    is_archive,
+    list_members,
+    read_head,
+)
 from tracklake.pipeline.sources.source import Unit
 from tracklake.schemas.files import write_file
 
-SUFFIXES = (".csv", ".txt", ".dat", ".gz", ENDING, "")
+SUFFIXES = (".csv", ".txt", ".dat", ".gz", ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, Parquet, documents) are skipped."""
 
-PROSE = (".txt", ".dat", ENDING, "")
+PROSE = (".txt", ".dat", ARCHIVE_SUFFIX, "")
 """Endings that documents share: an unrecognised file with one is skipped and named, not refused."""
 
 HASHES = ".hashes.json"
@@ -193,7 +199,7 @@ def _list_candidates(source: Path) -> list[Path]:
 
 
 def _describe_formats(sources: list[Source]) -> str:
-    return "; ".join(item.looks_like for item in sources)
+    return "; ".join(item.signature for item in sources)
 
 
 def _explain_unknown(name: str, head: bytes, sources: list[Source]) -> str:
@@ -207,7 +213,7 @@ def _explain_unknown(name: str, head: bytes, sources: list[Source]) -> str:
     )
 
 
-def _explain_archive(archive: RawFile, contents: Contents, sources: list[Source]) -> str:
+def _explain_archive(archive: RawFile, contents: ArchiveContents, sources: list[Source]) -> str:
     held = [*contents.others, *(file.name for file in contents.files)]
     got = ", ".join(name.removeprefix(f"{archive.name}/") for name in held[:5]) + (", ..." if len(held) > 5 else "")
     return (

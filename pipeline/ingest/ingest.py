@@ -14,7 +14,7 @@ from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_tabl
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import count_reasons, to_rejects
-from tracklake.pipeline.sources.csv.raw_files import unpacked_bytes
+from tracklake.pipeline.sources.csv import measure_unpacked
 from tracklake.pipeline.sources.source import Canonical, Part
 from tracklake.pipeline.stages.stage import Job, make_commit, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
@@ -193,7 +193,7 @@ def build(root: Path, job: Job) -> Commit:
     elif needs_spill(job):
         tables, info = _build_recording(root, job, [_open_spilled(root, file, recording) for file in files])
     else:
-        with MEMORY_BUDGET.reserve(sum(map(unpacked_bytes, files))):
+        with MEMORY_BUDGET.reserve(sum(map(measure_unpacked, files))):
             tables, info = _build_recording(root, job, [Part(file) for file in files])
     facts = {"dataset": job.inputs["dataset"], "recording": recording}
     return make_commit(job, tables, {**facts, **info}, started)

@@ -1,4 +1,4 @@
-"""The datasets tracklake reads: one file each, listed here and nowhere else."""
+"""The sources: one file per dataset that tracklake reads, listed here and nowhere else."""
 
 from tracklake.pipeline.sources.highd import HIGHD
 from tracklake.pipeline.sources.ngsim import NGSIM

@@ -1,38 +1,39 @@
-"""What became of every row: exact duplicates, the ingest log, the rejects."""
+"""Accounting of every row: exact duplicates, the ingest log, the rejects."""
 
 from collections.abc import Sequence
 
 import polars as pl
 
-from tracklake.pipeline.sources.csv.lines import REJECT_SCHEMA
-from tracklake.pipeline.sources.csv.raw_files import LINE, fetch_lines
+from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, fetch_lines
 from tracklake.pipeline.sources.source import Part
 from tracklake.schemas import INGEST_LOG, REJECTS
 
 FILE = "file_index"
+"""Column with the number of a row's file among its recording's files."""
+
 DUPLICATE = "duplicate row"
 CONFLICT = "another row has the same vehicle and frame"
 
 
 def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Part rows from exact repetitions of earlier ones.
+    """Split rows from exact repetitions of earlier ones.
 
     Args:
-        rows: values, with FILE and LINE saying where each row stands, in the order of these two.
+        rows: values with FILE and LINE, in the order of these two.
         key: one or two Int32 columns that sort equal rows next to each other.
 
     Returns:
-        (first occurrences, repetitions), sorted by key, rows of one key by their values, equal ones by file and line.
+        (first occurrences, repetitions), sorted by key, then by values, then by file and line.
     """
     values = [name for name in rows.columns if name not in (FILE, LINE)]
     rest = [name for name in values if name not in key]
     rows = rows.with_columns(_pack(key).alias(_PACKED))
     if not rows[_PACKED].is_sorted():
-        # One packed number sorts three times as fast as the columns it is made of.
+        # One packed number sorts three times as fast as its columns.
         rows = rows.sort(_PACKED, maintain_order=True)
     repeated = rows.select((pl.col(_PACKED) == pl.col(_PACKED).shift(1)).any()).item()
     rows = rows.drop(_PACKED)
-    # Comparing all columns costs seconds and is needed only where a key repeats at all.
+    # Comparing all columns takes seconds and is needed only if a key repeats.
     if not repeated:
         return rows, rows.clear()
     rows = rows.sort([*key, *rest, FILE, LINE], maintain_order=False)
@@ -46,28 +47,28 @@ _PACKED = "packed_key"
 
 
 def _pack(key: Sequence[str]) -> pl.Expr:
-    """One Int64 that sorts as one or two non-negative Int32 columns do."""
+    """Pack one or two non-negative Int32 columns into an Int64 of the same order."""
     packed = pl.lit(0, pl.Int64)
     for name in key:
         packed = packed * 2**31 + pl.col(name).cast(pl.Int64)
     return packed
 
 
-def account(
+def account_rows(
     dataset: str,
     recording: str,
     parts: Sequence[Part],
     rows_parsed: Sequence[int],
     dropped: Sequence[tuple[pl.DataFrame, str]],
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """The ingest log and the rejects of one recording.
+    """Build the ingest log and the rejects of one recording.
 
     Args:
-        dataset: of the recording.
-        recording: its name.
-        parts: its files.
-        rows_parsed: of each part, the rows that were read as entries.
-        dropped: rows (FILE, LINE) of those that were dropped afterwards, each set with its reason.
+        dataset: name of the dataset.
+        recording: name of the recording.
+        parts: files of the recording.
+        rows_parsed: number of rows of each part that were parsed.
+        dropped: sets of parsed rows (FILE, LINE) that were dropped later, each with its reason.
 
     Returns:
         (schemas.INGEST_LOG with one row per file, schemas.REJECTS); read = kept + dropped in each row.
@@ -103,12 +104,12 @@ _LATER = {FILE: pl.Int64(), LINE: pl.Int64(), "reason": pl.String()}
 
 
 def count_reasons(rejects: pl.DataFrame) -> list[dict[str, object]]:
-    """Rows by reason, as the log's list of structs."""
+    """Count rejected rows by reason, as the log's list of structs."""
     return rejects.group_by("reason").agg(pl.len().cast(pl.Int64).alias("rows")).sort("reason").to_dicts()
 
 
 def to_rejects(rejects: pl.DataFrame, dataset: str, recording: str | None) -> pl.DataFrame:
-    """Rejected lines as rows of schemas.REJECTS; one line that fails twice stands there once."""
+    """Turn rejected lines into rows of schemas.REJECTS, one per line."""
     return (
         rejects.with_columns(dataset=pl.lit(dataset), recording=pl.lit(recording, pl.String))
         .lazy()

@@ -1,30 +1,19 @@
 """highD: drone recordings of German motorways, 25 Hz, three CSV files per recording."""
 
 import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import PurePosixPath
 from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, account, split_duplicates
-from tracklake.pipeline.sources.assemble import assemble_subset
-from tracklake.pipeline.sources.completeness import Announced, compare
-from tracklake.pipeline.sources.csv.lines import Chunk, Layout, read_chunks
-from tracklake.pipeline.sources.csv.raw_files import LINE
-from tracklake.pipeline.sources.highd_rows import (
-    DIRECTION,
-    STRANGER,
-    add_directions,
-    split_conflicts,
-    split_impossible,
-    split_strangers,
-)
-from tracklake.pipeline.sources.source import Canonical, Grouping, Part, RawFile, Source, SourceError, Subset, Unit
+from tracklake.pipeline.sources.accounting import account_rows
+from tracklake.pipeline.sources.assembly import assemble_subset
+from tracklake.pipeline.sources.completeness import Announced, compare_counts
+from tracklake.pipeline.sources.highd_rows import DIRECTION, add_directions, split_impossible
+from tracklake.pipeline.sources.levelx import RECORDING, TRACKS, VEHICLES, LevelxFormat
+from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, SourceError, Subset
 from tracklake.pipeline.transforms.tracks.orientation import LOWER, UPPER, orient_highd
-from tracklake.schemas import Table
 from tracklake.schemas.completeness import RECORDING_META, TRACKS_META
 from tracklake.schemas.raw_highd import (
     RAW_HIGHD_RECORDING,
@@ -35,85 +24,19 @@ from tracklake.schemas.raw_highd import (
     RAW_VEHICLES_FIELDS,
 )
 
-RECORDING, VEHICLES, TRACKS = "highd-recordingMeta", "highd-tracksMeta", "highd-tracks"
-FIELDS = {RECORDING: RAW_RECORDING_FIELDS, VEHICLES: RAW_VEHICLES_FIELDS, TRACKS: RAW_TRACKS_FIELDS}
-RAW = {RECORDING: RAW_HIGHD_RECORDING, VEHICLES: RAW_HIGHD_VEHICLES, TRACKS: RAW_HIGHD_TRACKS}
+HIGHD_FORMAT = LevelxFormat(
+    dataset="highd",
+    title="highD",
+    fields={RECORDING: RAW_RECORDING_FIELDS, VEHICLES: RAW_VEHICLES_FIELDS, TRACKS: RAW_TRACKS_FIELDS},
+    raw={RECORDING: RAW_HIGHD_RECORDING, VEHICLES: RAW_HIGHD_VEHICLES, TRACKS: RAW_HIGHD_TRACKS},
+    choices={VEHICLES: {"class": ("car", "truck")}},
+)
+
 FIRST_FRAME = 1
-"""Frames count from 1, so time_s = 0 there even where the first vehicle comes later."""
+"""Number of a recording's first frame, where time_s = 0 even if the first vehicle appears later."""
 
 CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
-
-_Set = tuple[tuple[str, str], dict[str, RawFile]]
-"""Folder and number; files by dialect."""
-
-
-def detect(head: bytes, _name: str) -> str | None:
-    """Recognise one of the three files by its header."""
-    line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
-    header = tuple(field.strip().strip('"') for field in line.split(","))
-    return next((dialect for dialect, fields in FIELDS.items() if header == fields), None)
-
-
-def group(files: Sequence[RawFile]) -> Grouping:
-    """Gather each recording's three files by folder and number (`NN_tracks.csv`); incomplete ones are refused.
-
-    An archive is a folder. What is incomplete there is gathered once more by the folder that the archive lies in, so
-    that three archives of one file each are a recording too. Of two files of one kind the one that is named as shipped
-    is taken and the other refused.
-    """
-    together, refusals = gather_sets(files, lambda file: file.folder)
-    scattered = [file for _, found in together if len(found) < len(FIELDS) for file in found.values()]
-    beside, more_refusals = gather_sets(scattered, lambda file: str(file.path.parent))
-    together = [*(each for each in together if len(each[1]) == len(FIELDS)), *beside]
-    refusals += more_refusals
-    units: list[Unit] = []
-    for (_, digits), found in sorted(together, key=lambda each: each[0][::-1]):
-        recording = f"{int(digits):02d}"
-        missing = [f"{digits}_{_kind(dialect)}.csv" for dialect in FIELDS if dialect not in found]
-        there = ", ".join(file.name for file in found.values())
-        if missing:
-            refusals.append(
-                f"recording {recording}: {' and '.join(missing)} missing beside {there}. A highD recording needs its "
-                "three files in one folder; put the missing one there and run again."
-            )
-        elif any(unit.recording == recording for unit in units):
-            refusals.append(
-                f"recording {recording}: a second set of files ({there}); the first was taken. Remove one of them."
-            )
-        else:
-            units.append(Unit((found[RECORDING], found[VEHICLES], found[TRACKS]), recording))
-    return Grouping(tuple(units), tuple(refusals))
-
-
-def gather_sets(files: Sequence[RawFile], folder_of: Callable[[RawFile], str]) -> tuple[list[_Set], list[str]]:
-    """Files by folder and number, then by dialect; and messages about those that have no place."""
-    gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
-    refusals = []
-    for file in sorted(files, key=lambda file: (not _is_named_as_shipped(file), file.name)):
-        number = re.match(r"(\d+)_", file.filename)
-        if number is None:
-            refusals.append(
-                f"{file.name}: has the columns of a highD {_kind(file.dialect)} file, but its name does not begin with "
-                f"the recording's number. Expected `NN_{_kind(file.dialect)}.csv`, as shipped; rename it."
-            )
-            continue
-        found = gathered.setdefault((folder_of(file), number.group(1)), {})
-        if file.dialect in found:
-            refusals.append(
-                f"{file.name}: a second {_kind(file.dialect)} file of recording {number.group(1)} beside "
-                f"{found[file.dialect].name}, which was taken. Expected one; remove one of the two."
-            )
-            continue
-        found[file.dialect] = file
-    return list(gathered.items()), refusals
-
-
-def _is_named_as_shipped(file: RawFile) -> bool:
-    return PurePosixPath(file.filename).stem.endswith(_kind(file.dialect))
-
-
-def _kind(dialect: str) -> str:
-    return dialect.removeprefix("highd-")
+"""Carriageways by drivingDirection."""
 
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
@@ -121,128 +44,52 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
 
     Args:
         parts: recordingMeta, tracksMeta, tracks, in this order.
-        recording: its name, the number in the files' names.
+        recording: name of the recording, the number in the files' names.
     """
-    meta_file, vehicles_file, tracks_file = (part.file for part in parts)
-    meta_rows, vehicles, tracks = (_read(part.file) for part in parts)
-    meta = _only_row(meta_rows, meta_file)
-    _check_number(meta, meta_file, recording)
-    if tracks.frame.is_empty():
-        raise SourceError(
-            f"{tracks_file.name}: no readable row. Expected {','.join(RAW_TRACKS_FIELDS[:4])}, ... in each."
-            f"{_first_reject(tracks.rejects)} Restore the original file."
-        )
-    rejected = [
-        Part(part.file, rejects=chunk.rejects) for part, chunk in zip(parts, (meta_rows, vehicles, tracks), strict=True)
-    ]
-    parsed = [chunk.frame.height for chunk in (meta_rows, vehicles, tracks)]
-    entries, again = split_duplicates(tracks.frame.with_columns(pl.lit(2, pl.Int64).alias(FILE)), ["id", "frame"])
-    del tracks  # the largest recordings have two million rows: no frame of theirs is kept longer than it is used
-    entries, conflicts = split_conflicts(entries)
-    known, known_again = _unique_vehicles(vehicles.frame, vehicles_file)
-    entries, strangers = split_strangers(entries, known, tracks_file, vehicles_file)
-    markings = {
-        UPPER: _markings(meta["upperLaneMarkings"], meta_file),
-        LOWER: _markings(meta["lowerLaneMarkings"], meta_file),
-    }
-    entries = add_directions(entries, known)
-    entries, impossible = split_impossible(entries, *(len(marked) - 1 for marked in markings.values()))
-    dropped = [(known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT)]
-    dropped += [(strangers, STRANGER), *impossible]
-    log, rejects = account("highd", recording, rejected, parsed, dropped)
     files = [part.file for part in parts]
+    read, entries = HIGHD_FORMAT.read_recording(parts, recording)
+    markings = _read_markings(read.meta, files[0])
+    entries = add_directions(entries, read.vehicles)
+    entries, impossible = split_impossible(entries, *(len(marked) - 1 for marked in markings.values()))
+    dropped = [*read.dropped, *impossible]
+    log, rejects = account_rows("highd", recording, read.parts, read.rows_parsed, dropped)
     carriageways = {direction: entries.filter(pl.col(DIRECTION) == direction) for direction in CARRIAGEWAYS}
-    del entries
+    del entries, dropped, impossible
     subsets = [
-        _to_subset(carriageways.pop(direction), known, direction, recording, meta, markings, files)
+        _to_subset(carriageways.pop(direction), read.vehicles, direction, recording, read.meta, markings, files)
         for direction in CARRIAGEWAYS
     ]
     found = tuple(subset for subset in subsets if subset is not None)
-    whole = compare("highd", recording, found, _announced(meta, known), log.filter(pl.col("dialect") == TRACKS))
-    return Canonical(found, log, rejects, whole.table, whole.notes)
+    of_tracks = log.filter(pl.col("dialect") == HIGHD_FORMAT.name_dialect(TRACKS))
+    completeness = compare_counts("highd", recording, found, _list_announced(read.meta, read.vehicles), of_tracks)
+    return Canonical(found, log, rejects, completeness.table, completeness.notes)
 
 
 def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:
-    """Read what recordingMeta and tracksMeta say.
+    """Read recordingMeta and tracksMeta.
 
     Args:
-        files: by dialect; the tracks are not read.
-        recording: its name, the number in the files' names.
+        files: the recording's files by kind; tracks are not read.
+        recording: name of the recording, the number in the files' names.
 
     Returns:
         The row of recordingMeta; lanes by driving direction; the rows of tracksMeta, one per vehicle.
 
     Raises:
-        SourceError: a file cannot be read, or is of another recording.
+        SourceError: a file cannot be read or belongs to another recording.
     """
-    meta = _only_row(_read(files[RECORDING]), files[RECORDING])
-    _check_number(meta, files[RECORDING], recording)
+    meta, vehicles = HIGHD_FORMAT.read_metadata(files, recording)
+    markings = _read_markings(meta, files[RECORDING])
+    return meta, {direction: len(marked) - 1 for direction, marked in markings.items()}, vehicles
+
+
+def _read_markings(meta: dict[str, Any], file: RawFile) -> dict[int, list[float]]:
+    """Parse y of the lane markings, by driving direction, in m from the image's top."""
     columns = {UPPER: "upperLaneMarkings", LOWER: "lowerLaneMarkings"}
-    lanes = {side: len(_markings(meta[column], files[RECORDING])) - 1 for side, column in columns.items()}
-    vehicles, _ = _unique_vehicles(_read(files[VEHICLES]).frame, files[VEHICLES])
-    return meta, lanes, vehicles
+    return {direction: _parse_markings(meta[column], file) for direction, column in columns.items()}
 
 
-def _check_number(meta: dict[str, Any], file: RawFile, recording: str) -> None:
-    if f"{meta['id']:02d}" != recording:
-        raise SourceError(
-            f"{file.name}, line 2: expected id {int(recording)}, as the file's name says, got {meta['id']}. "
-            "Two recordings' files are mixed; restore the originals."
-        )
-
-
-def _read(file: RawFile) -> Chunk:
-    raw = RAW[file.dialect]
-    layout = _layout(file.dialect, raw)
-    chunks = list(read_chunks(file, layout))
-    if not chunks:
-        raise SourceError(
-            f"{file.name}: empty. Expected the header {','.join(layout.names[:4])}, ... and rows under it."
-        )
-    frame = pl.concat([chunk.frame for chunk in chunks]).select(*raw.dtypes)
-    rejects = pl.concat([chunk.rejects for chunk in chunks])
-    return Chunk(raw.validate(frame, where=file.name), rejects, sum(chunk.rows_read for chunk in chunks))
-
-
-def _layout(dialect: str, raw: Table) -> Layout:
-    wanted = [name for name in raw.dtypes if name != LINE]
-    return Layout(
-        names=FIELDS[dialect],
-        dtypes={name: raw.dtypes[name] for name in wanted},
-        required=raw.required & set(wanted),
-        bounds={name: limits for name, limits in raw.bounds.items() if name != LINE},
-        choices={"class": ("car", "truck")} if dialect == VEHICLES else {},
-    )
-
-
-def _only_row(meta: Chunk, file: RawFile) -> dict[str, Any]:
-    if meta.frame.height != 1:
-        why = _first_reject(meta.rejects)
-        raise SourceError(
-            f"{file.name}: expected one readable row under the header, got {meta.frame.height}.{why} "
-            "Restore the original file."
-        )
-    return meta.frame.row(0, named=True)
-
-
-def _first_reject(rejects: pl.DataFrame) -> str:
-    return "".join(f" Line {line} cannot be read: {reason}." for line, reason, _ in rejects.head(1).rows())
-
-
-def _unique_vehicles(vehicles: pl.DataFrame, file: RawFile) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Vehicles with one row each, and exact repetitions of those rows."""
-    unique, again = split_duplicates(vehicles.with_columns(pl.lit(1, pl.Int64).alias(FILE)), ["id"])
-    twice = unique.filter(~pl.col("id").is_first_distinct())
-    if not twice.is_empty():
-        first = twice.row(0, named=True)
-        raise SourceError(
-            f"{file.name}, line {first[LINE]}: a second, different row of vehicle {first['id']}. Expected one row per "
-            "vehicle; restore the original file."
-        )
-    return unique, again
-
-
-def _markings(text: str, file: RawFile) -> list[float]:
+def _parse_markings(text: str, file: RawFile) -> list[float]:
     try:
         values = [float(value) for value in text.split(";")]
     except ValueError:
@@ -266,24 +113,17 @@ def _to_subset(
 ) -> Subset | None:
     if entries.is_empty():
         return None
-    mine = vehicles.filter(pl.col(DIRECTION) == direction)
     upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)
     entries = orient_highd(entries, direction, upper_m, lower_m).select(
-        "frame",
-        "x_m",
-        "y_m",
-        "lane",
-        "speed_mps",
-        "accel_mps2",
-        "lateral_speed_mps",
+        *("frame", "x_m", "y_m", "lane", "speed_mps", "accel_mps2", "lateral_speed_mps"),
         vehicle_id="id",
         leader_id=leader.then(pl.col("precedingId")),
         follower_id=pl.when(pl.col("followingId") != 0).then(pl.col("followingId")),
         headway_recorded_m=leader.then(pl.col("dhw")),
     )
-    sizes = mine.select(
+    sizes = vehicles.filter(pl.col(DIRECTION) == direction).select(
         pl.col("class").str.to_lowercase(),
         vehicle_id="id",
         source_vehicle_id="id",
@@ -315,8 +155,8 @@ def _to_subset(
     )
 
 
-def _announced(meta: dict[str, Any], vehicles: pl.DataFrame) -> Announced:
-    """What recordingMeta and tracksMeta say that the tracks hold."""
+def _list_announced(meta: dict[str, Any], vehicles: pl.DataFrame) -> Announced:
+    """List the counts that recordingMeta and tracksMeta announce."""
     return Announced(
         totals={"vehicles": meta["numVehicles"], "cars": meta["numCars"], "trucks": meta["numTrucks"]},
         totals_by=RECORDING_META,
@@ -333,9 +173,9 @@ HIGHD = Source(
     licence="non-commercial, on request from levelXdata (highd-dataset.com)",
     citation="Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset. IEEE ITSC. "
     "doi.org/10.1109/ITSC.2018.8569552",
-    looks_like="highD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with the headers as shipped",
+    signature="highD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with the headers as shipped",
     version=1,
-    detect=detect,
-    group=group,
+    detect=HIGHD_FORMAT.detect,
+    group=HIGHD_FORMAT.group,
     to_canonical=to_canonical,
 )

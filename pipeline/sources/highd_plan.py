@@ -1,23 +1,24 @@
-"""highD's subsets as its metadata describe them, to plan a split before any track has been read."""
+"""highD's subsets from the metadata files alone, to plan a split before any track has been read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import polars as pl
 
-from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, RECORDING, VEHICLES, gather_sets, read_metadata
+from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, HIGHD_FORMAT, read_metadata
+from tracklake.pipeline.sources.levelx import RECORDING, VEHICLES
 from tracklake.pipeline.sources.source import RawFile, SourceError
 from tracklake.pipeline.transforms.splits.tables import COLUMNS
 
 
 @dataclass(frozen=True)
 class Announcement:
-    """What metadata say of the subsets.
+    """The subsets that metadata files announce.
 
     Args:
-        subsets: one row per carriageway with vehicles: the columns of `split_tables.COLUMNS`, `recording`, `lanes`
+        subsets: one row per carriageway with vehicles: the columns of `splits.tables.COLUMNS`, `recording`, `lanes`
             and `seconds`. `weight` is the sum of numFrames.
-        refusals: messages about recordings that cannot be planned with.
+        refusals: messages about recordings that cannot be used.
     """
 
     subsets: pl.DataFrame
@@ -25,38 +26,34 @@ class Announcement:
 
 
 def announce_subsets(files: Sequence[RawFile]) -> Announcement:
-    """Read recordingMeta and tracksMeta of every recording; tracks are not opened, and need not be there.
-
-    Args:
-        files: recognised as highD's.
+    """Read recordingMeta and tracksMeta of every recording among highD's files; tracks may be missing.
 
     Raises:
         SourceError: none of them is a recordingMeta or tracksMeta file.
     """
-    wanted = [file for file in files if file.dialect in (RECORDING, VEHICLES)]
+    wanted = [file for file in files if HIGHD_FORMAT.find_kind(file) in (RECORDING, VEHICLES)]
     if not wanted:
         raise SourceError(
             "no metadata of highD there. Expected NN_recordingMeta.csv and NN_tracksMeta.csv with the headers as "
             f"shipped, got {len(files)} other file(s) of highD. Give the folder with the downloads, unpacked or not."
         )
-    sets, refusals = gather_sets(wanted, lambda file: file.folder)
+    sets, refusals = HIGHD_FORMAT.gather_sets(wanted, lambda file: file.folder)
     rows: list[dict[str, object]] = []
     seen: set[str] = set()
     for (_, digits), found in sorted(sets, key=lambda each: each[0][::-1]):
         recording = f"{int(digits):02d}"
-        kinds = {RECORDING: "recordingMeta", VEHICLES: "tracksMeta"}
-        missing = [f"{digits}_{kind}.csv" for dialect, kind in kinds.items() if dialect not in found]
-        there = ", ".join(file.name for file in found.values())
+        missing = [f"{digits}_{kind}.csv" for kind in (RECORDING, VEHICLES) if kind not in found]
+        present = ", ".join(file.name for file in found.values())
         if missing:
             refusals.append(
-                f"recording {recording}: {missing[0]} missing beside {there}. A plan needs both files in one folder; "
+                f"recording {recording}: {missing[0]} missing beside {present}. A plan needs both files in one folder; "
                 "put the missing one there and run again."
             )
         elif recording in seen:
-            refusals.append(f"recording {recording}: a second set of files ({there}); the first was taken.")
+            refusals.append(f"recording {recording}: a second set of files ({present}); the first was used.")
         else:
             try:
-                rows += _describe(found, recording)
+                rows += _describe_carriageways(found, recording)
                 seen.add(recording)
             except SourceError as damage:
                 refusals.append(str(damage))
@@ -64,8 +61,8 @@ def announce_subsets(files: Sequence[RawFile]) -> Announcement:
     return Announcement(pl.DataFrame(rows, schema=schema), tuple(refusals))
 
 
-def _describe(files: dict[str, RawFile], recording: str) -> list[dict[str, object]]:
-    """One row per carriageway of a recording."""
+def _describe_carriageways(files: dict[str, RawFile], recording: str) -> list[dict[str, object]]:
+    """Describe the carriageways of a recording, a row each."""
     meta, lanes, vehicles = read_metadata(files, recording)
     rows: list[dict[str, object]] = []
     for direction, side in CARRIAGEWAYS.items():

@@ -7,13 +7,12 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account, split_duplicates
-from tracklake.pipeline.sources.assemble import assemble_subset
-from tracklake.pipeline.sources.completeness import Announced, compare
-from tracklake.pipeline.sources.csv.lines import REJECT_SCHEMA, Chunk, map_chunks
-from tracklake.pipeline.sources.csv.raw_files import LINE, read_head
+from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account_rows, split_duplicates
+from tracklake.pipeline.sources.assembly import assemble_subset
+from tracklake.pipeline.sources.completeness import Announced, compare_counts
+from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, Chunk, map_chunks, read_head
 from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
-from tracklake.pipeline.sources.ngsim_dialects import SITES, Site, detect, layout_of, name_recording, site_of
+from tracklake.pipeline.sources.ngsim_dialects import SITES, Site, build_layout, detect, find_site, name_recording
 from tracklake.pipeline.sources.source import (
     Canonical,
     Grouping,
@@ -34,19 +33,19 @@ from tracklake.schemas.raw_ngsim import RAW_NGSIM
 FRAME_RATE_HZ = 10.0
 CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
 DECIMALS = 6
-"""To which measurements are rounded. The originals have three; files that passed through a program's binary numbers say
-27.125999999999998 for 27.126, and are to give the same tables and to be recognised as repetitions."""
+"""Decimals that measurements are rounded to. The originals have three; files rewritten by other programs hold
+27.125999999999998 for 27.126, and must give the same tables and be recognised as repetitions."""
 
 CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
-"""The same in all rows of one vehicle, so that they tell apart vehicles that share an id."""
+"""Columns that are equal in all rows of one vehicle, so they distinguish vehicles that share an id."""
 
 PARSING_THREADS = 3
-"""Chunks of one file worked on at once: more help little, as the parser has threads of its own, and cost memory."""
+"""Chunks of one file parsed at once; more threads cost memory and help little, since the parser is threaded too."""
 
-MOST_RECORDINGS = 200
-"""If these do not hold half of a file's rows, Global_Time and Frame_ID tell no recordings apart. (Known are nine.)"""
+MAX_RECORDINGS = 200
+"""Most recordings a file may hold: if the largest ones do not have half of its rows, times or frames are wrong."""
 
-FED_BY = {
+FILLED_BY = {
     "Lane_ID": ("lane",),
     "v_Acc": ("accel_mps2",),
     "v_length": ("gap_m",),
@@ -54,24 +53,21 @@ FED_BY = {
     "Following": ("follower_id",),
     "Space_Headway": ("headway_recorded_m",),
 }
-"""Columns of tracks that are null where a raw column is missing."""
+"""Columns of tracks that are null if a raw column is missing."""
 
 
 def group(files: Sequence[RawFile]) -> Grouping:
-    """One unit per file: what recordings it holds is known only from its rows."""
+    """Make one unit of each file: only its rows tell which recordings it holds."""
     return Grouping(tuple(Unit((file,)) for file in files))
 
 
-def spill(file: RawFile, folder: Path) -> Spilled:
-    """Read a file chunk by chunk into a folder per recording.
+def spill_file(file: RawFile, folder: Path) -> Spilled:
+    """Read a file of any NGSIM dialect chunk by chunk into a folder per recording.
 
-    Recordings are told apart by Global_Time - 100 * Frame_ID, which is constant in each.
-
-    Args:
-        file: any NGSIM dialect.
-        folder: receives `<recording>/<chunk>.arrow` with the columns of schemas.RAW_NGSIM, less Location.
+    Global_Time - 100 * Frame_ID is constant within a recording and identifies it. Rows go to
+    `<folder>/<recording>/<chunk>.arrow` with the columns of schemas.RAW_NGSIM without Location.
     """
-    layout = layout_of(read_head(file), file.dialect, where=file.name)
+    layout = build_layout(read_head(file), file.dialect, where=file.name)
     absent = [
         pl.lit(None, dtype).alias(name)
         for name, dtype in RAW_NGSIM.dtypes.items()
@@ -82,12 +78,12 @@ def spill(file: RawFile, folder: Path) -> Spilled:
         counts: Counter[str] = Counter()
         raw = RAW_NGSIM.validate(chunk.frame.with_columns(absent).select(*RAW_NGSIM.dtypes), where=file.name)
         for share, (recording, rows) in enumerate(
-            _part_recordings(raw.with_columns(pl.col(pl.Float64).round(DECIMALS)))
+            _split_recordings(raw.with_columns(pl.col(pl.Float64).round(DECIMALS)))
         ):
             counts[recording] += rows.height
             target = folder / recording
             target.mkdir(parents=True, exist_ok=True)
-            # Plain Arrow costs a quarter of the time of compressed Parquet, and lives no longer than the run.
+            # Plain Arrow takes a quarter of the time of compressed Parquet; the files are deleted after the run.
             rows.write_ipc(target / f"{number:06d}-{share:06d}.arrow", compression="uncompressed")
         _require_constant_keys(counts, file)
         return counts, chunk.rejects, chunk.rows_read
@@ -100,23 +96,22 @@ def spill(file: RawFile, folder: Path) -> Spilled:
 
 
 def _require_constant_keys(counts: Counter[str], file: RawFile) -> None:
-    """Refuse a file in which nearly every row has a key of its own, for its times or frames are not what they say.
+    """Refuse a file in which nearly every row has a key of its own, since its times or frames are wrong.
 
-    Single rows with a damaged time make recordings of their own; that many rows of a file have one is what a rounded
-    Global_Time or swapped columns do.
+    A row with a damaged time is a recording of its own; many such rows mean a rounded Global_Time or swapped columns.
     """
-    if 2 * sum(rows for _, rows in counts.most_common(MOST_RECORDINGS)) < counts.total():
+    if 2 * sum(rows for _, rows in counts.most_common(MAX_RECORDINGS)) < counts.total():
         raise SourceError(
             f"{file.name}: {len(counts):,} recordings by Global_Time - 100 * Frame_ID in {counts.total():,} rows. "
-            f"Expected the same number in all rows of a recording, and no more than {MOST_RECORDINGS} recordings in a "
+            f"Expected the same number in all rows of a recording, and no more than {MAX_RECORDINGS} recordings in a "
             "file. Global_Time was rounded or columns are swapped; restore the original file."
         )
 
 
-def _part_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
-    """(recording, its rows); once more for another spelling of the site.
+def _split_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Yield (recording, its rows), again for each spelling of the site.
 
-    Not every dialect says the site; the recording's name does, so that rows which differ only in that are repetitions.
+    Only some dialects have the site, so the column is dropped: rows that differ only in it are repetitions.
     """
     rows = rows.with_columns(key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64))
     for part in rows.partition_by("key", "Location"):
@@ -125,12 +120,7 @@ def _part_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
 
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
-    """Turn the spilled rows of one recording into its tables.
-
-    Args:
-        parts: the shares of every file that holds the recording.
-        recording: its name.
-    """
+    """Turn the spilled rows of one recording, a part per file that holds some of it, into its tables."""
     shares = [
         part.rows.collect().with_columns(pl.lit(index, pl.Int64).alias(FILE))
         for index, part in enumerate(parts)
@@ -140,8 +130,8 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     raw, derived = split_derived(raw, shares, ["Vehicle_ID", "Frame_ID", "Local_X", "Local_Y"])
     rows, duplicates = split_duplicates(raw, ["Vehicle_ID", "Frame_ID"])
     dropped = [(derived, IN_FULLER_FILE), (duplicates, DUPLICATE)]
-    log, rejects = account("ngsim", recording, parts, [share.height for share in shares], dropped)
-    site_name = site_of(recording)
+    log, rejects = account_rows("ngsim", recording, parts, [share.height for share in shares], dropped)
+    site_name = find_site(recording)
     one_direction = rows["Direction"].is_null().all()
     site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", None, (), "")
     first_frame, last_frame = rows.select(first=pl.col("Frame_ID").min(), last=pl.col("Frame_ID").max()).row(0)
@@ -170,20 +160,17 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             subsets.append(_to_subset(entries, f"{recording}-{direction}", oriented_as, facts, files))
     totals = PUBLISHED_TOTALS.get(recording, {})
     announced = Announced(totals, totals_by=PUBLISHED, vehicles=None, vehicles_by=TOTAL_FRAMES)
-    whole = compare("ngsim", recording, subsets, announced, log)
-    return Canonical(tuple(subsets), log, rejects, whole.table, (*_remark(subsets), *whole.notes))
+    completeness = compare_counts("ngsim", recording, subsets, announced, log)
+    notes = (*_describe_subsets(subsets), *completeness.notes)
+    return Canonical(tuple(subsets), log, rejects, completeness.table, notes)
 
 
 def _to_subset(
     rows: pl.DataFrame, name: str, direction: int | None, facts: dict[str, Any], files: Sequence[RawFile]
 ) -> Subset:
-    missing = {column for raw, fed in FED_BY.items() if rows[raw].is_null().all() for column in fed}
+    missing = {column for raw, filled in FILLED_BY.items() if rows[raw].is_null().all() for column in filled}
     entries = orient_ngsim(rows, direction).select(
-        *CONSTANTS,
-        "x_m",
-        "y_m",
-        "speed_mps",
-        "accel_mps2",
+        *(*CONSTANTS, "x_m", "y_m", "speed_mps", "accel_mps2"),
         source_id="Vehicle_ID",
         frame="Frame_ID",
         lane="Lane_ID",
@@ -218,14 +205,15 @@ def _to_subset(
     )
 
 
-def _remark(subsets: Sequence[Subset]) -> list[str]:
+def _describe_subsets(subsets: Sequence[Subset]) -> list[str]:
+    """Describe split ids and missing columns, a note each."""
     notes = []
     for subset in subsets:
         facts = subset.facts.row(0, named=True)
         if facts["ids_split"]:
             notes.append(f"{subset.name}: {facts['ids_split']} ids stood for more than one vehicle and were split")
         if facts["columns_missing"]:
-            # Lanes are what samples, and with them splits and tensors, cannot be made without.
+            # Samples, and with them splits and tensors, need lanes.
             missing = facts["columns_missing"]
             stages = "; no samples, split or tensors without lane" if "lane" in missing else ""
             notes.append(f"{subset.name}: the files have no {', '.join(missing)}; those columns are null{stages}")
@@ -238,11 +226,11 @@ NGSIM = Source(
     licence="public domain (U.S. Department of Transportation)",
     citation="U.S. Department of Transportation Federal Highway Administration (2016). Next Generation Simulation "
     "(NGSIM) Vehicle Trajectories and Supporting Data. doi.org/10.21949/1504477",
-    looks_like="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
+    signature="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
     "Global_Time, Local_X, Local_Y, v_Vel",
     version=2,
     detect=detect,
     group=group,
     to_canonical=to_canonical,
-    spill=spill,
+    spill=spill_file,
 )

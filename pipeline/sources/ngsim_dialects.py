@@ -1,12 +1,11 @@
-"""NGSIM's dialects as data: which fields a file has, what it calls them, and how its recordings are named."""
+"""NGSIM's dialects as data: the fields of a file, their names, and the names of recordings."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from zoneinfo import ZoneInfo
 
-from tracklake.pipeline.sources.csv.lines import UNNAMED, Layout
-from tracklake.pipeline.sources.csv.raw_files import LINE
+from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Layout
 from tracklake.pipeline.sources.source import SourceError
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
@@ -15,7 +14,7 @@ TEXT_FIELDS = (
     *("v_length", "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID"),
     *("Preceding", "Following", "Space_Headway", "Time_Headway"),
 )
-"""The 18 fields of the original text files, in order."""
+"""Fields of the original text files, in order."""
 
 EXPORT_FIELDS = (
     *TEXT_FIELDS[:14],
@@ -23,7 +22,7 @@ EXPORT_FIELDS = (
     *TEXT_FIELDS[14:],
     "Location",
 )
-"""The 25 columns of the portal's export, in order."""
+"""Columns of the portal's export, in order."""
 
 ALIASES = {
     "tot_frames": "Total_Frames",
@@ -43,7 +42,7 @@ ALIASES = {
     "headway": "Time_Headway",
     **{name.lower(): name for name in EXPORT_FIELDS},
 }
-"""Every name a header has used, in lower case, and what the raw schema calls it."""
+"""Names that headers use, in lower case, and the raw schema's name of each."""
 
 LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
 ESSENTIAL = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel")
@@ -52,15 +51,15 @@ TEXT, CSV = "ngsim-text", "ngsim-csv"
 
 @dataclass(frozen=True)
 class Site:
-    """A place NGSIM recorded.
+    """A recording site of NGSIM.
 
     Args:
-        name: as in Location.
-        freeway: or an arterial with several directions.
-        direction: of travel on a freeway.
-        lanes: main lanes of a freeway.
+        name: value of Location.
+        freeway: whether it is a freeway; else an arterial with several directions.
+        direction: direction of travel on a freeway.
+        lanes: number of main lanes of a freeway.
         on_ramp_lanes: lanes that are on-ramps.
-        day: on which it was recorded, local date.
+        day: local date of the recordings.
     """
 
     name: str
@@ -92,9 +91,9 @@ RECORDINGS = {
     1163018600: "peachtree-1245",
     1163030300: "peachtree-1600",
 }
-"""Published recordings by Global_Time - 100 * Frame_ID, named by site and scheduled start, local time.
+"""Published recordings by Global_Time - 100 * Frame_ID, named by site and scheduled local start time.
 
-Peachtree's clock counts seconds since 1970 (shifted by a time zone) yet advances by 100 a frame: its keys lie 11,700
+Peachtree's clock counts seconds since 1970 (shifted by a time zone) but advances by 100 a frame: its keys are 11,700
 apart, the 3 h 15 min between its two periods.
 """
 
@@ -104,10 +103,10 @@ _LOCAL = ZoneInfo("America/Los_Angeles")
 
 @cache
 def name_recording(key: int, location: str | None) -> str:
-    """The recording of a Global_Time - 100 * Frame_ID; its name begins with its site's.
+    """Name the recording of a Global_Time - 100 * Frame_ID; the name begins with the site's.
 
-    Unknown keys are a recording of their own, named by site, local date and local time of frame 1. Where the file does
-    not say the site, it is the one that was recorded on that day, else `unknown`.
+    A key that is not published is a recording of its own, named by site, local date and local time of frame 1. If the
+    file has no site, it is the one recorded on that day, else `unknown`.
     """
     if key in RECORDINGS:
         return RECORDINGS[key]
@@ -119,12 +118,12 @@ def name_recording(key: int, location: str | None) -> str:
     by_day = {site.day: site.name for site in SITES.values()}
     site = location or by_day.get(f"{start:%Y-%m-%d}", UNKNOWN)
     rest = f"-{start_ms % 1000:03d}" if start_ms % 1000 else ""
-    again = "-again" if start.fold else ""  # the hour that summer time's end repeats
+    again = "-again" if start.fold else ""  # the hour repeated at the end of summer time
     return f"{site}-{start:%Y%m%d-%H%M%S}{rest}{again}"
 
 
-def site_of(recording: str) -> str:
-    """The site that a recording's name begins with."""
+def find_site(recording: str) -> str:
+    """Find the site that a recording's name begins with."""
     return next((site for site in SITES if recording.startswith(f"{site}-")), UNKNOWN)
 
 
@@ -133,7 +132,7 @@ def detect(head: bytes, _name: str) -> str | None:
 
     A header that names the essential columns, or a line of 18 numbers: separated by commas, or by blanks.
     """
-    lines = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", errors="replace").splitlines()[:25]
+    lines = head.removeprefix(BOM).decode("utf-8", errors="replace").splitlines()[:25]
     if not lines:
         return None
     header = _canonical_names(lines[0])
@@ -144,26 +143,21 @@ def detect(head: bytes, _name: str) -> str | None:
     return TEXT if any(_are_numbers(line.split()) for line in lines) else None
 
 
-def layout_of(head: bytes, dialect: str, *, where: str) -> Layout:
-    """How to read a file of a dialect, given its first bytes.
-
-    Args:
-        head: the first bytes.
-        dialect: as detected.
-        where: the file's name, for the message.
+def build_layout(head: bytes, dialect: str, *, where: str) -> Layout:
+    """Build the layout of a file of a dialect from its first bytes; `where` names the file in the message.
 
     Raises:
         SourceError: two columns have one meaning.
     """
     if dialect == CSV:
-        line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace")
-        names = _tell_apart(_canonical_names(line), where)
+        line = head.removeprefix(BOM).split(b"\n", 1)[0].decode("utf-8", errors="replace")
+        names = _make_unique(_canonical_names(line), where)
     else:
         names = TEXT_FIELDS
     wanted = [name for name in RAW_NGSIM.columns if name in names and name != LINE]
-    # Every vehicle has a size, a lane and a place in the queue, so where a file has those columns no cell is empty.
-    # The last field tells a cut line from a whole one, so it may not be empty even where the schema would let it.
-    # (Direction may: freeways have none.)
+    # Every vehicle has a size, a lane and neighbors or 0, so no cell of those columns is empty if a file has them.
+    # The last field shows that a line is whole, so it may not be empty even if the schema allows it.
+    # Direction may be empty: freeways have none.
     required = (RAW_NGSIM.required | set(TEXT_FIELDS) | {names[-1]}) & set(wanted) - {"Direction"}
     if dialect != CSV:
         required = frozenset(wanted)
@@ -171,7 +165,7 @@ def layout_of(head: bytes, dialect: str, *, where: str) -> Layout:
         names=names,
         dtypes={name: RAW_NGSIM.dtypes[name] for name in wanted},
         required=required,
-        # The portal's export has them in five columns; no number is refused for having them in another.
+        # The portal's export has them in five columns; other columns may have them too.
         thousands=frozenset(name for name in wanted if dialect == CSV and RAW_NGSIM.dtypes[name].is_numeric()),
         bounds={name: limits for name, limits in RAW_NGSIM.bounds.items() if name in wanted},
         choices={"Location": LOCATIONS} if "Location" in names else {},
@@ -185,8 +179,8 @@ def _canonical_names(line: str) -> list[str]:
     return [ALIASES.get(name.lower(), name) for name in names]
 
 
-def _tell_apart(names: list[str], where: str) -> tuple[str, ...]:
-    """Unique names: those of no meaning here are numbered where they are missing, repeated or ours."""
+def _make_unique(names: list[str], where: str) -> tuple[str, ...]:
+    """Make names unique: unknown fields are numbered if their name is missing, repeated or reserved."""
     taken = {LINE, ""}
     unique = []
     for number, name in enumerate(names, start=1):

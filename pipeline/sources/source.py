@@ -1,4 +1,4 @@
-"""What a dataset's source is: data and a few functions, listed in an explicit registry."""
+"""A dataset's source: data and a few functions, listed in an explicit registry."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,11 +20,11 @@ class RawFile:
     """A raw file: one in a folder, or a member of a zip archive.
 
     Args:
-        path: where it is, or the archive that holds it.
-        name: as tables and messages call it: relative to the folder given; a member's begins with its archive's.
-        dialect: how its source reads it; empty until it is recognised.
-        sha256: of its bytes (a member's own, whatever the archive's are); empty until it is recognised.
-        member: of the archive, as the archive calls it; None where the file stands by itself.
+        path: path of the file, or of the archive that holds it.
+        name: name in tables and messages, relative to SOURCE; a member's name begins with its archive's.
+        dialect: format of its lines; empty until recognised.
+        sha256: hash of its bytes (a member's own, unpacked); empty until recognised.
+        member: name of the member in its archive; None for a file of its own.
     """
 
     path: Path
@@ -35,38 +35,38 @@ class RawFile:
 
     @property
     def folder(self) -> str:
-        """The folder it lies in; an archive is a folder with folders in it."""
-        return str(self._place.parent)
+        """Path of its folder; an archive is a folder with folders in it."""
+        return str(self._full_path.parent)
 
     @property
     def filename(self) -> str:
-        """Its name in its folder."""
-        return self._place.name
+        """Name within its folder, without the path."""
+        return self._full_path.name
 
     @property
-    def _place(self) -> PurePosixPath:
+    def _full_path(self) -> PurePosixPath:
         # Some programs write the folders of an archive with backslashes.
         inside = "" if self.member is None else self.member.replace("\\", "/")
         return PurePosixPath(self.path.as_posix(), inside.lstrip("/"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, fit for a job's inputs or a task's arguments."""
+        """Return plain values for a job's inputs or a task's arguments."""
         return {**asdict(self), "path": str(self.path)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "RawFile":
-        """The file that `to_dict` described."""
+        """Rebuild the file that `to_dict` described."""
         return cls(**{**values, "path": Path(values["path"])})
 
 
 @dataclass(frozen=True)
 class Spilled:
-    """What reading one file that holds several recordings left in the staging folder.
+    """The rows of one file that holds several recordings, left in the staging folder.
 
     Args:
-        recordings: rows by recording; each stands in `<folder>/<recording>/*.arrow`.
-        rows_read: data lines of the file.
-        rejects: `line`, `reason`, `text` of those that belong to no recording.
+        recordings: number of rows by recording; the rows are in `<folder>/<recording>/*.arrow`.
+        rows_read: number of data lines of the file.
+        rejects: `line`, `reason`, `text` of lines that belong to no recording.
     """
 
     recordings: Mapping[str, int]
@@ -80,7 +80,7 @@ class Part:
 
     Args:
         file: the raw file.
-        rows: spilled rows, lazily; None where the source reads the raw file itself.
+        rows: spilled rows; None if the source reads the raw file itself.
         rejects: `line`, `reason`, `text` of rejected lines that can only belong to this recording.
     """
 
@@ -94,10 +94,10 @@ class Subset:
     """One subset in canonical form.
 
     Args:
-        name: of the subset.
-        tracks: frame of schemas.TRACKS, unconformed (dataset and subset come from here).
-        vehicles: frame of schemas.VEHICLES.
-        facts: the row of schemas.SUBSETS, less what follows from the tables themselves.
+        name: name of the subset.
+        tracks: rows of schemas.TRACKS.
+        vehicles: rows of schemas.VEHICLES.
+        facts: the row of schemas.SUBSETS.
     """
 
     name: str
@@ -111,11 +111,11 @@ class Canonical:
     """One recording in canonical form, with every row of its files accounted for.
 
     Args:
-        subsets: the carriageways that have entries.
-        log: one row per file of schemas.INGEST_LOG.
-        rejects: schemas.REJECTS.
-        completeness: schemas.COMPLETENESS.
-        notes: what the reader of the run's output should know.
+        subsets: carriageways that have entries.
+        log: rows of schemas.INGEST_LOG, one per file.
+        rejects: rows of schemas.REJECTS.
+        completeness: rows of schemas.COMPLETENESS.
+        notes: messages for the user.
     """
 
     subsets: tuple[Subset, ...]
@@ -130,8 +130,8 @@ class Unit:
     """Raw files to be read together: a highD recording's three, or one NGSIM file.
 
     Args:
-        files: in the order their source wants them.
-        recording: where the source knows it without reading, else None.
+        files: the files in the order their source expects.
+        recording: name of the recording; None if only the rows tell it.
     """
 
     files: tuple[RawFile, ...]
@@ -140,7 +140,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Grouping:
-    """Recognised files, grouped; and those that cannot be used, each with its message."""
+    """Recognised files in groups, and messages about files that cannot be used."""
 
     units: tuple[Unit, ...]
     refusals: tuple[str, ...] = ()
@@ -148,26 +148,26 @@ class Grouping:
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset: what it is, how its files are recognised, read and made canonical.
+    """A dataset: its description, and the functions that recognise, read and convert its files.
 
     Args:
-        name: of the dataset.
-        title: for people.
-        licence: of the data.
-        citation: to give when using it.
-        looks_like: what its files look like, for messages about unknown files.
-        version: counts changes of what the functions below make of the same bytes.
-        detect: (first bytes, file name) to a dialect, or None.
-        group: recognised files to units.
-        to_canonical: the parts of one recording, and its name, to tables.
-        spill: for files that hold several recordings: read one into a staging folder, a folder per recording.
+        name: name of the dataset.
+        title: full name for people.
+        licence: licence of the data.
+        citation: reference to cite.
+        signature: description of its files, for messages about unknown files.
+        version: number that changes with what the functions below make of the same bytes.
+        detect: function of the first bytes and the file name; returns a dialect or None.
+        group: function that gathers recognised files into units.
+        to_canonical: function of the parts of one recording and its name; returns its tables.
+        spill: function that reads a file of several recordings into a staging folder, a folder per recording.
     """
 
     name: Dataset
     title: str
     licence: str
     citation: str
-    looks_like: str
+    signature: str
     version: int
     detect: Callable[[bytes, str], str | None]
     group: Callable[[Sequence[RawFile]], Grouping]

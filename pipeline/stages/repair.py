@@ -5,7 +5,7 @@ import polars as pl
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
 from tracklake.pipeline.stages.stage import INGEST, Stage
-from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
+from tracklake.pipeline.transforms.starts.late_starts import classify_starts, estimate_missing_starts
 from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, TRACKS, VEHICLE_STARTS, VEHICLES, Table
 
 
@@ -13,7 +13,7 @@ def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]
     """Judge every vehicle's start and estimate what is missing of the late ones."""
     on_ramps = settings.on_ramp_lanes.get(reader.facts["site"], reader.facts["on_ramp_lanes"])
     known = {**reader.partition, **reader.clock}
-    starts, cutoffs = judge_starts(reader.table(VEHICLES), on_ramp_lanes=tuple(on_ramps), **known)
+    starts, cutoffs = classify_starts(reader.table(VEHICLES), on_ramp_lanes=tuple(on_ramps), **known)
     missing = estimate_missing_starts(reader.table(TRACKS), starts, cutoff_m=cutoffs["cutoff_m"][0], **known)
     return {VEHICLE_STARTS: starts, START_CUTOFFS: cutoffs, MISSING_STARTS: missing}
 

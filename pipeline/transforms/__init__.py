@@ -1,1 +1,1 @@
-"""Pure functions, frame in, frame out: no file, no clock, no lake."""
+"""Pure functions from frames to frames, without files, clocks or the lake."""

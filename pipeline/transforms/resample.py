@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from tracklake.schemas.arrays import Integers, find_run_starts
 from tracklake.schemas.errors import TracklakeError
 
 CLOCK_DTYPES: dict[str, pl.DataType] = {
@@ -18,15 +19,14 @@ CLOCK_DTYPES: dict[str, pl.DataType] = {
     "speed_mps": pl.Float32(),
     "segment": pl.Int32(),
 }
-"""What a frame of entries on the clock holds; see `put_on_clock`."""
+"""Columns of entries on the clock; see `put_on_clock`."""
 
 
 def find_stride(*, frame_rate_hz: float, rate_hz: int) -> Fraction:
-    """Frames of the source per tick of the clock, exactly (25 Hz to 10 Hz: 5/2).
+    """Return the number of source frames per tick as a fraction (25 Hz to 10 Hz: 5/2).
 
     Raises:
-        TracklakeError: the clock is faster than the source; positions between frames are interpolated, never
-            multiplied.
+        TracklakeError: the clock is faster than the source.
     """
     stride = Fraction(frame_rate_hz).limit_denominator(1001) / rate_hz
     if stride < 1:
@@ -38,23 +38,23 @@ def find_stride(*, frame_rate_hz: float, rate_hz: int) -> Fraction:
 
 
 def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float, rate_hz: int) -> pl.DataFrame:
-    """Select (or interpolate) the entries on the clock, by frame and never by row (DESIGN section 7).
+    """Select or interpolate the entries on the clock, by frame and never by row (DESIGN section 7).
 
-    Tick k lies at frame `first_frame + k * frame_rate_hz / rate_hz`. Where that is a whole number the source's own
-    entry is taken; where it is not, x_m, y_m and speed_mps are linear between the two frames around it and the lane
-    is that of the earlier one. Both frames must exist: a gap is never bridged.
+    Tick k is at frame `first_frame + k * frame_rate_hz / rate_hz`. If that is a whole number, the source's own entry
+    is used; if not, x_m, y_m and speed_mps are interpolated linearly between the two frames around it and the lane is
+    that of the earlier one. Both frames must exist: a gap is never bridged.
 
     Args:
-        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame. Of y_m, lane
-            and speed_mps those may be left out that the caller does not need.
-        first_frame: the recording's first frame, where tick 0 lies (highD 1, NGSIM whatever it is).
-        frame_rate_hz: the source's.
-        rate_hz: the clock's.
+        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame. y_m, lane and
+            speed_mps are optional.
+        first_frame: first frame of the recording, at tick 0.
+        frame_rate_hz: frame rate of the source.
+        rate_hz: rate of the clock.
 
     Returns:
-        CLOCK_DTYPES, less what `tracks` leaves out, sorted by vehicle_id, tick; `frame` is null where no source frame
-        falls on the tick. `segment` numbers the gap-free runs of source frames, so that ticks are consecutive within a
-        segment. A track that skips a frame starts a new segment even if the clock would not have used that frame.
+        CLOCK_DTYPES without the columns missing in `tracks`, sorted by vehicle_id, tick; `frame` is null if no source
+        frame falls on the tick. `segment` numbers the gap-free runs of source frames, so ticks are consecutive within a
+        segment. A skipped frame starts a new segment even if no tick falls on that frame.
 
     Raises:
         TracklakeError: the clock is faster than the source.
@@ -76,20 +76,20 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
         on_frame = (pl.col("frame").cast(pl.Int64) - first_frame) % frames == 0
         return entries.filter(on_frame).select(columns).collect()
 
-    # The first tick at or after an entry lies `beyond` / `ticks` frames after it: on the entry itself, before the
-    # next frame, or farther (then it belongs to a later entry).
+    # The first tick at or after an entry is `beyond` / `ticks` frames after it: at the entry itself, before the next
+    # frame, or farther (then it belongs to a later entry).
     beyond = pl.col("tick") * frames - position
     on_frame = beyond == 0
     next_is_adjacent = (pl.col("segment") == pl.col("segment").shift(-1)).fill_null(value=False)
     share = beyond / ticks
 
-    def between(name: str) -> pl.Expr:
+    def interpolate(name: str) -> pl.Expr:
         now = pl.col(name).cast(pl.Float64)
         return pl.when(on_frame).then(now).otherwise(now + share * (now.shift(-1) - now)).alias(name)
 
     return (
         entries.with_columns(
-            *(between(name) for name in ("x_m", "y_m", "speed_mps") if name in given),
+            *(interpolate(name) for name in ("x_m", "y_m", "speed_mps") if name in given),
             frame=pl.when(on_frame).then("frame"),
             used=on_frame | ((beyond < ticks) & next_is_adjacent),
         )
@@ -99,33 +99,23 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
     )
 
 
+def join_key(vehicle_id: NDArray[np.integer], frame: NDArray[np.integer]) -> Integers:
+    """Join vehicle and frame (or tick) to one number of the same order; frames may lie some way beyond Int32."""
+    key: Integers = (vehicle_id.astype(np.int64, copy=False) << 32) + frame
+    return key
+
+
 def cut_runs(values: NDArray[np.int32], rows: int) -> list[tuple[int, int]]:
-    """Cut rows into pieces that part no run of equal values.
+    """Cut rows into pieces that split no run of equal values.
 
     Args:
-        values: (N,) segments or ticks; equal ones stand together.
-        rows: of a piece, about; more where a run is longer.
+        values: (N,) segments or ticks; equal ones are consecutive.
+        rows: approximate number of rows of a piece; more if a run is longer.
 
     Returns:
         First row and end (exclusive) of each piece.
     """
-    starts = np.flatnonzero(np.diff(values, prepend=-1))
+    starts = find_run_starts(values)
     runs = np.searchsorted(starts, np.arange(0, values.size, rows), side="right") - 1
     cuts = [int(start) for start in np.unique(starts[runs])]
     return list(zip(cuts, [*cuts[1:], values.size], strict=True)) if cuts else []
-
-
-def bound_segments(clock: pl.DataFrame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and last row of the segment that each row of the clock stands in.
-
-    Args:
-        clock: segment; the rows of a segment stand together, as `put_on_clock` leaves them.
-
-    Returns:
-        Two arrays (N,) of row numbers. Ticks are consecutive within a segment, so rows differ as ticks do.
-    """
-    segment = clock["segment"].to_numpy()
-    starts = np.flatnonzero(np.diff(segment, prepend=segment[:1] - 1))
-    lengths = np.diff(starts, append=segment.size)
-    first = np.repeat(starts, lengths)
-    return first, first + np.repeat(lengths, lengths) - 1

@@ -9,7 +9,7 @@ from highd_files import write_recording
 from raw_texts import EXPORT_NAMES, FIRST_RELEASE_NAMES, TEXT_NAMES, as_csv, as_text, ngsim_row, write
 
 from tracklake.pipeline.ingest.discovery import discover
-from tracklake.pipeline.sources.csv.raw_files import hash_raw
+from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.sources.source import Part
 
 KINDS = ("recordingMeta", "tracksMeta", "tracks")

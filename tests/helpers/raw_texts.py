@@ -7,7 +7,7 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.sources.csv.raw_files import read_head
+from tracklake.pipeline.sources.csv import read_head
 from tracklake.pipeline.sources.highd import HIGHD
 from tracklake.pipeline.sources.ngsim import NGSIM
 from tracklake.pipeline.sources.source import Part, RawFile

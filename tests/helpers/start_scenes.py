@@ -27,7 +27,7 @@ def make_tracks(entries):
 
 
 def summarise(tracks):
-    """The columns of `vehicles` that judge_starts reads."""
+    """The columns of `vehicles` that classify_starts reads."""
     return tracks.group_by("vehicle_id", maintain_order=True).agg(
         first_frame=pl.col("frame").first(),
         last_frame=pl.col("frame").last(),

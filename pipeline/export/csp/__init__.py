@@ -1,1 +1,1 @@
-"""Export in the format of convolutional social pooling."""
+"""Export to the .mat files of convolutional social pooling."""

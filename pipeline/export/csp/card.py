@@ -1,35 +1,35 @@
-"""The card beside exported .mat files: what they hold, what they were made of and with which options."""
+"""The card beside exported .mat files: contents, sources and options."""
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from tracklake.pipeline.export.csp.result import CspExport
 from tracklake.pipeline.transforms.csp.parts import REASONS
 
-if TYPE_CHECKING:
-    from tracklake.pipeline.export.csp.export import CspExport
-
 CARD = "DATA_CARD.md"
+"""Name of the card's file."""
 
 ORIGINAL = """\
-Every value is the one that the original script computes: windows count rows (a gap in a track stretches them), of two
-vehicles in one cell the higher id stands there, the parts are cut at 0.7 and 0.8 of the highest vehicle id of each
-data set, so that vehicles on either side of a cut lose each other as neighbors. Ids are those of the source's files.
-Subsets that validation excludes are in it.
+Every value is the one that the original script computes. Windows count rows, so a gap in a track stretches them. If two
+vehicles share a cell, the one with the higher id fills it. The parts are cut at 0.7 and 0.8 of the highest vehicle id
+of each data set, so vehicles on either side of a cut are not each other's neighbors. Ids are those of the source's
+files. Subsets that validation excludes are included.
 """
 CLEAN = """\
-Made with `--clean`. The arithmetic of labels and samples is the original script's; what differs: entries around which
-a vehicle is missing (late starts), or of vehicles that entered before the road ahead was recorded, are no samples;
-of two vehicles in one cell the nearer stands there and the other in the nearest free cell of its lane; no vehicle
-and no neighbor crosses from part to part: the parts are those of the lake's split where it has a validation part,
-else of one planned for these files, whose TrainSet may hold what the lake evaluates on; subsets that validation
-excludes are left out. A track with a gap, or across a border of the split, is several tracks, of which the later ones
-have ids that no vehicle had.
+Made with `--clean`. Labels and samples are computed as in the original script, with these differences:
+
+- Entries near a missing vehicle (late starts) and entries of vehicles that entered before the road ahead was recorded
+  are no samples.
+- If two vehicles share a cell, the nearer one fills it and the other moves to the nearest free cell of its lane.
+- No vehicle and no neighbor is in two parts. The parts are those of the lake's split if it has a validation part, else
+  of a split planned for these files, whose TrainSet may hold data that the lake evaluates on.
+- Subsets that validation excludes are left out.
+- A track with a gap, or across a border of the split, becomes several tracks; the later ones have new ids.
 """
 
 
-def write_card(path: Path, export: "CspExport") -> None:
-    """Write it; the same export gives the same bytes."""
+def write_card(path: Path, export: CspExport) -> None:
+    """Write the card; the same export gives the same bytes."""
     options = ["--" + name.replace("_", "-") for name in ("clean", "full_future") if getattr(export.options, name)]
     options += [f"--dataset {export.options.dataset}"] if export.options.dataset else []
     lines = [
@@ -46,7 +46,7 @@ def write_card(path: Path, export: "CspExport") -> None:
             for file in export.files
         ),
         "",
-        "Entries of tracks are samples or dropped, for the first reason that applies:",
+        "An entry of a track is a sample, or is dropped for the first reason that applies:",
         "",
         "| reason | " + " | ".join(file.name for file in export.files) + " | meaning |",
         "| --- | " + "---: | " * len(export.files) + "--- |",
@@ -55,19 +55,19 @@ def write_card(path: Path, export: "CspExport") -> None:
         counts = [file.dropped.get(reason, 0) for file in export.files]
         if any(counts):
             lines.append(f"| {reason} | " + " | ".join(f"{count:,}" for count in counts) + f" | {meaning} |")
-    lines += ["", *_tell_left_out(export), "Data sets, by the first column of `traj` and the row of `tracks`:", ""]
+    lines += ["", *_describe_left_out(export), "Data sets, by the first column of `traj` and the row of `tracks`:", ""]
     lines += ["| id | data set | subset | recording |", "| ---: | --- | --- | --- |"]
     lines += [f"| {row['id']} | {row['dataset']} | {row['subset']} | {row['recording']} |" for row in export.datasets]
     lines += ["", COLUMNS, *(f"- note: {note}" for note in export.notes)]
     path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
 
-def _tell_left_out(export: "CspExport") -> list[str]:
+def _describe_left_out(export: CspExport) -> list[str]:
     lines = [f"- {count:,} entries in no file: {REASONS[reason]}" for reason, count in export.left_out.items()]
     if export.options.clean:
         lines.append(
-            f"- {export.collisions:,} neighbors found their cell taken by a nearer one and moved to another, except "
-            f"{export.crowded_out:,} for whom there was none"
+            f"- {export.collisions:,} neighbors shared a cell with a nearer one and moved to another cell, except "
+            f"{export.crowded_out:,} that were dropped since no cell was free"
         )
     else:
         lines.append(f"- {export.overwritten:,} neighbors were overwritten by another one in the same cell")
@@ -77,7 +77,7 @@ def _tell_left_out(export: "CspExport") -> list[str]:
 COLUMNS = """\
 Columns of `traj` (single precision): data set id, vehicle id, frame, x (lateral, ft), y (along the road, ft), lane
 (1 is the driver's leftmost; US-101: lanes from 6 on are 6), lateral maneuver (1 keep, 2 left, 3 right), longitudinal
-maneuver (1 normal, 2 brake), and the ids in the 39 cells around (left, own, right lane; 13 cells of 15 ft each, from
-behind to ahead; 0 is nobody). `tracks{data set, vehicle}` is 3 x T: frame, x, y. 10 frames a second; those of highD
-are interpolated, frame k at (k - 1) / 10 s.
+maneuver (1 normal, 2 brake), and the ids in the 39 cells around the vehicle (left, own, right lane; 13 cells of 15 ft
+each, from behind to ahead; 0 = none). `tracks{data set, vehicle}` is 3 x T: frame, x, y. The rate is 10 frames per
+second; highD is interpolated, with frame k at (k - 1) / 10 s.
 """

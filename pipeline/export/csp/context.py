@@ -1,4 +1,4 @@
-"""What `export csp --clean` reads of the lake: the three parts, late starts, and what validation excludes."""
+"""Context that `export csp --clean` reads from the lake: the parts, late starts and excluded subsets."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,36 +13,36 @@ from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.split import gather_subsets
 from tracklake.pipeline.stages.split_makers import SplitInputs, make_split
-from tracklake.pipeline.transforms.csp.subset import Context
+from tracklake.pipeline.transforms.csp.subset import CleanContext
 from tracklake.schemas import MISSING_STARTS, SPLITS, SUBSET_STATUS, VEHICLE_STARTS
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.split_recipes import LEAKAGE_FREE
 
-Contexts = dict[tuple[str, str], Context | None]
+Contexts = dict[tuple[str, str], CleanContext | None]
 
 
 def read_context(
     settings: Settings, manifest: Manifest, subsets: Sequence[dict[str, Any]], notes: list[str]
 ) -> Contexts:
-    """Read it for every subset; None for one that validation excludes.
+    """Read the context of every subset; None for a subset that validation excludes.
 
-    The files have three parts. Where the lake's split (setting `split`) has a validation part it is used; else the
-    split is planned as `validation_part = true` would make it.
+    The files have three parts. The lake's split (setting `split`) is used if it has a validation part; else a split is
+    planned with `validation_part = true`.
 
     Args:
-        settings: the lake, protocol and split.
-        manifest: of the lake.
-        subsets: dataset and subset of each.
-        notes: what the user should know is added.
+        settings: settings with the lake, protocol and split.
+        manifest: live files of the lake.
+        subsets: dataset and subset of each subset.
+        notes: messages for the user; new ones are appended.
 
     Raises:
-        StageError: validation, repair, samples or the split has not run, or on other inputs than now.
-        ExportError: the split is one whose parts share something.
+        StageError: validation, repair, samples or the split has not run, or its inputs have changed.
+        ExportError: the parts of the split share data.
     """
     root, protocol = settings.lake, settings.get_protocol()
     if protocol.split not in LEAKAGE_FREE:
         raise ExportError(
-            f"--clean is for splits whose parts share nothing, and the setting `split` is {protocol.split!r}. Set it "
+            f"--clean needs a split whose parts share nothing, and the setting `split` is {protocol.split!r}. Set it "
             f"to one of {', '.join(LEAKAGE_FREE)}, or leave --clean out: the files are then cut by vehicle id."
         )
     Planner(root, manifest, settings).require("split")
@@ -56,8 +56,9 @@ def read_context(
         allocation = make_split(replace(recipe, validation=True), inputs).allocation
         splits = allocation.splits
         notes.append(
-            f"the lake's split {protocol.split} has no validation part; the files hold the one that `validation_part = "
-            "true` makes: TestSet.mat is not the lake's eval part, and TrainSet.mat may hold some of it"
+            f"the lake's split {protocol.split} has no validation part; the files hold the split that "
+            "`validation_part = true` makes: TestSet.mat is not the lake's eval part, and TrainSet.mat may hold some "
+            "of it"
         )
         notes += [
             f"split of {dataset} is relaxed: {reason}"
@@ -72,7 +73,7 @@ def read_context(
         found[key] = (
             None
             if key in excluded
-            else Context(
+            else CleanContext(
                 blocks=splits.filter(pl.col("dataset") == key[0], pl.col("subset") == key[1]),
                 vehicle_starts=scan(root, manifest, VEHICLE_STARTS, **values).collect(),
                 missing_starts=scan(root, manifest, MISSING_STARTS, **values).collect(),

@@ -1,1 +1,1 @@
-"""Export of samples as windows that need no tracklake to be read."""
+"""Export of samples as windows that can be read without tracklake."""

@@ -1,48 +1,47 @@
-"""The card beside exported windows: what they hold, where they come from, what may be done with them."""
+"""The card beside exported windows: contents, provenance and licence."""
 
 import json
 import math
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.export.windows.files import npz_arrays, window_schema
+from tracklake.pipeline.export.windows.files import build_schema, list_npz_arrays
+from tracklake.pipeline.export.windows.result import WindowsExport
+from tracklake.pipeline.sources import SOURCES
 from tracklake.schemas.columns import PARTS
 from tracklake.training.data.tensor_folder import TensorFolder
 
-if TYPE_CHECKING:
-    from tracklake.pipeline.export.windows.export import WindowsExport
-
 RELATIVE = """\
-Positions are in m and relative to the sample's last position (`origin`, which is the front centre on the carriageway):
-x along the direction of travel, y across it, positive to the driver's right.
+Positions are in m, relative to the sample's last position (`origin`, the front centre on the carriageway): x along the
+direction of travel, y across it, positive to the driver's right.
 """
 ABSOLUTE = """\
-Positions are in m on the carriageway: x of the front centre along the direction of travel, y across it, from the
-carriageway's left edge, positive to the driver's right. `origin` is the sample's last position.
+Positions are in m on the carriageway: x of the front centre along the direction of travel, y from the carriageway's
+left edge, positive to the driver's right. `origin` is the sample's last position.
 """
 COLUMNS = {
     "dataset": "ngsim or highd",
     "subset": "one carriageway of one recording",
     "vehicle_id": "unique within the subset",
-    "tick": "of the sample",
-    "time_s": "since the recording's first frame, s",
+    "tick": "tick of the sample",
+    "time_s": "time since the recording's first frame, s",
     "lane": "1 is the driver's leftmost; null = unknown",
     "lateral_maneuver": "keep, left or right",
     "longitudinal_maneuver": "normal or brake",
-    "origin_x_m": "the sample's last position on the carriageway, m",
-    "origin_y_m": "likewise",
-    "history_x_m": "up to the sample's tick, m",
-    "history_y_m": "likewise",
-    "future_x_m": "after it, m; null where unknown",
-    "future_y_m": "likewise",
-    "neighbor_cell": "of each neighbor: 13 * column + row of the grid (left, own, right; row 12 ahead), increasing",
-    "neighbor_id": "its vehicle_id, in the same order",
-    "neighbor_history_x_m": "its history, in the same order; null where unknown",
-    "neighbor_history_y_m": "likewise",
+    "origin_x_m": "x of the sample's last position on the carriageway, m",
+    "origin_y_m": "y of the sample's last position on the carriageway, m",
+    "history_x_m": "x up to the sample's tick, m",
+    "history_y_m": "y up to the sample's tick, m",
+    "future_x_m": "x after the sample's tick, m; null = unknown",
+    "future_y_m": "y after the sample's tick, m; null = unknown",
+    "neighbor_cell": "cell of each neighbor, 13 * column + row (left, own, right lane; row 12 ahead), increasing",
+    "neighbor_id": "vehicle_id of each neighbor",
+    "neighbor_history_x_m": "x of each neighbor up to the sample's tick, m; null = unknown",
+    "neighbor_history_y_m": "y of each neighbor up to the sample's tick, m; null = unknown",
 }
 LOADING = {
     "parquet": """\
@@ -63,37 +62,53 @@ history, future, known = train["history"], train["future"], train["future_mask"]
 }
 
 
-def write_card(path: Path, export: "WindowsExport", folder: TensorFolder, facts: pl.DataFrame) -> None:
-    """Write it; the same export gives the same bytes.
+def write_card(path: Path, export: WindowsExport, folder: TensorFolder, facts: pl.DataFrame) -> None:
+    """Write the card; the same export gives the same bytes.
 
     Args:
-        path: of the card.
-        export: what is written.
-        folder: the tensors.
-        facts: of the subsets, see `pipeline.export.windows.export.read_facts`.
+        path: path of the card.
+        export: the export that it describes.
+        folder: tensors that were exported.
+        facts: facts of the subsets from `pipeline.export.windows.export.read_facts`.
     """
-    index, protocol = folder.index, folder.protocol
-    asked = f"tracklake export {'windows' if export.format == 'parquet' else 'npz'}"
+    command = f"tracklake export {'windows' if export.format == 'parquet' else 'npz'}"
     lines = [
-        f"# Trajectory windows: protocol {protocol.name}, split {folder.split}",
+        f"# Trajectory windows: protocol {folder.protocol.name}, split {folder.split}",
         "",
-        f"Written by tracklake {version('tracklake')}: `{asked}{' --absolute' if export.absolute else ''}`.",
+        f"Written by tracklake {version('tracklake')}: `{command}{' --absolute' if export.absolute else ''}`.",
         "",
-        "## Counts",
+        *_describe_counts(export, folder),
+        *_describe_provenance(facts),
+        *_describe_protocol(folder),
+        *_describe_split(folder.index),
+        "## What the files hold",
         "",
-        "| file | samples | neighbors | subsets |",
-        "| --- | ---: | ---: | --- |",
+        ABSOLUTE if export.absolute else RELATIVE,
+        _bound_errors(folder.index, absolute=export.absolute),
+        "",
+        *_describe_columns(export, folder),
+        "",
+        LOADING[export.format],
     ]
+    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def _describe_counts(export: WindowsExport, folder: TensorFolder) -> list[str]:
+    lines = ["## Counts", "", "| file | samples | neighbors | subsets |", "| --- | ---: | ---: | --- |"]
     for part in PARTS:
-        named = ", ".join(sorted(folder.subsets_of(part))) or "-"
+        subsets = ", ".join(sorted(folder.subsets_of(part))) or "-"
         counts = f"{export.samples[part]:,} | {export.neighbors[part]:,}"
-        lines.append(f"| {part}.{export.format} | {counts} | {named} |")
-    lines += ["", "## Licence", ""]
-    lines += [f"- {note}" for note in export.notes]
-    lines += [
+        lines.append(f"| {part}.{export.format} | {counts} | {subsets} |")
+    lines += ["", "## Licence", "", *(f"- {note}" for note in export.notes), ""]
+    return [
+        *lines,
+        "Windows are the recordings' data in another form: each data set's licence applies to them too.",
         "",
-        "Windows are the recordings' data in another form: the licence of each data set holds for them, too.",
-        "",
+    ]
+
+
+def _describe_provenance(facts: pl.DataFrame) -> list[str]:
+    lines = [
         "## Provenance",
         "",
         "| subset | recording | vehicles | file | sha256 |",
@@ -101,17 +116,34 @@ def write_card(path: Path, export: "WindowsExport", folder: TensorFolder, facts:
     ]
     for row in facts.iter_rows(named=True):
         for file in row["source_files"] or [{"file": "-", "sha256": "-"}]:
-            shown = f"{row['dataset']}/{row['subset']} | {row['recording']} | {row['vehicles']:,}"
-            lines.append(f"| {shown} | {file['file']} | {file['sha256']} |")
-    lines += ["", *_cite(facts), "## Protocol", ""]
-    lines += [f"- {name}: {value}" for name, value in index["protocol"].items()]
-    lines += [
+            subset = f"{row['dataset']}/{row['subset']} | {row['recording']} | {row['vehicles']:,}"
+            lines.append(f"| {subset} | {file['file']} | {file['sha256']} |")
+    used = set(facts["dataset"])
+    cited = [line for source in SOURCES if source.name in used for line in (f"Cite: {source.citation}", "")]
+    return [*lines, "", *cited]
+
+
+def _describe_protocol(folder: TensorFolder) -> list[str]:
+    protocol = folder.protocol
+    return [
+        "## Protocol",
+        "",
+        *(f"- {name}: {value}" for name, value in folder.index["protocol"].items()),
         f"- H = {protocol.history_ticks} positions of history, the sample's own included; F = "
         f"{protocol.horizon_ticks} of future",
         "",
+    ]
+
+
+def _describe_split(index: Mapping[str, Any]) -> list[str]:
+    """Describe the split's recipe and blocks."""
+    recipe = index["split_recipe"]
+    lines = [
         "## Split",
         "",
-        *_name_recipe(index["split_recipe"]),
+        f"- recipe: {recipe['digest']}",
+        *(f"- {name}: {value}" for name, value in recipe["parameters"].items()),
+        f"- vehicles left out of val and eval: {recipe['left_out_vehicles']:,}",
         "",
         "| subset | block | frames | vehicles | part |",
         "| --- | ---: | --- | --- | --- |",
@@ -123,62 +155,36 @@ def write_card(path: Path, export: "WindowsExport", folder: TensorFolder, facts:
         frames = f"{block['first_frame']} to {block['last_frame']}"
         subset = f"{block['dataset']}/{block['subset']}"
         lines.append(f"| {subset} | {block['block']} | {frames} | {vehicles} | {block['part']} |")
-    lines += [
-        "",
-        "## What the files hold",
-        "",
-        ABSOLUTE if export.absolute else RELATIVE,
-        _bound_errors(index, absolute=export.absolute),
-        "",
-        *_describe(export, folder),
-        "",
-        LOADING[export.format],
-    ]
-    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    return [*lines, ""]
 
 
 def _bound_errors(index: Mapping[str, Any], *, absolute: bool) -> str:
-    """How far positions are from the tables'; the difference of two of them errs up to twice as far."""
-    most_mm = [(1 if absolute else 2) * 1000 * error for error in index["max_error_m"]]
-    # Rounded up, and float32's own errors on top: differences of up to 400 m err by less than 0.04 mm.
-    along, across = (f"{math.ceil((error + 0.04) * 10) / 10:g}" for error in most_mm)
-    said = f"Positions were stored as {index['storage']}; the rounding error is at most {along} mm along the road and "
+    """Describe the largest rounding error of positions; a difference of two positions has up to twice that error."""
+    largest_mm = [(1 if absolute else 2) * 1000 * error for error in index["max_error_m"]]
+    # Rounded up, plus float32's own error: differences of up to 400 m are exact to 0.04 mm.
+    along, across = (f"{math.ceil((error + 0.04) * 10) / 10:g}" for error in largest_mm)
+    text = f"Positions were stored as {index['storage']}; the rounding error is at most {along} mm along the road and "
     if absolute:
-        return f"{said}{across} mm across it."
-    return f"{said}{across} mm across it (each is the difference of two stored ones), half of that in `origin`."
+        return f"{text}{across} mm across it."
+    return f"{text}{across} mm across it (each is the difference of two stored ones), half of that in `origin`."
 
 
-def _name_recipe(recipe: dict[str, Any]) -> list[str]:
-    """What the split is made by: digest, parameters, and how many vehicles it leaves out."""
-    return [
-        f"- recipe: {recipe['digest']}",
-        *(f"- {name}: {value}" for name, value in recipe["parameters"].items()),
-        f"- vehicles left out of val and eval: {recipe['left_out_vehicles']:,}",
-    ]
-
-
-def _cite(facts: pl.DataFrame) -> list[str]:
-    """What to cite, by data set."""
-    from tracklake.pipeline.sources import SOURCES
-
-    used = set(facts["dataset"])
-    return [line for source in SOURCES if source.name in used for line in (f"Cite: {source.citation}", "")]
-
-
-def _describe(export: "WindowsExport", folder: TensorFolder) -> list[str]:
-    """A table of columns or arrays: name, type, meaning."""
+def _describe_columns(export: WindowsExport, folder: TensorFolder) -> list[str]:
+    """Build a table of columns or arrays: name, type, meaning."""
     if export.format == "parquet":
-        schema = window_schema(folder)
-        rows = [f"| {field.name} | {_spell(str(field.type))} | {COLUMNS[field.name]} |" for field in schema]
+        schema = build_schema(folder)
+        rows = [f"| {field.name} | {_name_type(str(field.type))} | {COLUMNS[field.name]} |" for field in schema]
         return ["| column | type | meaning |", "| --- | --- | --- |", *rows]
     rows = [
         f"| {name} | {dtype} | {json.dumps(shape).replace(chr(34), '')} | {meaning} |"
-        for name, (dtype, shape, meaning) in npz_arrays(folder).items()
+        for name, (dtype, shape, meaning) in list_npz_arrays(folder).items()
     ]
     rows.append("| subsets | str | [subsets] | data set and subset, by the numbers in `subset` |")
     return ["| array | dtype | shape (S samples, K neighbors) | meaning |", "| --- | --- | --- | --- |", *rows]
 
 
-def _spell(kind: str) -> str:
-    """An Arrow type as people write it."""
-    return "string" if kind.startswith("dictionary") else kind.replace("element: ", "").replace("item: ", "")
+def _name_type(arrow_type: str) -> str:
+    """Shorten the name of an Arrow type."""
+    if arrow_type.startswith("dictionary"):
+        return "string"
+    return arrow_type.replace("element: ", "").replace("item: ", "")

@@ -1,98 +1,48 @@
-"""Windows: every sample of the tensors with history, future and neighbors, in files that need no tracklake."""
+"""Windows: every sample of the tensors with history, future and neighbors, in files that need no tracklake to read."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from tracklake.pipeline.export.folder import ExportError, refuse_taken, write_files
+from tracklake.pipeline.export.windows.card import write_card
+from tracklake.pipeline.export.windows.files import WRITERS
+from tracklake.pipeline.export.windows.result import Format, Windows, WindowsExport
 from tracklake.pipeline.lake import Manifest, load, scan
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.columns import PARTS
-from tracklake.training.data.batches import Batch
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.data.windows import spread
 
-Format = Literal["parquet", "npz"]
 CARD = "README.md"
-READ_AT_ONCE = 8192
-"""Samples gathered together; also the rows of a Parquet row group."""
+"""Name of the card's file."""
 
-
-@dataclass(frozen=True)
-class WindowsExport:
-    """What was written.
-
-    Args:
-        out: the folder.
-        format: of the files.
-        absolute: whether positions are those on the carriageway.
-        samples: by part.
-        neighbors: by part.
-        files: names.
-        notes: for the user.
-    """
-
-    out: Path
-    format: Format
-    absolute: bool
-    samples: dict[str, int]
-    neighbors: dict[str, int]
-    files: tuple[str, ...]
-    notes: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self) | {"out": str(self.out)}
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Samples as exported: a batch, and what names its samples and neighbors.
-
-    Args:
-        batch: B samples, K neighbors.
-        subset: (B,) position in the index's `subsets`.
-        vehicle_id: (B,)
-        tick: (B,) of the sample.
-        lane: (B,) at the tick; 0 = unknown.
-        neighbor_id: (K,)
-    """
-
-    batch: Batch
-    subset: npt.NDArray[np.int32]
-    vehicle_id: npt.NDArray[np.int32]
-    tick: npt.NDArray[np.int32]
-    lane: npt.NDArray[np.int16]
-    neighbor_id: npt.NDArray[np.int32]
+BATCH_SAMPLES = 8192
+"""Samples gathered at once, and rows of a Parquet row group."""
 
 
 def export_windows(
     settings: Settings, out: Path, file_format: Format, *, absolute: bool = False, force: bool = False
 ) -> WindowsExport:
-    """Write one file per part and a card beside them; all of them or none.
+    """Write one file per part and a card, all of them or none.
 
     Args:
-        settings: say which lake and protocol.
-        out: the folder.
+        settings: settings with the lake and protocol.
+        out: folder of the files.
         file_format: `parquet` or `npz`.
-        absolute: positions on the carriageway instead of relative to the sample's last one.
-        force: replace such files in `out`.
+        absolute: whether positions are on the carriageway instead of relative to the sample's last one.
+        force: whether existing files are replaced.
 
     Raises:
         StageError: the lake has no tensors of this protocol.
         ExportError: `out` cannot be written to, or the split has no samples.
     """
-    from tracklake.pipeline.export.windows.card import write_card
-    from tracklake.pipeline.export.windows.files import WRITERS
-
     manifest = load(settings.lake)
     names = (*(f"{part}.{file_format}" for part in PARTS), CARD)
     refuse_taken(out, names, force=force, lake=settings.lake)
@@ -113,13 +63,13 @@ def export_windows(
         ),
     )
     show = reporter()
-    show.begin("write", sum(-(-samples // READ_AT_ONCE) for samples, _ in counts.values()))
+    show.begin("write", sum(-(-samples // BATCH_SAMPLES) for samples, _ in counts.values()))
 
     def write(aside: Path) -> None:
         for part in PARTS:
             with WRITERS[file_format](aside / f"{part}.{file_format}", folder, *counts[part]) as writer:
                 for windows in read_windows(folder, part, absolute=absolute):
-                    writer.add(windows)
+                    writer.add_windows(windows)
                     show.advance("write", part)
         write_card(aside / CARD, export, folder, facts)
 
@@ -128,15 +78,13 @@ def export_windows(
 
 
 def count_part(folder: TensorFolder, part: str) -> tuple[int, int]:
-    """(samples, neighbors) of a part."""
+    """Count the samples and the neighbors of a part."""
     samples = folder.samples_of(part)
     return len(samples), int((folder.neighbor_offset[samples + 1] - folder.neighbor_offset[samples]).sum())
 
 
 def read_facts(lake: Path, manifest: Manifest, folder: TensorFolder) -> pl.DataFrame:
-    """Of each subset in the tensors, in their order: dataset, subset, recording, vehicles, source_files, licence."""
-    from tracklake.pipeline.sources import SOURCES
-
+    """Read dataset, subset, recording, vehicles, source_files and licence of each subset, in the tensors' order."""
     licences = {source.name: source.licence for source in SOURCES}
     named = pl.DataFrame(folder.index["subsets"]).select("dataset", "subset")
     facts = scan(lake, manifest, SUBSETS).select("dataset", "subset", "recording", "vehicles", "source_files").collect()
@@ -146,8 +94,8 @@ def read_facts(lake: Path, manifest: Manifest, folder: TensorFolder) -> pl.DataF
 
 
 def read_windows(folder: TensorFolder, part: str, *, absolute: bool) -> Iterator[Windows]:
-    """A part's samples in their order, READ_AT_ONCE at a time."""
-    for batch in folder.batches(part, READ_AT_ONCE, absolute=absolute):
+    """Read a part's samples in their order, BATCH_SAMPLES at a time."""
+    for batch in folder.batches(part, BATCH_SAMPLES, absolute=absolute):
         row = folder.sample_row[batch.sample]
         run = folder.runs_of(row)
         pair, _ = spread(folder.neighbor_offset, batch.sample)

@@ -1,4 +1,4 @@
-"""The files of windows: Parquet with a row per sample, or NumPy arrays in an `.npz`."""
+"""Writers of windows: Parquet with a row per sample, or NumPy arrays in an `.npz`."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tracklake.pipeline.export.windows.export import Windows
+from tracklake.pipeline.export.windows.result import Windows
+from tracklake.schemas.arrays import Flags, Singles
 from tracklake.schemas.columns import DATASETS, LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -20,61 +21,61 @@ AXES = ("x_m", "y_m")
 
 
 class ParquetWindows:
-    """One Parquet file: a row per sample, lists for what has a length.
+    """Writer of one Parquet file: a row per sample, with lists of positions and neighbors.
 
     Args:
-        path: of the file.
-        folder: the tensors.
-        samples: how many there will be.
-        neighbors: likewise.
+        path: path of the file.
+        folder: tensors that are exported.
+        samples: unused; see `NpzWindows`.
+        neighbors: unused; see `NpzWindows`.
     """
 
     def __init__(self, path: Path, folder: TensorFolder, samples: int, neighbors: int) -> None:
         del samples, neighbors
         self.folder = folder
-        # A dictionary's values are all different (two data sets never share a subset's name).
+        # Values of a dictionary must differ; no two data sets share a subset's name.
         self.dataset_of = np.array([DATASETS.index(subset["dataset"]) for subset in folder.index["subsets"]])
-        self.schema = window_schema(folder)
+        self.schema = build_schema(folder)
         self.writer = pq.ParquetWriter(path, self.schema, compression="zstd")
 
     def __enter__(self) -> Self:
-        """Begin."""
+        """Return the open writer."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Write the footer."""
+        """Write the footer and close the file."""
         self.writer.close()
 
-    def add(self, windows: Windows) -> None:
+    def add_windows(self, windows: Windows) -> None:
         """Write samples as one row group."""
         batch, rate_hz = windows.batch, self.folder.protocol.rate_hz
         subsets = self.folder.index["subsets"]
         neighbor_offset = np.searchsorted(batch.neighbor_sample, np.arange(len(batch) + 1)).astype(np.int32)
         columns: dict[str, Any] = {
-            "dataset": _name(DATASETS, self.dataset_of[windows.subset]),
-            "subset": _name([subset["subset"] for subset in subsets], windows.subset),
+            "dataset": _encode_names(DATASETS, self.dataset_of[windows.subset]),
+            "subset": _encode_names([subset["subset"] for subset in subsets], windows.subset),
             "vehicle_id": windows.vehicle_id,
             "tick": windows.tick,
             "time_s": windows.tick / rate_hz,
             "lane": pa.array(windows.lane, mask=windows.lane == 0),
-            "lateral_maneuver": _name(LATERAL_MANEUVERS, batch.lateral),
-            "longitudinal_maneuver": _name(LONGITUDINAL_MANEUVERS, batch.longitudinal),
+            "lateral_maneuver": _encode_names(LATERAL_MANEUVERS, batch.lateral),
+            "longitudinal_maneuver": _encode_names(LONGITUDINAL_MANEUVERS, batch.longitudinal),
         }
         for axis, name in enumerate(AXES):
             columns[f"origin_{name}"] = np.ascontiguousarray(batch.origin[:, axis])
-            columns[f"history_{name}"] = _lists(batch.history[..., axis])
-            columns[f"future_{name}"] = _lists(batch.future[..., axis], batch.future_mask)
+            columns[f"history_{name}"] = _build_lists(batch.history[..., axis])
+            columns[f"future_{name}"] = _build_lists(batch.future[..., axis], batch.future_mask)
         columns["neighbor_cell"] = pa.ListArray.from_arrays(neighbor_offset, batch.neighbor_cell)
         columns["neighbor_id"] = pa.ListArray.from_arrays(neighbor_offset, windows.neighbor_id)
         for axis, name in enumerate(AXES):
-            inner = _lists(batch.neighbor_history[..., axis], batch.neighbor_mask)
+            inner = _build_lists(batch.neighbor_history[..., axis], batch.neighbor_mask)
             columns[f"neighbor_history_{name}"] = pa.ListArray.from_arrays(neighbor_offset, inner)
         arrays = [pa.array(columns[field.name]).cast(field.type) for field in self.schema]
         self.writer.write_table(pa.Table.from_arrays(arrays, schema=self.schema))
 
 
-def window_schema(folder: TensorFolder) -> pa.Schema:
-    """Columns of the Parquet files, in order."""
+def build_schema(folder: TensorFolder) -> pa.Schema:
+    """Build the schema of the Parquet files."""
     history = pa.list_(pa.float32(), folder.protocol.history_ticks)
     future = pa.list_(pa.float32(), folder.protocol.horizon_ticks)
     text = pa.dictionary(pa.int32(), pa.string())
@@ -98,24 +99,24 @@ def window_schema(folder: TensorFolder) -> pa.Schema:
     )
 
 
-def _name(names: Sequence[str], codes: npt.NDArray[np.integer]) -> pa.DictionaryArray:
+def _encode_names(names: Sequence[str], codes: npt.NDArray[np.integer]) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(codes.astype(np.int32), pa.array(list(names), pa.string()))
 
 
-def _lists(values: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:
-    """(M, T) as M lists; null where unknown."""
+def _build_lists(values: Singles, known: Flags | None = None) -> pa.FixedSizeListArray:
+    """Turn (M, T) values into M lists, with null for unknown values."""
     flat = pa.array(values.reshape(-1), mask=None if known is None else ~known.reshape(-1))
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
 class NpzWindows:
-    """One `.npz`: the arrays of `npz_arrays`, spooled one by one and then put into the archive, uncompressed.
+    """Writer of one `.npz`: each array is spooled to a file, then added to the archive uncompressed.
 
     Args:
-        path: of the file.
-        folder: the tensors.
-        samples: how many there will be.
-        neighbors: likewise.
+        path: path of the file.
+        folder: tensors that are exported.
+        samples: total number of samples.
+        neighbors: total number of neighbors.
     """
 
     def __init__(self, path: Path, folder: TensorFolder, samples: int, neighbors: int) -> None:
@@ -126,9 +127,9 @@ class NpzWindows:
         self.stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Begin every array with its header: the shapes are known."""
+        """Write the header of every array; the shapes are known."""
         self.spool.mkdir()
-        for name, (dtype, shape, _) in npz_arrays(self.folder).items():
+        for name, (dtype, shape, _) in list_npz_arrays(self.folder).items():
             file = self.stack.enter_context((self.spool / f"{name}.npy").open("wb"))
             sizes = tuple(self.sizes.get(str(axis), axis) for axis in shape)
             header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": sizes}
@@ -137,14 +138,14 @@ class NpzWindows:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Put the arrays into the archive."""
+        """Add the arrays to the archive and delete the spooled files."""
         self.stack.close()
         if raised[0] is None:
             names = [f"{subset['dataset']}/{subset['subset']}" for subset in self.folder.index["subsets"]]
             np.save(self.spool / "subsets.npy", np.array(names, dtype=np.str_), allow_pickle=False)
             with ZipFile(self.path, "w", ZIP_STORED) as archive:
                 for name in (*self.files, "subsets"):
-                    # The same windows give the same bytes: no time of writing.
+                    # A fixed time, so that the same windows give the same bytes.
                     entry = ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
                     with (
                         (self.spool / f"{name}.npy").open("rb") as values,
@@ -153,11 +154,11 @@ class NpzWindows:
                         shutil.copyfileobj(values, out, 4 * 2**20)
         shutil.rmtree(self.spool)
 
-    def add(self, windows: Windows) -> None:
-        """Write samples behind those before."""
+    def add_windows(self, windows: Windows) -> None:
+        """Append samples to the spooled arrays."""
         batch = windows.batch
         values: Mapping[str, npt.NDArray[Any]] = {
-            **{name: getattr(batch, name) for name in npz_arrays(self.folder) if hasattr(batch, name)},
+            **{name: getattr(batch, name) for name in list_npz_arrays(self.folder) if hasattr(batch, name)},
             "neighbor_sample": batch.neighbor_sample + self.offset,
             "subset": windows.subset,
             "vehicle_id": windows.vehicle_id,
@@ -165,21 +166,21 @@ class NpzWindows:
             "lane": windows.lane,
             "neighbor_id": windows.neighbor_id,
         }
-        for name, (dtype, _, _) in npz_arrays(self.folder).items():
+        for name, (dtype, _, _) in list_npz_arrays(self.folder).items():
             np.ascontiguousarray(values[name], dtype=dtype).tofile(self.files[name])
         self.offset += len(batch)
 
 
-def npz_arrays(folder: TensorFolder) -> dict[str, tuple[str, tuple[int | str, ...], str]]:
-    """dtype, shape and meaning of every array in an `.npz` but `subsets`; S samples, K neighbors of all of them."""
+def list_npz_arrays(folder: TensorFolder) -> dict[str, tuple[str, tuple[int | str, ...], str]]:
+    """List dtype, shape and meaning of every array in an `.npz` but `subsets`, for S samples and K neighbors."""
     history, future = folder.protocol.history_ticks, folder.protocol.horizon_ticks
     return {
         "history": ("float32", ("S", history, 2), "positions up to the sample's tick, m: along the road, across it"),
-        "future": ("float32", ("S", future, 2), "positions after it; where masked, the last known one again"),
-        "future_mask": ("bool", ("S", future), "True where the position is known"),
-        "neighbor_history": ("float32", ("K", history, 2), "neighbors' positions; where masked, the first known again"),
-        "neighbor_mask": ("bool", ("K", history), "True where the position is known"),
-        "neighbor_sample": ("int64", ("K",), "which sample of this file, increasing"),
+        "future": ("float32", ("S", future, 2), "positions after it; masked ones repeat the last known one"),
+        "future_mask": ("bool", ("S", future), "True if the position is known"),
+        "neighbor_history": ("float32", ("K", history, 2), "neighbors' positions; masked ones repeat the first known"),
+        "neighbor_mask": ("bool", ("K", history), "True if the position is known"),
+        "neighbor_sample": ("int64", ("K",), "the neighbor's sample in this file, increasing"),
         "neighbor_cell": ("int8", ("K",), "13 * column + row of the grid (left, own, right; row 12 ahead)"),
         "neighbor_id": ("int32", ("K",), "the neighbor's vehicle_id"),
         "lateral": ("uint8", ("S",), ", ".join(f"{code} {name}" for code, name in enumerate(LATERAL_MANEUVERS))),

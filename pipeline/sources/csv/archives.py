@@ -1,4 +1,4 @@
-"""Zip archives as folders: which of their members may be raw files, and a member's bytes without unpacking to disk."""
+"""Zip archives read like folders: their members that may be raw files, and a member's bytes without unpacking."""
 
 import errno
 import struct
@@ -13,25 +13,27 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from tracklake.pipeline.sources.source import RawFile, SourceError
 
-MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
-"""Of an archive, an empty one, one in several volumes."""
+ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
+"""First bytes of a zip archive, of an empty one, and of one in several volumes."""
 
-ENDING = ".zip"
+ARCHIVE_SUFFIX = ".zip"
+"""Ending of a zip archive's name."""
+
 MACOS_FOLDER = "__MACOSX"
-"""What a Mac adds to the archives it makes; as little the user's as a hidden file."""
+"""Folder that macOS adds to archives; it is ignored like a hidden file."""
 
 ENCRYPTED = 1
-"""The bit in a member's flags."""
+"""Bit in a member's flags that says it is encrypted."""
 
 
 @dataclass(frozen=True)
-class Contents:
-    """An archive's members that are files, hidden ones apart.
+class ArchiveContents:
+    """The visible files of an archive.
 
     Args:
-        files: those whose ending says that they may be raw files, by name.
-        others: names of those whose ending says that they are not.
-        refusals: messages about those that may be raw files and cannot be read.
+        files: members with a raw file's ending, sorted by name.
+        others: names of members with another ending.
+        refusals: messages about members with a raw file's ending that cannot be read.
     """
 
     files: tuple[RawFile, ...]
@@ -40,13 +42,13 @@ class Contents:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file begins as zip archives do, whatever it is called."""
+    """Recognise a zip archive by its first bytes, whatever its name."""
     with path.open("rb") as handle:
-        return handle.read(4) in MAGICS
+        return handle.read(4) in ZIP_MAGICS
 
 
-def list_members(archive: RawFile, suffixes: Sequence[str]) -> Contents:
-    """What an archive holds.
+def list_members(archive: RawFile, suffixes: Sequence[str]) -> ArchiveContents:
+    """List the files of an archive.
 
     Args:
         archive: the archive itself.
@@ -64,15 +66,15 @@ def list_members(archive: RawFile, suffixes: Sequence[str]) -> Contents:
         name = f"{archive.name}/{inner}"
         if inner.suffix.lower() not in suffixes:
             others.append(name)
-        elif complaint := _complaint(info, inner, times[inner], archive.name):
-            unreadable.setdefault(complaint, []).append(name)
+        elif obstacle := _find_obstacle(info, inner, times[inner], archive.name):
+            unreadable.setdefault(obstacle, []).append(name)
         else:
             files.append(replace(archive, name=name, member=info.filename))
     refusals = [
-        f"{names[0]}{f' and {len(names) - 1} more' if names[1:] else ''}: {complaint}"
-        for complaint, names in unreadable.items()
+        f"{names[0]}{f' and {len(names) - 1} more' if names[1:] else ''}: {obstacle}"
+        for obstacle, names in unreadable.items()
     ]
-    return Contents(tuple(sorted(files, key=lambda file: file.name)), tuple(sorted(others)), tuple(refusals))
+    return ArchiveContents(tuple(sorted(files, key=lambda file: file.name)), tuple(sorted(others)), tuple(refusals))
 
 
 def open_member(file: RawFile) -> BufferedReader:
@@ -86,17 +88,16 @@ def open_member(file: RawFile) -> BufferedReader:
     assert file.member is not None
     with _directory(file) as directory:
         try:
-            # The open member keeps the archive's file open for itself. It reads as a buffered file, though it is not
-            # declared as one.
+            # The open member keeps the archive's file open. It reads like a buffered file but is not declared as one.
             return cast("BufferedReader", directory.open(file.member))
         except KeyError:
             raise SourceError(
-                f"{file.name}: not in the archive any more, which has changed since it was looked into. Run again."
+                f"{file.name}: no longer in the archive, which has changed since it was listed. Run again."
             ) from None
 
 
-def member_bytes(file: RawFile) -> int:
-    """How long a member is, unpacked.
+def measure_member(file: RawFile) -> int:
+    """Return a member's unpacked size in bytes.
 
     Raises:
         SourceError: the archive is damaged.
@@ -107,12 +108,12 @@ def member_bytes(file: RawFile) -> int:
 
 @contextmanager
 def _directory(file: RawFile) -> Iterator[ZipFile]:
-    """The archive of a file, with whatever damage does to reading it said as a SourceError."""
+    """Open the archive of a file; damage to it is raised as a SourceError."""
     try:
         with ZipFile(file.path) as directory:
             yield directory
     except (BadZipFile, EOFError, RuntimeError, ValueError, OverflowError, struct.error, OSError) as damage:
-        # A damaged position is an invalid argument to the system; its other errors are what they are.
+        # A damaged offset is an invalid argument to the system; other OS errors are passed on.
         if isinstance(damage, OSError) and damage.errno != errno.EINVAL:
             raise
         raise SourceError(
@@ -122,7 +123,7 @@ def _directory(file: RawFile) -> Iterator[ZipFile]:
 
 
 def _inner_path(member: str) -> PurePosixPath:
-    """Some programs write the folders of an archive with backslashes, some begin with the root."""
+    """Normalise a member's path: some programs write backslashes, some begin with a slash."""
     return PurePosixPath(member.replace("\\", "/").lstrip("/"))
 
 
@@ -133,15 +134,15 @@ def _is_visible_file(member: str) -> bool:
     return not any(part == MACOS_FOLDER or (part.startswith(".") and part != "..") for part in parts)
 
 
-def _complaint(info: ZipInfo, inner: PurePosixPath, times: int, archive: str) -> str | None:
-    """Why a member that may be a raw file cannot be read, and what to do."""
+def _find_obstacle(info: ZipInfo, inner: PurePosixPath, times: int, archive: str) -> str | None:
+    """Explain why a member with a raw file's ending cannot be read, or return None."""
     unpack = f"Unpack {archive} and give the folder."
     if info.flag_bits & ENCRYPTED:
         return f"encrypted. Expected an archive without a password. {unpack}"
     if info.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
         return f"compressed by method {info.compress_type}. Expected 0 (stored) or 8 (deflated). {unpack}"
     if times > 1:
-        return f"{times} members of this name, of which no more than one can be meant. Expected one. {unpack}"
-    if inner.suffix.lower() == ENDING:
-        return f"an archive inside an archive, which is not looked into. Expected the raw files. {unpack}"
+        return f"{times} members have this name. Expected one. {unpack}"
+    if inner.suffix.lower() == ARCHIVE_SUFFIX:
+        return f"an archive inside an archive, which is not read. Expected the raw files. {unpack}"
     return None

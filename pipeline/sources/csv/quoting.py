@@ -3,18 +3,21 @@
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.sources.csv.raw_files import cut_at_lines
+from tracklake.pipeline.sources.csv.line_bytes import cut_at_lines
 
 QUOTE, COMMA, POINT, ZERO, NINE = (ord(character) for character in '",.09')
 BLOCK_BYTES = 1 << 21
-"""Larger than what suits bytes alone: most of the work is on positions, of which there are few."""
+"""Size of a block, in bytes; larger than CACHED_BYTES since most of the work is on the few quotes' positions."""
 
 LONGEST_GROUP = 3
+"""Most digits before or after a thousands separator."""
+
 LONGEST_FRACTION = 4
+"""Most digits after the decimal point of a number that is unquoted."""
 
 
 def are_paired(data: bytes) -> bool:
-    """Whether quotes surround whole fields; elsewhere the CSV reader and the one for single lines might disagree."""
+    """Check that quotes surround whole fields; otherwise the chunk and the line parser might disagree."""
     return b'"' not in data or all(_are_paired(np.frombuffer(block, np.uint8)) for block in cut_at_lines(data))
 
 
@@ -33,12 +36,9 @@ def _are_paired(text: np.ndarray) -> bool:
 
 
 def unquote_thousands(data: bytes) -> bytes:
-    """Quoted numbers with one thousands separator as plain numbers: `"1,156.5"` as `1156.5`; all else as it is.
+    """Turn quoted numbers with one thousands separator into plain ones (`"1,156.5"` to `1156.5`); quotes are paired.
 
-    As the reader then sees numbers, it need not make texts of a whole column for the sake of some.
-
-    Args:
-        data: lines in which quotes are paired.
+    The CSV reader then parses the whole column as numbers.
     """
     return b"".join(_unquote(np.frombuffer(block, np.uint8)) for block in cut_at_lines(data, BLOCK_BYTES))
 
@@ -55,7 +55,7 @@ def _unquote(text: np.ndarray) -> bytes:
     sound = np.ones(comma.size, dtype=bool)
     for place in range(1, LONGEST_GROUP + 1):
         sound &= _is_digit(text[comma + place]) & ((digits < place) | _is_digit(text[comma - place]))
-    # What follows the group ends the field, or is a point and some digits.
+    # After the group the field ends, or a point and some digits follow.
     point = comma + LONGEST_GROUP + 1
     ends = point == closing
     fraction = np.flatnonzero(sound & ~ends)

@@ -1,1 +1,1 @@
-"""Tracks as convolutional social pooling's own script writes them."""
+"""Tracks and samples as the script of convolutional social pooling makes them."""

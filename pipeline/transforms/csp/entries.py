@@ -1,4 +1,4 @@
-"""Entries as convolutional social pooling's script holds them: rows of a track, in feet and single precision.
+"""Entries in the units of convolutional social pooling's script: rows of a track, in feet and single precision.
 
 Deo and Trivedi 2018, `preprocess_data.m`: columns 1, 2, 5, 6 and 14 of NGSIM's text files, as MATLAB's `single`.
 """
@@ -9,14 +9,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from tracklake.schemas.arrays import Floats, Integers, Singles, bound_runs
 from tracklake.schemas.columns import FOOT_M
 from tracklake.schemas.errors import TracklakeError
 
 LARGEST_WHOLE = 1 << 24
-"""Whole numbers beyond this cannot be told apart in single precision."""
-
-Singles = NDArray[np.float32]
-Ints = NDArray[np.int64]
+"""Highest number below which single precision represents every whole number."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +22,11 @@ class CspEntries:
     """The entries of one subset, (N,) each, sorted by track and frame.
 
     Args:
-        track_id: who it is: increasing.
-        frame: increasing within a track.
-        x_ft: lateral position (NGSIM's Local_X).
-        y_ft: position along the road (NGSIM's Local_Y).
-        lane: 1 is the driver's leftmost.
+        track_id: id of the track, increasing.
+        frame: frame number, increasing within a track.
+        x_ft: lateral position in ft (NGSIM's Local_X).
+        y_ft: position along the road in ft (NGSIM's Local_Y).
+        lane: lane number; 1 is the driver's leftmost.
     """
 
     track_id: NDArray[np.int32]
@@ -39,26 +37,23 @@ class CspEntries:
 
     @property
     def height(self) -> int:
-        """How many entries there are."""
+        """N, the number of entries."""
         return self.track_id.size
 
-    def bound_tracks(self) -> tuple[Ints, Ints]:
-        """(N,) first and last row of the track that each row stands in."""
-        starts = np.flatnonzero(np.diff(self.track_id, prepend=self.track_id[:1] - 1))
-        lengths = np.diff(starts, append=self.height)
-        first = np.repeat(starts, lengths)
-        return first, first + np.repeat(lengths, lengths) - 1
+    def bound_tracks(self) -> tuple[Integers, Integers]:
+        """Return the first and the last row of each row's track, (N,) each."""
+        return bound_runs(self.track_id)
 
 
 def to_csp_entries(clock: pl.DataFrame, *, last_lane: int | None) -> CspEntries:
-    """Turn entries in metres into what the script reads.
+    """Convert entries in metres to the script's.
 
     Args:
         clock: track_id, frame, x_m, y_m, lane (without nulls), sorted by track_id, frame; each pair once.
-        last_lane: lanes with higher numbers count as this one (the script's 6 on US-101); None: all stay.
+        last_lane: highest lane; higher ones count as this one (the script's 6 on US-101). None = no limit.
 
     Raises:
-        TracklakeError: an id or a frame that single precision does not hold.
+        TracklakeError: single precision cannot represent an id or a frame.
     """
     for name in ("track_id", "frame"):
         highest = clock[name].max()
@@ -77,28 +72,28 @@ def to_csp_entries(clock: pl.DataFrame, *, last_lane: int | None) -> CspEntries:
     )
 
 
-def to_feet(metres: NDArray[np.float64]) -> Singles:
-    """Metres as feet in single precision: where feet were recorded, the very single that the script reads.
+def to_feet(metres: Floats) -> Singles:
+    """Convert metres to feet in single precision, exactly as the script reads recorded feet.
 
-    A foot is 0.3048 m, so that dividing gives the recorded number to within a few units of double precision's last
-    place, 1e-13 of it. A number of up to six decimals that is not halfway between two singles is 1e-9 and more away
-    from there, and below 2^18 feet none is halfway: both round to the same single.
+    A foot is 0.3048 m, so the division gives the recorded number to a few units of double precision's last place,
+    1e-13 of it. A number of up to six decimals lies at least 1e-9 from the middle between two singles, and below 2^18
+    feet none lies on it: both round to the same single.
     """
     return (metres / FOOT_M).astype(np.float32)
 
 
-def name_as_recorded(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataFrame, int]:
+def assign_recorded_ids(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.DataFrame, int]:
     """Name tracks by the ids in the source's files, as the script does: one id is one track.
 
-    Where the lake told vehicles of one id apart they are one track again. Of two with the same id in the same frame,
-    which the script's own Dataset class cannot read, that of the lower vehicle_id (seen first) stays.
+    Vehicles that share an id in the source are one track again. If two of them are in the same frame, which the
+    script's Dataset class cannot read, the one with the lower vehicle_id (seen first) is kept.
 
     Args:
         clock: vehicle_id, frame.
         vehicles: vehicle_id, source_vehicle_id.
 
     Returns:
-        The clock with track_id, sorted by track_id, frame; how many rows were dropped.
+        The clock with track_id, sorted by track_id, frame; the number of dropped rows.
     """
     names = vehicles.select("vehicle_id", track_id="source_vehicle_id")
     if names["vehicle_id"].equals(names["track_id"]):
@@ -110,15 +105,15 @@ def name_as_recorded(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl.Da
     return once, named.height - once.height
 
 
-def name_by_runs(clock: pl.DataFrame, block: NDArray[np.int32], *, highest_id: int) -> pl.DataFrame:
-    """Name tracks so that none has a gap: the first run of a vehicle keeps its id, later ones get unused ids.
+def assign_run_ids(clock: pl.DataFrame, block: NDArray[np.int32], *, highest_id: int) -> pl.DataFrame:
+    """Name tracks so that none has a gap: the first run of a vehicle keeps its id, later runs get unused ids.
 
-    The Dataset class counts rows, not frames: across a gap it would take a second for a tenth of one.
+    The Dataset class counts rows, not frames: across a gap it would mistake a second for a tenth of one.
 
     Args:
         clock: vehicle_id, tick, segment, sorted by vehicle_id, tick.
-        block: (N,) of the split; where it changes, a new run begins.
-        highest_id: of all vehicles, also of those that are not in the clock; unused ids are above it.
+        block: (N,) block of the split; a new run begins where it changes.
+        highest_id: highest id of all vehicles, also of those not in the clock; unused ids are above it.
 
     Returns:
         The clock with track_id, sorted by track_id, tick.

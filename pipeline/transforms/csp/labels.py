@@ -1,4 +1,4 @@
-"""Maneuver codes as convolutional social pooling's script gives them: windows of rows, clamped to the track."""
+"""Maneuver codes of convolutional social pooling's script, from windows of rows clamped to the track."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,10 +6,17 @@ from numpy.typing import NDArray
 from tracklake.pipeline.transforms.csp.entries import CspEntries
 
 LANE_ROWS = 40
-"""The lane now is compared with the lane so many rows before and after."""
+"""Rows before and after an entry whose lanes are compared with its own."""
+
 BRAKE_ROWS_BEHIND = 30
+"""Rows of the past speed's window."""
+
 BRAKE_ROWS_AHEAD = 50
+"""Rows of the future speed's window."""
+
 BRAKE_RATIO = 0.8
+"""Ratio of future to past speed below which a vehicle brakes."""
+
 KEEP, LEFT, RIGHT = 1, 2, 3
 NORMAL, BRAKE = 1, 2
 
@@ -17,21 +24,15 @@ Codes = NDArray[np.uint8]
 
 
 def code_maneuvers(entries: CspEntries) -> tuple[Codes, Codes]:
-    """Give every entry its lateral and its longitudinal code (preprocess_data.m, 'Parse fields').
+    """Compute the lateral and the longitudinal code of every entry (preprocess_data.m, 'Parse fields').
 
-    - lateral: 3 (right) where the lane number grows over either window (tested first), else 2 (left) where it falls
-      over either, else 1 (keep).
-    - longitudinal: 2 (brake) where vFut / vHist < 0.8, displacements per row over the next 50 and the last 30 rows; at
-      the first and the last row of a track 1 (normal). All in single precision, and as IEEE divides: standing still
-      so far, a vehicle brakes if it goes backwards next (-Inf), and else does not (Inf, NaN).
+    - lateral: 3 (right) if the lane number grows over either window (tested first), else 2 (left) if it falls over
+      either, else 1 (keep).
+    - longitudinal: 2 (brake) if vFut / vHist < 0.8, displacements per row over the next 50 and the last 30 rows; 1
+      (normal) at the first and the last row of a track. All in single precision with IEEE division: a vehicle that
+      stood still brakes if it moves backwards next (-Inf), and otherwise does not (Inf, NaN).
 
-    Windows count rows, as the script does: where a track skips frames they last longer.
-
-    Args:
-        entries: of one subset.
-
-    Returns:
-        Two arrays (N,): 1 keep, 2 left, 3 right; 1 normal, 2 brake.
+    Windows count rows, as in the script, so they last longer where a track skips frames.
     """
     row = np.arange(entries.height)
     first, last = entries.bound_tracks()
@@ -47,7 +48,7 @@ def code_maneuvers(entries: CspEntries) -> tuple[Codes, Codes]:
     with np.errstate(divide="ignore", invalid="ignore"):
         past = (y_ft - y_ft[behind]) / (row - behind).astype(np.float32)
         future = (y_ft[ahead] - y_ft) / (ahead - row).astype(np.float32)
-        # Single 0.8 is greater than double 0.8 and no single lies between: either comparison says the same.
+        # Single 0.8 is greater than double 0.8 and no single lies between, so both comparisons agree.
         slower = future / past < np.float32(BRAKE_RATIO)
     brake = slower & (ahead > row) & (behind < row)
     return lateral, np.where(brake, np.uint8(BRAKE), np.uint8(NORMAL))

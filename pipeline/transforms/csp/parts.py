@@ -1,4 +1,4 @@
-"""Which entries go into TrainSet, ValSet and TestSet, and which of them are samples."""
+"""The assignment of entries to TrainSet, ValSet and TestSet, and the selection of samples."""
 
 from collections.abc import Iterable, Mapping
 
@@ -7,17 +7,23 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.csp.entries import CspEntries
+from tracklake.schemas.arrays import Flags
 from tracklake.schemas.columns import PARTS
 
 TRAIN, VAL, TEST = range(3)
-"""Places in `schemas.columns.PARTS`."""
+"""Codes of the parts: positions in `schemas.columns.PARTS`."""
+
 NO_PART = -1
+"""Code of an entry that is in no part."""
+
 HISTORY_ROWS = 31
-"""3 s at 10 Hz and the entry itself: tracks with fewer rows stop the script."""
+"""Rows of a full history, 3 s at 10 Hz and the entry itself; the script stops at shorter tracks."""
+
 FULL_FUTURE_ROWS = 50
-"""5 s at 10 Hz, all that the Dataset class reads ahead."""
+"""Rows of a full future, 5 s at 10 Hz: all that the Dataset class reads ahead."""
+
 TRAIN_SHARE, TRAIN_VAL_SHARE = np.float32(0.7), np.float32(0.8)
-"""Of the highest vehicle id: where the validation and the test set begin."""
+"""Shares of the highest vehicle id at which the validation and the test set begin."""
 
 NO_LANE, EXCLUDED, SAME_ID, ID_ZERO = "no_lane", "excluded_subset", "same_id_and_frame", "id_zero"
 OUTSIDE_SPLIT, IN_TWO_PARTS = "outside_split", "in_two_parts"
@@ -29,31 +35,30 @@ SHORT_TRACK, SHORT_HISTORY, SHORT_FUTURE, NO_FULL_FUTURE = (
 )
 EARLY, WOULD_BE = "early_vehicle", "would_be_neighbor"
 REASONS = {
-    NO_LANE: "the subset has no lanes: neither tracks nor samples of it are written",
-    EXCLUDED: "validation excludes the subset: neither tracks nor samples of it are written",
+    NO_LANE: "the subset has no lanes: its tracks and samples are not written",
+    EXCLUDED: "validation excludes the subset: its tracks and samples are not written",
     SAME_ID: "another vehicle has the same id in the same frame: not in tracks either",
-    ID_ZERO: "the format counts ids from 1, 0 is nobody: not in tracks either",
+    ID_ZERO: "the format counts ids from 1, and 0 means none: not in tracks either",
     OUTSIDE_SPLIT: "in no part of the split: not in tracks either",
-    IN_TWO_PARTS: "the vehicle is in train as well, or in val and eval: not in tracks either",
-    SHORT_TRACK: "of tracks under 31 frames, on which the original stops",
+    IN_TWO_PARTS: "the vehicle is also in train, or in val and eval: not in tracks either",
+    SHORT_TRACK: "the track has fewer than 31 frames, at which the original stops",
     SHORT_HISTORY: "before the track's 31st frame",
     SHORT_FUTURE: "the track's last frame is not later than the next frame",
     NO_FULL_FUTURE: "fewer than 50 frames of the track follow (--full-future)",
     EARLY: "the road ahead was not yet recorded when the vehicle entered (--clean)",
-    WOULD_BE: "a vehicle whose track starts late is missing around the entry (--clean)",
+    WOULD_BE: "a vehicle whose track starts late is missing near the entry (--clean)",
 }
-"""Why an entry is no sample, in the order in which it is tested; an entry is dropped for the first that applies."""
+"""Reasons why an entry is no sample, in the order in which they are tested; the first that applies counts."""
 
 Parts = NDArray[np.int8]
+"""Code of the part of each entry."""
 
 
-def part_by_id(track_id: NDArray[np.int32]) -> Parts:
-    """Part as the script does: up to round(0.7 max id) train, up to round(0.8 max id) validation, the rest test.
+def assign_parts_by_id(track_id: NDArray[np.int32]) -> Parts:
+    """Assign a subset's entries to parts by id: train up to round(0.7 max id), val up to round(0.8 max id), else test.
 
-    By the highest id and not by the count of vehicles; in single precision, halves away from zero.
-
-    Args:
-        track_id: (N,) of one subset.
+    As in the script, shares are of the highest id and not of the number of vehicles, in single precision with halves
+    rounded away from zero.
     """
     if not track_id.size:
         return np.zeros(0, np.int8)
@@ -62,20 +67,20 @@ def part_by_id(track_id: NDArray[np.int32]) -> Parts:
     return np.where(track_id <= last_train, TRAIN, np.where(track_id <= last_val, VAL, TEST)).astype(np.int8)
 
 
-def part_by_split(
+def assign_parts_by_split(
     clock: pl.DataFrame, blocks: pl.DataFrame, *, first_frame: int, stride: float
 ) -> tuple[Parts, NDArray[np.int32], Parts]:
-    """Part by the lake's split, which no vehicle, no frame and no history crosses.
+    """Assign entries to parts by the lake's split, across which no vehicle, frame or history reaches.
 
     Args:
         clock: vehicle_id, tick.
         blocks: rows of `splits` of this subset.
-        first_frame: the recording's first frame, where tick 0 lies.
+        first_frame: first frame of the recording, at tick 0.
         stride: source frames per tick.
 
     Returns:
-        (N,) each: the part, NO_PART = none; the row of `blocks`, -1 = none; the part in which an entry would stand if
-        its vehicle were in no other part (of a vehicle in two parts only the entries in train stay, if there are any).
+        (N,) each: the part or NO_PART; the row of `blocks` or -1; the part before vehicles in two parts are left out,
+        of which only the entries in train are kept.
     """
     vehicle = clock["vehicle_id"].to_numpy()
     frame = first_frame + clock["tick"].to_numpy() * stride
@@ -90,28 +95,28 @@ def part_by_split(
         block[within] = number
         codes[number] = PARTS.index(part)
     intended = codes[block]
-    spread = (
+    divided = (
         pl.DataFrame({"vehicle": vehicle, "part": intended})
         .filter(pl.col("part") != NO_PART)
         .group_by("vehicle")
         .agg(parts=pl.col("part").n_unique())
         .filter(pl.col("parts") > 1)["vehicle"]
     )
-    in_two = pl.Series(vehicle).is_in(spread.implode()).to_numpy() & (intended != TRAIN)
+    in_two = pl.Series(vehicle).is_in(divided.implode()).to_numpy() & (intended != TRAIN)
     return np.where(in_two, np.int8(NO_PART), intended), block, intended
 
 
-def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, NDArray[np.bool_]]:
-    """Tell which entries the script's filter drops (preprocess_data.m, 'Filter edge cases'), and --full-future's.
+def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, Flags]:
+    """Find the entries that the script's filter (preprocess_data.m, 'Filter edge cases') and --full-future drop.
 
-    The script keeps an entry at frame t where the 31st frame of its track <= t and the last one > t + 1.
+    The script keeps an entry at frame t if the 31st frame of its track is <= t and the last one > t + 1.
 
     Args:
-        entries: of one subset.
+        entries: entries of one subset.
         full_future: whether a sample needs 50 rows after it.
 
     Returns:
-        (N,) by reason; reasons may overlap.
+        (N,) flags by reason; reasons may overlap.
     """
     row = np.arange(entries.height)
     first, last = entries.bound_tracks()
@@ -125,15 +130,12 @@ def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, NDArray[n
     return drops
 
 
-def keep_samples(part: Parts, drops: Mapping[str, NDArray[np.bool_]]) -> tuple[NDArray[np.bool_], dict[str, list[int]]]:
-    """Keep the entries to which no reason applies, and count the others.
+def keep_samples(part: Parts, drops: Mapping[str, Flags]) -> tuple[Flags, dict[str, list[int]]]:
+    """Keep the entries to which no reason applies, and count the others by reason and part.
 
     Args:
-        part: (N,) of PARTS.
-        drops: by reason, (N,).
-
-    Returns:
-        (N,) kept; by reason how many were dropped of each part.
+        part: (N,) part of each entry.
+        drops: (N,) flags by reason.
     """
     kept = np.ones(part.size, np.bool_)
     counts = {}
@@ -145,35 +147,28 @@ def keep_samples(part: Parts, drops: Mapping[str, NDArray[np.bool_]]) -> tuple[N
 
 
 def count_parts(part: Parts) -> list[int]:
-    """How many entries stand in each part."""
+    """Count the entries of each part."""
     return [int(count) for count in np.bincount(part, minlength=len(PARTS))]
 
 
 ORIGINAL_ORDER = ("us-101-0750", "us-101-0805", "us-101-0820", "i-80-1600", "i-80-1700", "i-80-1715")
-"""The script's data sets 1 to 6."""
+"""Recordings that are the script's data sets 1 to 6."""
 
 
 def number_datasets(subsets: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
-    """Give every subset its data set id, a row of `tracks`.
+    """Number (dataset, subset) pairs with data set ids, the rows of `tracks`.
 
-    NGSIM's six freeway recordings have the script's 1 to 6 as soon as one of them is there; the others follow, NGSIM's
+    NGSIM's six freeway recordings have the script's ids 1 to 6 if one of them is present; the others follow, NGSIM's
     before highD's, by name.
-
-    Args:
-        subsets: (dataset, subset), each once.
     """
-    asked = set(subsets)
+    given = set(subsets)
     original = {("ngsim", name): number for number, name in enumerate(ORIGINAL_ORDER, start=1)}
-    known = {subset: number for subset, number in original.items() if subset in asked}
-    others = sorted(asked - known.keys(), key=lambda subset: (subset[0] != "ngsim", subset))
+    known = {subset: number for subset, number in original.items() if subset in given}
+    others = sorted(given - known.keys(), key=lambda subset: (subset[0] != "ngsim", subset))
     return known | {subset: number for number, subset in enumerate(others, start=1 + len(original) * bool(known))}
 
 
 def count_rows(ids: Mapping[tuple[str, str], int]) -> int:
-    """Rows of `tracks`: the script's six if one of them is there, and one for each other subset.
-
-    Args:
-        ids: from `number_datasets`.
-    """
+    """Count the rows of `tracks`: the script's six if one of them is present, and one for each other subset."""
     has_known = any(dataset == "ngsim" and subset in ORIGINAL_ORDER for dataset, subset in ids)
     return max([*ids.values(), len(ORIGINAL_ORDER) * has_known])

@@ -1,4 +1,4 @@
-"""One subset as convolutional social pooling's files hold it: rows, labels, parts, and which rows are samples."""
+"""One subset prepared for convolutional social pooling's files: rows, labels, parts and samples."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.csp.entries import (
     CspEntries,
-    Ints,
-    Singles,
-    name_as_recorded,
-    name_by_runs,
+    assign_recorded_ids,
+    assign_run_ids,
     to_csp_entries,
 )
 from tracklake.pipeline.transforms.csp.grid import OverwritingGrid, ResolvedGrid
@@ -27,31 +25,35 @@ from tracklake.pipeline.transforms.csp.parts import (
     SAME_ID,
     WOULD_BE,
     Parts,
+    assign_parts_by_id,
+    assign_parts_by_split,
     find_drops,
     keep_samples,
-    part_by_id,
-    part_by_split,
 )
 from tracklake.pipeline.transforms.resample import find_stride, put_on_clock
 from tracklake.pipeline.transforms.starts.late_starts import find_would_be_neighbors
+from tracklake.schemas.arrays import Flags, Integers, Singles
 from tracklake.schemas.samples import CELLS
 
 RATE_HZ = 10
+"""Rate of the script's clock, in Hz."""
+
 COLUMNS = 8 + CELLS
-"""Of `traj`: data set, vehicle, frame, x, y, lane, lateral and longitudinal code, the 39 cells."""
+"""Columns of `traj`: data set, vehicle, frame, x, y, lane, lateral and longitudinal code, the 39 cells."""
+
 BLOCK_ROWS = 1 << 16
-"""Samples put together at a time."""
+"""Samples assembled at once."""
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """What there is to know of a subset beside its tracks.
+class CspRecording:
+    """The facts about a subset beside its tracks.
 
     Args:
-        dataset_id: its row of `tracks`, from 1.
-        first_frame: the recording's first frame.
-        frame_rate_hz: the source's.
-        last_lane: lanes with higher numbers count as this one; None: all stay.
+        dataset_id: row of `tracks`, from 1.
+        first_frame: first frame of the recording.
+        frame_rate_hz: frame rate of the source.
+        last_lane: highest lane; higher ones count as this one. None = no limit.
     """
 
     dataset_id: int
@@ -61,13 +63,13 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Context:
-    """What `--clean` needs of a subset.
+class CleanContext:
+    """The tables of a subset that `--clean` reads.
 
     Args:
-        blocks: its rows of `splits`.
+        blocks: rows of `splits`.
         vehicle_starts: vehicle_id, early.
-        missing_starts: of late starts.
+        missing_starts: rows of `missing_starts`.
     """
 
     blocks: pl.DataFrame
@@ -80,15 +82,15 @@ class CspSubset:
     """A subset ready to be written.
 
     Args:
-        dataset_id: its row of `tracks`, from 1.
-        entries: all that stand in `tracks`.
-        lateral: (N,) code of each.
-        longitudinal: (N,) code of each.
-        part: (N,) of schemas.columns.PARTS.
-        kept: (N,) which are samples.
-        dropped: by reason, how many entries of each part are no samples.
-        left_out: by reason, how many entries stand nowhere.
-        positions: track_id, tick, x_m, lane of the entries where collisions are to be resolved, else None.
+        dataset_id: row of `tracks`, from 1.
+        entries: all entries of `tracks`.
+        lateral: (N,) lateral code.
+        longitudinal: (N,) longitudinal code.
+        part: (N,) code of the part.
+        kept: (N,) whether the entry is a sample.
+        dropped: number of entries of each part that are no samples, by reason.
+        left_out: number of entries that are in no file, by reason.
+        positions: track_id, tick, x_m, lane of the entries if collisions are resolved, else None.
     """
 
     dataset_id: int
@@ -96,45 +98,45 @@ class CspSubset:
     lateral: Codes
     longitudinal: Codes
     part: Parts
-    kept: NDArray[np.bool_]
+    kept: Flags
     dropped: dict[str, list[int]]
     left_out: dict[str, int]
     positions: pl.DataFrame | None = None
 
     def open_grid(self) -> OverwritingGrid | ResolvedGrid:
-        """The grid around the samples; made when it is needed, for it is large."""
+        """Build the grid around the samples; it is large, so only when it is needed."""
         if self.positions is None:
             return OverwritingGrid(self.entries)
         return ResolvedGrid(self.positions, self.kept, self.part)
 
-    def samples_of(self, part: int) -> Ints:
-        """Rows of the samples of a part, in order."""
+    def find_samples(self, part: int) -> Integers:
+        """Return the rows of a part's samples, in order."""
         return np.flatnonzero(self.kept & (self.part == part))
 
-    def assemble(self, rows: Ints, grid: OverwritingGrid | ResolvedGrid) -> Iterator[Singles]:
+    def assemble_samples(self, rows: Integers, grid: OverwritingGrid | ResolvedGrid) -> Iterator[Singles]:
         """Yield the samples of some rows as blocks (47, B) of columns of `traj`."""
         entries = self.entries
         columns: list[NDArray[Any]] = [entries.track_id, entries.frame, entries.x_ft, entries.y_ft, entries.lane]
         columns += [self.lateral, self.longitudinal]
         for start in range(0, rows.size, BLOCK_ROWS):
-            some = rows[start : start + BLOCK_ROWS]
-            block = np.empty((COLUMNS, some.size), np.float32)
+            chunk = rows[start : start + BLOCK_ROWS]
+            block = np.empty((COLUMNS, chunk.size), np.float32)
             block[0] = self.dataset_id
-            for place, column in enumerate(columns, start=1):
-                block[place] = column[some]
-            block[COLUMNS - CELLS :] = grid.fill(some).T
+            for row, column in enumerate(columns, start=1):
+                block[row] = column[chunk]
+            block[COLUMNS - CELLS :] = grid.fill_grids(chunk).T
             yield block
 
 
-def put_on_csp_clock(tracks: pl.DataFrame, recorded: Recorded) -> pl.DataFrame:
+def put_on_csp_clock(tracks: pl.DataFrame, recorded: CspRecording) -> pl.DataFrame:
     """Put tracks on the script's 10 Hz clock.
 
     A 10 Hz source keeps its entries and frame numbers. Any other is interpolated (`put_on_clock`), and its frames are
-    counted in ticks from 1.
+    ticks counted from 1.
 
     Args:
         tracks: vehicle_id, frame, x_m, y_m, lane of one subset, sorted by vehicle_id, frame.
-        recorded: of the subset.
+        recorded: facts about the subset.
     """
     clock = put_on_clock(
         tracks, first_frame=recorded.first_frame, frame_rate_hz=recorded.frame_rate_hz, rate_hz=RATE_HZ
@@ -143,46 +145,50 @@ def put_on_csp_clock(tracks: pl.DataFrame, recorded: Recorded) -> pl.DataFrame:
     return clock if native else clock.with_columns(frame=pl.col("tick") + 1)
 
 
-def prepare_as_original(
-    clock: pl.DataFrame, vehicles: pl.DataFrame, recorded: Recorded, *, full_future: bool = False
+def prepare_original_subset(
+    clock: pl.DataFrame, vehicles: pl.DataFrame, recorded: CspRecording, *, full_future: bool = False
 ) -> CspSubset:
     """Prepare a subset as the script does.
 
     Args:
-        clock: from `put_on_csp_clock`, lane without nulls.
+        clock: entries from `put_on_csp_clock`, lane without nulls.
         vehicles: vehicle_id, source_vehicle_id.
-        recorded: of the subset.
+        recorded: facts about the subset.
         full_future: whether a sample needs 50 rows after it.
     """
-    named, shared = name_as_recorded(clock, vehicles)
-    named, nameless = _without_id_zero(named)
+    named, shared = assign_recorded_ids(clock, vehicles)
+    named, zeros = _drop_id_zero(named)
     entries = to_csp_entries(named, last_lane=recorded.last_lane)
-    part = part_by_id(entries.track_id)
+    part = assign_parts_by_id(entries.track_id)
     kept, dropped = keep_samples(part, find_drops(entries, full_future=full_future))
-    left_out = {SAME_ID: shared, ID_ZERO: nameless}
-    return CspSubset(recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, _some(left_out), None)
+    left_out = _drop_zero_counts({SAME_ID: shared, ID_ZERO: zeros})
+    return CspSubset(recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, left_out, None)
 
 
-def prepare_clean(clock: pl.DataFrame, context: Context, recorded: Recorded, *, full_future: bool = False) -> CspSubset:
-    """Prepare a subset without late starts, gaps, overwritten neighbors and leaks; the arithmetic stays the script's.
+def prepare_clean_subset(
+    clock: pl.DataFrame, context: CleanContext, recorded: CspRecording, *, full_future: bool = False
+) -> CspSubset:
+    """Prepare a subset without late starts, gaps, overwritten neighbors and leaks, with the script's arithmetic.
 
     Args:
-        clock: from `put_on_csp_clock`, lane without nulls.
-        context: of the subset.
-        recorded: of the subset.
+        clock: entries from `put_on_csp_clock`, lane without nulls.
+        context: the subset's split and late starts.
+        recorded: facts about the subset.
         full_future: whether a sample needs 50 rows after it.
     """
     stride = find_stride(frame_rate_hz=recorded.frame_rate_hz, rate_hz=RATE_HZ)
-    clock, nameless = _without_id_zero(clock.with_columns(track_id="vehicle_id"))
-    part, block, intended = part_by_split(clock, context.blocks, first_frame=recorded.first_frame, stride=float(stride))
+    clock, zeros = _drop_id_zero(clock.with_columns(track_id="vehicle_id"))
+    part, block, intended = assign_parts_by_split(
+        clock, context.blocks, first_frame=recorded.first_frame, stride=float(stride)
+    )
     left_out = {
-        ID_ZERO: nameless,
+        ID_ZERO: zeros,
         OUTSIDE_SPLIT: int((intended == NO_PART).sum()),
         IN_TWO_PARTS: int(((intended != NO_PART) & (part == NO_PART)).sum()),
     }
     within = part != NO_PART
     highest_id = int(clock["vehicle_id"].to_numpy().max(initial=0))
-    named = name_by_runs(clock.with_columns(part=part).filter(within), block[within], highest_id=highest_id)
+    named = assign_run_ids(clock.with_columns(part=part).filter(within), block[within], highest_id=highest_id)
     entries = to_csp_entries(named, last_lane=recorded.last_lane)
     part = named["part"].to_numpy()
     early = context.vehicle_starts.filter("early")["vehicle_id"].implode()
@@ -200,16 +206,15 @@ def prepare_clean(clock: pl.DataFrame, context: Context, recorded: Recorded, *, 
     positions = named.select(
         "tick", "x_m", track_id=pl.Series(entries.track_id), lane=pl.Series(entries.lane).cast(pl.Int16)
     )
-    return CspSubset(
-        recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, _some(left_out), positions
-    )
+    left_out = _drop_zero_counts(left_out)
+    return CspSubset(recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, left_out, positions)
 
 
-def stack_tracks(subset: CspSubset, part: int) -> tuple[NDArray[np.int32], Ints, Singles]:
-    """The tracks of a part, as `tracks` holds them.
+def stack_tracks(subset: CspSubset, part: int) -> tuple[NDArray[np.int32], Integers, Singles]:
+    """Stack the tracks of a part for `tracks`.
 
     Returns:
-        (V,) ids, increasing; (V,) rows of each; (N, 3) frame, x, y of all, one track after the other.
+        (V,) increasing ids; (V,) number of rows; (N, 3) frame, x, y of all tracks, one after the other.
     """
     rows = np.flatnonzero(subset.part == part)
     entries = subset.entries
@@ -218,11 +223,11 @@ def stack_tracks(subset: CspSubset, part: int) -> tuple[NDArray[np.int32], Ints,
     return ids, lengths, values
 
 
-def _without_id_zero(clock: pl.DataFrame) -> tuple[pl.DataFrame, int]:
-    """The clock without track 0, and how many rows that had."""
-    nameless = int((clock["track_id"] == 0).sum())
-    return (clock.filter(pl.col("track_id") != 0) if nameless else clock), nameless
+def _drop_id_zero(clock: pl.DataFrame) -> tuple[pl.DataFrame, int]:
+    """Drop track 0 from the clock and count its rows."""
+    zeros = int((clock["track_id"] == 0).sum())
+    return (clock.filter(pl.col("track_id") != 0) if zeros else clock), zeros
 
 
-def _some(counts: dict[str, int]) -> dict[str, int]:
+def _drop_zero_counts(counts: dict[str, int]) -> dict[str, int]:
     return {reason: count for reason, count in counts.items() if count}

@@ -1,1 +1,1 @@
-"""Prediction origins with their maneuvers and neighbors."""
+"""Samples (prediction origins) with their maneuvers and neighbors."""

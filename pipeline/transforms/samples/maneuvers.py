@@ -4,39 +4,44 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tracklake.pipeline.transforms.resample import bound_segments
+from tracklake.schemas.arrays import bound_runs
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 
 LANE_WINDOW_S = 4
-"""The lane now is compared with the lane this long before and after."""
+"""Time before and after an entry at which lanes are compared with its own, in s."""
+
 BRAKE_HISTORY_S = 3
+"""Window of the past mean speed, in s."""
+
 BRAKE_FUTURE_S = 5
+"""Window of the future mean speed, in s."""
+
 BRAKE_RATIO = (4, 5)
-"""0.8 as a fraction: `brake` where the mean speed ahead is less than this share of the mean speed behind."""
+"""Ratio of future to past mean speed below which a vehicle brakes: 0.8 as a fraction."""
+
 UNITS_PER_M = 1e7
-"""Displacements are compared as whole tenths of a micrometre: a millimetre and a thousandth of a foot are both whole
-numbers of them, so that rounding does not decide whether a ratio is 0.8 exactly."""
+"""Units of displacement per m. A millimetre and a thousandth of a foot are whole numbers of units, so rounding does not
+decide whether a ratio is exactly 0.8."""
 
 
 def label_maneuvers(clock: pl.DataFrame, *, rate_hz: int) -> pl.DataFrame:
     """Label every entry on the clock with its lateral and its longitudinal maneuver (DESIGN section 7).
 
-    The windows follow the code of convolutional social pooling (Deo and Trivedi 2018, preprocess_data.m), not its
-    text: the lane now against the lane 4 s before and 4 s after, and the mean speed (displacement / elapsed) over the
-    next 5 s against that over the last 3 s. They are clamped to the track; where the track has gaps, to the gap-free
-    segment that the entry stands in, since what lies across a gap is not bridged.
+    The windows follow the code of convolutional social pooling (Deo and Trivedi 2018, preprocess_data.m), not the
+    paper's text: the lane now against the lane 4 s before and 4 s after, and the mean speed (displacement / time) over
+    the next 5 s against that over the last 3 s. Windows are clamped to the entry's gap-free segment.
 
-    - lateral: `right` where the lane number grows over either window (tested first), else `left` where it falls over
+    - lateral: `right` if the lane number grows over either window (tested first), else `left` if it falls over
       either, else `keep`. Lane 1 is the driver's leftmost.
-    - longitudinal: `brake` where mean speed ahead / mean speed behind < 0.8, else `normal`. An empty window on either
+    - longitudinal: `brake` if mean speed ahead / mean speed behind < 0.8, else `normal`. An empty window on either
       side, or a history without forward progress (standing, or pushed backwards by noise), is `normal`.
 
     Args:
-        clock: x_m, lane, segment as `put_on_clock` leaves them; lane without nulls.
-        rate_hz: ticks per second of the clock.
+        clock: x_m, lane (without nulls), segment from `put_on_clock`.
+        rate_hz: rate of the clock.
 
     Returns:
-        One row per entry, in the same order: lateral_maneuver, longitudinal_maneuver (Enums).
+        lateral_maneuver and longitudinal_maneuver (Enums) of every entry, in the clock's order.
 
     Raises:
         ValueError: a lane is null.
@@ -44,7 +49,7 @@ def label_maneuvers(clock: pl.DataFrame, *, rate_hz: int) -> pl.DataFrame:
     if clock["lane"].null_count():
         raise ValueError(f"{clock['lane'].null_count()} of {clock.height} entries have no lane: maneuvers need one")
     row = np.arange(clock.height)
-    first, last = bound_segments(clock)
+    first, last = bound_runs(clock["segment"].to_numpy())
 
     lane = clock["lane"].to_numpy()
     lane_before = lane[np.maximum(row - LANE_WINDOW_S * rate_hz, first)]
@@ -62,11 +67,11 @@ def label_maneuvers(clock: pl.DataFrame, *, rate_hz: int) -> pl.DataFrame:
     brake = (ahead > row) & (driven > 0) & (whole * to_drive * (row - behind) < share * driven * (ahead - row))
     return pl.DataFrame(
         {
-            "lateral_maneuver": _name(lateral, LATERAL_MANEUVERS),
-            "longitudinal_maneuver": _name(brake.astype(np.uint8), LONGITUDINAL_MANEUVERS),
+            "lateral_maneuver": _to_enum(lateral, LATERAL_MANEUVERS),
+            "longitudinal_maneuver": _to_enum(brake.astype(np.uint8), LONGITUDINAL_MANEUVERS),
         }
     )
 
 
-def _name(codes: NDArray[np.uint8], names: tuple[str, ...]) -> pl.Series:
+def _to_enum(codes: NDArray[np.uint8], names: tuple[str, ...]) -> pl.Series:
     return pl.Series(codes, dtype=pl.UInt8).cat.to(pl.Enum(names))

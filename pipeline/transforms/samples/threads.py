@@ -1,26 +1,26 @@
-"""Work on pieces of arrays in two threads: NumPy lets go of the interpreter while it computes."""
+"""Work on pieces of arrays in two threads; NumPy releases the interpreter lock while it computes."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 THREADS = 2
-"""More gain little: between its computations every thread needs the interpreter, and several recordings are worked on
-at once already."""
+"""Threads per call; more gain little, since each needs the interpreter between computations and several recordings are
+processed at once."""
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 
 def map_in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
-    """The results of a function for every piece, in the order of the pieces.
+    """Apply a function to every piece and return the results in the order of the pieces.
 
     Args:
-        work: must not change what the work on another piece reads.
-        pieces: small (bounds of a slice); all of them are listed before the first is begun.
+        work: function of a piece; it must not change what other calls read.
+        pieces: small values such as the bounds of a slice.
 
     Raises:
-        Exception: the first that `work` raises, in the order of the pieces.
+        Exception: the first exception of `work`, in the order of the pieces.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(work, pieces))

@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.transforms.csp.parts import part_by_id
+from tracklake.pipeline.transforms.csp.parts import assign_parts_by_id
 from tracklake.pipeline.transforms.splits.tables import Allocation, tabulate
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.split_recipes import find_shares
@@ -24,7 +24,7 @@ def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = 
     """
     units = [subsets.with_columns(part=pl.lit(None, pl.String)).clear()]
     for (dataset, subset), own in vehicles.group_by("dataset", "subset", maintain_order=True):
-        codes = part_by_id(own["vehicle_id"].cast(pl.Int32).to_numpy())
+        codes = assign_parts_by_id(own["vehicle_id"].cast(pl.Int32).to_numpy())
         ranges = (
             own.with_columns(part=pl.Series([PARTS[code] for code in codes], dtype=pl.String))
             .group_by("part")

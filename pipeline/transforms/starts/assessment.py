@@ -48,10 +48,10 @@ def assess_starts(
 
     Args:
         tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
-        vehicle_starts: vehicle_id, fully_tracked, from `judge_starts`.
+        vehicle_starts: vehicle_id, fully_tracked, from `classify_starts`.
         dataset: the subset's.
         subset: its name.
-        cutoff_m: from `judge_starts`, of the whole tracks; None = nothing to assess.
+        cutoff_m: from `classify_starts`, of the whole tracks; None = nothing to assess.
         first_frame: the recording's first frame.
         frame_rate_hz: the source's.
 

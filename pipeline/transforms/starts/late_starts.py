@@ -46,7 +46,7 @@ def find_cutoff(start_x_m: Floats) -> float | None:
     return float(candidates[np.argmax((2 * at_or_before >= starts.size) & none_just_beyond)])
 
 
-def judge_starts(
+def classify_starts(
     vehicles: pl.DataFrame,
     *,
     dataset: str,
@@ -151,10 +151,10 @@ def estimate_missing_starts(
 
     Args:
         tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
-        vehicle_starts: vehicle_id, starts_late, fully_tracked, from `judge_starts`.
+        vehicle_starts: vehicle_id, starts_late, fully_tracked, from `classify_starts`.
         dataset: the subset's.
         subset: its name.
-        cutoff_m: from `judge_starts`; None = no late starts.
+        cutoff_m: from `classify_starts`; None = no late starts.
         first_frame: the recording's first frame.
         frame_rate_hz: the source's.
 

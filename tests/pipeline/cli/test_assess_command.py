@@ -14,7 +14,7 @@ from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.lake import connect, open_for_writing
 from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, RunRequest, RunResult
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.sources.csv.raw_files import hash_raw
+from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.pipeline.transforms.starts.assessment import POSITIONS_M

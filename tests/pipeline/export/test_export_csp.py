@@ -11,7 +11,8 @@ from scipy.io import loadmat
 
 from tracklake.pipeline.export.csp import export as csp
 from tracklake.pipeline.export.csp.card import CARD
-from tracklake.pipeline.export.csp.export import FILES, CspOptions, export_csp
+from tracklake.pipeline.export.csp.export import FILES, export_csp
+from tracklake.pipeline.export.csp.result import CspOptions
 from tracklake.pipeline.export.folder import ExportError
 from tracklake.pipeline.lake import LakeMissingError, load, scan
 from tracklake.pipeline.settings import Settings

@@ -129,7 +129,7 @@ def test_parquet_equals_a_loop_over_the_tables(lake, parquet, tmp_path, absolute
 
 
 def test_npz_holds_the_same(lake, parquet, tmp_path, monkeypatch):
-    monkeypatch.setattr(windows, "READ_AT_ONCE", 7)  # several pieces per file
+    monkeypatch.setattr(windows, "BATCH_SAMPLES", 7)  # several pieces per file
     export = export_windows(Settings(lake=lake), tmp_path / "out", "npz")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {name.replace("parquet", "npz") for name in NAMES}
     for part in ("train", "eval"):
@@ -177,7 +177,7 @@ def test_the_card_says_what_the_files_are(lake, parquet, tmp_path):
         "- train_share: 0.8\n- validation: False\n- vehicles left out of val and eval: 0\n",
         "H = 16 positions of history, the sample's own included; F = 25 of future",
         "| ngsim/i-80-1600 | 0 | ",
-        "| history_x_m | fixed_size_list<float>[16] | up to the sample's tick, m |",
+        "| history_x_m | fixed_size_list<float>[16] | x up to the sample's tick, m |",
         "relative to the sample's last position",
     ):
         assert said in card, said
@@ -218,7 +218,7 @@ def test_a_failure_leaves_nothing(lake, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("tracklake.pipeline.export.windows.card.write_card", fail)
+    monkeypatch.setattr(windows, "write_card", fail)
     with pytest.raises(FileAccessError, match="disk full"):
         export_windows(Settings(lake=lake), tmp_path / "out", "npz")
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.lake import open_for_writing
 from tracklake.pipeline.sources import SourceError
-from tracklake.pipeline.sources.csv.raw_files import hash_raw
+from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.sources.highd_rows import LANE, SPEED
 
 

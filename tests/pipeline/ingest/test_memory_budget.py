@@ -13,7 +13,8 @@ from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.ingest.memory_budget import MemoryBudget
 from tracklake.pipeline.lake import open_for_writing
 from tracklake.pipeline.sources import RawFile
-from tracklake.pipeline.sources.csv.raw_files import GZIP_RATIO, hash_raw, unpacked_bytes
+from tracklake.pipeline.sources.csv import hash_raw, measure_unpacked
+from tracklake.pipeline.sources.csv.raw_files import GZIP_RATIO
 
 
 def test_no_more_is_taken_at_once_than_there_is_and_all_have_a_turn():
@@ -88,7 +89,7 @@ def test_the_length_of_a_packed_files_text(tmp_path):
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(text))
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("folder/a.csv", text)
-    assert unpacked_bytes(RawFile(tmp_path / "a.csv", "00")) == len(text)
-    assert unpacked_bytes(RawFile(tmp_path / "a.zip", "00", member="folder/a.csv")) == len(text)
+    assert measure_unpacked(RawFile(tmp_path / "a.csv", "00")) == len(text)
+    assert measure_unpacked(RawFile(tmp_path / "a.zip", "00", member="folder/a.csv")) == len(text)
     packed = (tmp_path / "a.csv.gz").stat().st_size
-    assert unpacked_bytes(RawFile(tmp_path / "a.csv.gz", "00")) == GZIP_RATIO * packed, "estimated"
+    assert measure_unpacked(RawFile(tmp_path / "a.csv.gz", "00")) == GZIP_RATIO * packed, "estimated"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raw_texts import TEXT_NAMES, as_csv, ngsim, ngsim_row, read_highd, read_ngsim, write
 
-from tracklake.pipeline.sources.completeness import Announced, compare
+from tracklake.pipeline.sources.completeness import Announced, compare_counts
 from tracklake.pipeline.sources.ngsim_dialects import RECORDINGS
 from tracklake.pipeline.sources.source import Subset
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, SUBSETS
@@ -320,7 +320,7 @@ def published(entries, vehicles):
     )  # fmt: skip
     subset = Subset("us-101-0750", TRACKS_TABLE.empty(), frame, SUBSETS.empty())
     announced = Announced(PUBLISHED_TOTALS["us-101-0750"], "published", None, "Total_Frames")
-    return compare("ngsim", "us-101-0750", [subset], announced, INGEST_LOG.empty())
+    return compare_counts("ngsim", "us-101-0750", [subset], announced, INGEST_LOG.empty())
 
 
 @pytest.mark.parametrize(

@@ -203,7 +203,7 @@ def test_a_second_file_of_one_kind_is_named_not_passed_over(tmp_path):
     grouping = group(copy, *paths)
     assert [file.path for file in grouping.units[0].files] == paths
     assert grouping.refusals == (
-        "01_tracks (1).csv: a second tracks file of recording 01 beside 01_tracks.csv, which was taken. Expected one; "
+        "01_tracks (1).csv: a second tracks file of recording 01 beside 01_tracks.csv, which was used. Expected one; "
         "remove one of the two.",
     )
 

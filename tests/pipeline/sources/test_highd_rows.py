@@ -5,7 +5,8 @@ from highd_files import TRACKS, VEHICLES, track_row, vehicle_row, write_recordin
 from raw_texts import read_highd
 
 from tracklake.pipeline.sources import SourceError
-from tracklake.pipeline.sources.highd_rows import LANE, SPEED, STRANGER
+from tracklake.pipeline.sources.highd_rows import LANE, SPEED
+from tracklake.pipeline.sources.levelx import UNKNOWN_VEHICLE
 
 BOX = (100, 13, 4, 2)
 
@@ -59,7 +60,7 @@ def test_a_few_damaged_ids_are_dropped_and_many_are_refused(tmp_path):
     tracks = [track_row(frame, 1, BOX, ("-25.00", "0.00"), 2) for frame in range(1, 100)]
     stranger = track_row(100, 77, BOX, ("-25.00", "0.00"), 2)
     canonical = read_highd(write_recording(tmp_path, vehicles=vehicles, tracks=[*tracks, stranger]))
-    assert reasons(canonical) == [(101, STRANGER)]
+    assert reasons(canonical) == [(101, UNKNOWN_VEHICLE)]
     again = track_row(101, 77, BOX, ("-25.00", "0.00"), 2)
     files = write_recording(tmp_path / "many", vehicles=vehicles, tracks=[*tracks, stranger, again])
     with pytest.raises(SourceError, match=r"01_tracks\.csv, line 101: vehicle 77 has no row in 01_tracksMeta\.csv"):

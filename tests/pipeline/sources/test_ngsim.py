@@ -17,7 +17,7 @@ from raw_texts import (
 )
 
 from tracklake.pipeline.sources.ngsim import NGSIM
-from tracklake.pipeline.sources.ngsim_dialects import name_recording, site_of
+from tracklake.pipeline.sources.ngsim_dialects import find_site, name_recording
 from tracklake.pipeline.sources.source import SourceError
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
@@ -193,7 +193,7 @@ def test_a_last_column_of_no_meaning_does_not_hide_a_cut_line(tmp_path):
 )
 def test_recordings_are_named_by_their_key(key, location, recording, site):
     assert name_recording(key, location) == recording
-    assert site_of(recording) == site
+    assert find_site(recording) == site
 
 
 def test_recordings_are_told_apart_and_ids_restart_in_each(tmp_path):

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
-from tracklake.pipeline.transforms.resample import CLOCK_DTYPES, bound_segments, cut_runs, find_stride, put_on_clock
+from tracklake.pipeline.transforms.resample import CLOCK_DTYPES, cut_runs, find_stride, put_on_clock
+from tracklake.schemas.arrays import bound_runs
 from tracklake.schemas.errors import TracklakeError
 
 INT32_MAX = 2**31 - 1
@@ -101,7 +102,7 @@ def test_no_tracks():
     clock = put_on_clock(make_tracks([]), first_frame=1, frame_rate_hz=25.0, rate_hz=10)
     assert clock.is_empty()
     assert dict(clock.schema) == CLOCK_DTYPES
-    first, last = bound_segments(clock)
+    first, last = bound_runs(clock["segment"].to_numpy())
     assert first.size == last.size == 0
 
 
@@ -117,7 +118,7 @@ def test_stride_is_exact():
 
 def test_segment_bounds():
     clock = pl.DataFrame({"segment": [1, 1, 1, 2, 4, 4]})
-    first, last = bound_segments(clock)
+    first, last = bound_runs(clock["segment"].to_numpy())
     assert first.tolist() == [0, 0, 0, 3, 4, 4]
     assert last.tolist() == [2, 2, 2, 3, 5, 5]
 

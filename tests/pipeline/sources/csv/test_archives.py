@@ -14,7 +14,7 @@ from raw_texts import TEXT_NAMES, as_csv, check_accounts, tracks_of, write
 from tracklake.pipeline.ingest import discovery as discovery_module
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.sources import RawFile, SourceError
-from tracklake.pipeline.sources.csv.raw_files import fetch_lines, hash_raw, read_head
+from tracklake.pipeline.sources.csv import fetch_lines, hash_raw, read_head
 
 PACKINGS = ("gzip", "an archive each", "one archive", "stored", "gzip in zip", "mixed")
 
@@ -152,12 +152,11 @@ def test_members_that_cannot_be_read_are_refused_once_for_all_and_the_others_go_
     assert sorted(discovery.refusals) == [
         "locked.zip/0_tracks.csv and 2 more: encrypted. Expected an archive without a password. "
         "Unpack locked.zip and give the folder.",
-        "nested.zip/inner.zip: an archive inside an archive, which is not looked into. Expected the raw files. "
+        "nested.zip/inner.zip: an archive inside an archive, which is not read. Expected the raw files. "
         "Unpack nested.zip and give the folder.",
         "odd.zip/data/export.csv: compressed by method 12. Expected 0 (stored) or 8 (deflated). "
         "Unpack odd.zip and give the folder.",
-        "twice.zip/a.csv and 1 more: 2 members of this name, of which no more than one can be meant. "
-        "Expected one. Unpack twice.zip and give the folder.",
+        "twice.zip/a.csv and 1 more: 2 members have this name. Expected one. Unpack twice.zip and give the folder.",
     ]
 
 
@@ -191,7 +190,7 @@ def test_an_archive_that_changed_after_it_was_looked_into(tmp_path):
     path = pack(tmp_path / "a.zip", {"raw.txt": NGSIM_FILES["text"]})
     (file,) = find(path).units[0][1].files
     pack(path, {"other.txt": NGSIM_FILES["text"]})
-    with pytest.raises(SourceError, match=r"^a\.zip/raw\.txt: not in the archive any more.* Run again\.$"):
+    with pytest.raises(SourceError, match=r"^a\.zip/raw\.txt: no longer in the archive.* Run again\.$"):
         read_head(file)
 
 

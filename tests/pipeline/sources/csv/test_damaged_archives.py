@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from raw_texts import as_csv, ngsim_row, write
 
 from tracklake.pipeline.sources import SourceError
-from tracklake.pipeline.sources.csv.raw_files import read_head
+from tracklake.pipeline.sources.csv import read_head
 
 
 @pytest.mark.parametrize("cut", [5, 40, -30, -1])

@@ -1,4 +1,4 @@
-"""What the strict parser takes at once, the one that looks at lines one by one takes as well, with the same values."""
+"""The strict parser and the line parser accept the same lines, with the same values."""
 
 import pytest
 from hypothesis import example, given, settings
@@ -6,10 +6,11 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from raw_texts import EXPORT_NAMES, TEXT_NAMES
 
-from tracklake.pipeline.sources.csv.lines import _parse_line_by_line, _parse_strictly
-from tracklake.pipeline.sources.csv.raw_files import count_lines
-from tracklake.pipeline.sources.highd import RAW, RECORDING, TRACKS, VEHICLES, _layout
-from tracklake.pipeline.sources.ngsim_dialects import CSV, TEXT, layout_of
+from tracklake.pipeline.sources.csv.line_bytes import count_lines
+from tracklake.pipeline.sources.csv.reader import _parse_line_by_line, _parse_strictly
+from tracklake.pipeline.sources.highd import HIGHD_FORMAT
+from tracklake.pipeline.sources.levelx import RECORDING, TRACKS, VEHICLES
+from tracklake.pipeline.sources.ngsim_dialects import CSV, TEXT, build_layout
 
 
 def cells_of(text):
@@ -31,7 +32,7 @@ ROW_RECORDING = cells_of(
 
 
 def ngsim_layout(names, dialect=CSV):
-    return layout_of(",".join(names).encode() + b"\n", dialect, where="test")
+    return build_layout(",".join(names).encode() + b"\n", dialect, where="test")
 
 
 CASES = {
@@ -40,9 +41,9 @@ CASES = {
     "no header": (ngsim_layout(TEXT_NAMES, f"{CSV}-no-header"), ROW_18),
     "export": (ngsim_layout(EXPORT_NAMES), ROW_25),
     "more columns": (ngsim_layout(("remark", *EXPORT_NAMES, "more")), ['"a,b"', *ROW_25, "x"]),
-    "tracks": (_layout(TRACKS, RAW[TRACKS]), ROW_TRACKS),
-    "vehicles": (_layout(VEHICLES, RAW[VEHICLES]), ROW_VEHICLES),
-    "recording": (_layout(RECORDING, RAW[RECORDING]), ROW_RECORDING),
+    "tracks": (HIGHD_FORMAT.build_layout(TRACKS), ROW_TRACKS),
+    "vehicles": (HIGHD_FORMAT.build_layout(VEHICLES), ROW_VEHICLES),
+    "recording": (HIGHD_FORMAT.build_layout(RECORDING), ROW_RECORDING),
 }
 CELLS = [
     *("", " ", '""', '"', '" "', '"5"', '" 5"', '"5 "', '"a"b', 'a"b', "null", "true", "x", "#5", "'5'", "\u0665"),

@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from test_csp_original import DTYPES, assemble, drive, prepare, recordings
 
 from tracklake.pipeline.transforms.csp.parts import REASONS, TEST, TRAIN, VAL
-from tracklake.pipeline.transforms.csp.subset import Context, Recorded, prepare_clean, put_on_csp_clock, stack_tracks
+from tracklake.pipeline.transforms.csp.subset import (
+    CleanContext,
+    CspRecording,
+    prepare_clean_subset,
+    put_on_csp_clock,
+    stack_tracks,
+)
 from tracklake.schemas import MISSING_STARTS, SPLITS
 from tracklake.schemas.columns import FOOT_M
 
@@ -30,9 +36,9 @@ def clean(rows, *, blocks=(("train", 0, ALL),), early=(), missing=(), last_lane=
     metres = [(v, f, float(y) * FOOT_M, float(x) * FOOT_M, lane) for v, f, x, y, lane in rows]
     tracks = pl.DataFrame(metres, schema=DTYPES, orient="row").sort("vehicle_id", "frame")
     starts = tracks.select(pl.col("vehicle_id").unique().sort()).with_columns(early=pl.col("vehicle_id").is_in(early))
-    recorded = Recorded(1, tracks["frame"].min(), 10.0, last_lane)
-    context = Context(make_blocks(*blocks), starts, pl.DataFrame(list(missing), schema=MISSING_STARTS.dtypes))
-    return prepare_clean(put_on_csp_clock(tracks, recorded), context, recorded, full_future=full_future)
+    recorded = CspRecording(1, tracks["frame"].min(), 10.0, last_lane)
+    context = CleanContext(make_blocks(*blocks), starts, pl.DataFrame(list(missing), schema=MISSING_STARTS.dtypes))
+    return prepare_clean_subset(put_on_csp_clock(tracks, recorded), context, recorded, full_future=full_future)
 
 
 def dropped(subset):
@@ -190,11 +196,11 @@ def test_a_skipped_source_frame_between_two_ticks_begins_a_track():
     tracks = pl.DataFrame({"vehicle_id": 1, "frame": frames, "x_m": np.arange(99.0), "y_m": 2.0, "lane": 1}).cast(
         DTYPES
     )
-    recorded = Recorded(1, 1, 25.0, None)
-    context = Context(
+    recorded = CspRecording(1, 1, 25.0, None)
+    context = CleanContext(
         make_blocks(("train", 0, ALL)), pl.DataFrame({"vehicle_id": [1], "early": [False]}), MISSING_STARTS.empty()
     )
-    found = prepare_clean(put_on_csp_clock(tracks, recorded), context, recorded)
+    found = prepare_clean_subset(put_on_csp_clock(tracks, recorded), context, recorded)
     assert tracks_of(found) == {1: [1], 2: list(range(2, 41))}
 
 
@@ -203,9 +209,9 @@ def test_ticks_of_another_clock_lie_in_blocks_by_their_frames():
     tracks = pl.DataFrame(
         {"vehicle_id": 1, "frame": np.arange(1, 101), "x_m": np.arange(100.0), "y_m": 2.0, "lane": 1}
     ).cast(DTYPES)
-    recorded = Recorded(1, 1, 25.0, None)
+    recorded = CspRecording(1, 1, 25.0, None)
     starts = pl.DataFrame({"vehicle_id": [1], "early": [False]})
-    context = Context(make_blocks(("train", 1, 51)), starts, MISSING_STARTS.empty())
-    found = prepare_clean(put_on_csp_clock(tracks, recorded), context, recorded)
+    context = CleanContext(make_blocks(("train", 1, 51)), starts, MISSING_STARTS.empty())
+    found = prepare_clean_subset(put_on_csp_clock(tracks, recorded), context, recorded)
     assert tracks_of(found) == {1: list(range(1, 22))}  # frame 51 is tick 20, the 21st
     assert found.left_out == {"outside_split": 40 - 21}

@@ -11,8 +11,13 @@ from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.csp.entries import to_feet
 from tracklake.pipeline.transforms.csp.grid import CHUNK_ROWS
-from tracklake.pipeline.transforms.csp.parts import TEST, TRAIN, VAL, count_rows, number_datasets, part_by_id
-from tracklake.pipeline.transforms.csp.subset import Recorded, prepare_as_original, put_on_csp_clock, stack_tracks
+from tracklake.pipeline.transforms.csp.parts import TEST, TRAIN, VAL, assign_parts_by_id, count_rows, number_datasets
+from tracklake.pipeline.transforms.csp.subset import (
+    CspRecording,
+    prepare_original_subset,
+    put_on_csp_clock,
+    stack_tracks,
+)
 from tracklake.schemas.columns import FOOT_M
 from tracklake.schemas.errors import TracklakeError
 
@@ -27,12 +32,12 @@ def prepare(rows, *, dataset=1, last_lane=None, vehicles=None, full_future=False
     tracks = pl.DataFrame(metres, schema=DTYPES, orient="row").sort("vehicle_id", "frame")
     ids = tracks.select(pl.col("vehicle_id").unique().sort())
     names = ids.with_columns(source_vehicle_id=pl.col("vehicle_id").replace(vehicles or {}))
-    recorded = Recorded(dataset, tracks["frame"].min(), 10.0, last_lane)
-    return prepare_as_original(put_on_csp_clock(tracks, recorded), names, recorded, full_future=full_future)
+    recorded = CspRecording(dataset, tracks["frame"].min(), 10.0, last_lane)
+    return prepare_original_subset(put_on_csp_clock(tracks, recorded), names, recorded, full_future=full_future)
 
 
 def assemble(subset, part):
-    blocks = list(subset.assemble(subset.samples_of(part), subset.open_grid()))
+    blocks = list(subset.assemble_samples(subset.find_samples(part), subset.open_grid()))
     return np.concatenate(blocks, axis=1).T if blocks else np.zeros((0, 47), np.float32)
 
 
@@ -104,11 +109,11 @@ def test_many_samples_at_once_are_put_together_in_order():
     subset = prepare(rows)
     samples = np.flatnonzero(subset.kept)
     assert samples.size > CHUNK_ROWS
-    ids = subset.open_grid().fill(samples)
+    ids = subset.open_grid().fill_grids(samples)
     pick = np.array([0, CHUNK_ROWS - 1, CHUNK_ROWS, samples.size - 1])
-    assert np.array_equal(ids[pick], subset.open_grid().fill(samples[pick]))
+    assert np.array_equal(ids[pick], subset.open_grid().fill_grids(samples[pick]))
     assert np.array_equal(assemble(subset, TRAIN)[:, 1:3], np.stack(
-        [values[subset.samples_of(TRAIN)] for values in (subset.entries.track_id, subset.entries.frame)], axis=1
+        [values[subset.find_samples(TRAIN)] for values in (subset.entries.track_id, subset.entries.frame)], axis=1
     ))  # fmt: skip
 
 
@@ -116,7 +121,7 @@ def cells_around(*others, own=(50, 1000.0, 2)):
     """{cell: id} around one vehicle at one frame; others are (id, y, lane)."""
     rows = [(vehicle, 1, 20.0, y, lane) for vehicle, y, lane in (own, *others)]
     subset = prepare(rows)
-    (grid,) = subset.open_grid().fill(np.flatnonzero(subset.entries.track_id == own[0]))
+    (grid,) = subset.open_grid().fill_grids(np.flatnonzero(subset.entries.track_id == own[0]))
     return {cell: int(vehicle) for cell, vehicle in enumerate(grid) if vehicle}
 
 
@@ -228,9 +233,9 @@ def test_parts_end_at_rounded_shares_of_the_highest_id(highest):
     ids = np.array(sorted(i for i in ids if 1 <= i <= highest), np.int32)
     if highest <= 30_000:  # beyond, single precision does not hold the tenths
         expected = [TRAIN if i <= last_train else VAL if i <= last_val else TEST for i in ids]
-        assert part_by_id(ids).tolist() == expected
-    assert part_by_id(ids)[-1] == (TEST if highest > 2 else TRAIN if highest == 1 else VAL)
-    assert (np.diff(part_by_id(ids)) >= 0).all()
+        assert assign_parts_by_id(ids).tolist() == expected
+    assert assign_parts_by_id(ids)[-1] == (TEST if highest > 2 else TRAIN if highest == 1 else VAL)
+    assert (np.diff(assign_parts_by_id(ids)) >= 0).all()
 
 
 @given(st.lists(st.tuples(st.integers(0, 60_000_000), st.sampled_from([1000, 1_000_000])), min_size=1))
@@ -275,9 +280,9 @@ def test_25_hz_is_interpolated_to_ticks_counted_from_one():
     tracks = pl.DataFrame(
         {"vehicle_id": 3, "frame": np.arange(1, 101), "x_m": np.arange(1.0, 101.0), "y_m": 2.0, "lane": 1}
     ).cast(DTYPES)  # fmt: skip
-    recorded = Recorded(7, 1, 25.0, None)
+    recorded = CspRecording(7, 1, 25.0, None)
     clock = put_on_csp_clock(tracks, recorded)
-    subset = prepare_as_original(clock, pl.DataFrame({"vehicle_id": [3], "source_vehicle_id": [3]}), recorded)
+    subset = prepare_original_subset(clock, pl.DataFrame({"vehicle_id": [3], "source_vehicle_id": [3]}), recorded)
     assert subset.entries.frame.tolist() == list(range(1, 41))
     assert np.array_equal(subset.entries.y_ft, (np.arange(1.0, 101.0, 2.5) / 0.3048).astype(np.float32))
     assert np.flatnonzero(subset.kept).tolist() == list(range(30, 38))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from start_scenes import NAMES, US101, creep, cross_slowly, drive, make_tracks, read_us101, summarise
 
 from tracklake.pipeline.transforms.starts.assessment import POSITIONS_M, assess_starts, cut_and_estimate
-from tracklake.pipeline.transforms.starts.late_starts import estimate_missing_starts, judge_starts
+from tracklake.pipeline.transforms.starts.late_starts import classify_starts, estimate_missing_starts
 from tracklake.schemas.start_assessments import ESTIMATORS, START_ASSESSMENTS
 
 RATE_HZ = 10.0
@@ -261,7 +261,7 @@ def test_a_vehicle_that_backs_up_and_returns_starts_where_it_first_got():
 def test_us101_excerpt():
     """The contract's windows cover 95 %; the local regression covers at least as much with far less in vain."""
     tracks, first_frame = read_us101()
-    starts, cutoffs = judge_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=RATE_HZ)
+    starts, cutoffs = classify_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=RATE_HZ)
     cutoff_m = cutoffs["cutoff_m"][0]
     table = assess_starts(tracks, starts, **NAMES, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=RATE_HZ)
     sums = table.group_by("estimator").agg(pl.col("starts", "frames_missing", "frames_covered", "frames_excess").sum())

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from start_scenes import NAMES, US101, make_tracks, read_us101, summarise
 
 from tracklake.pipeline.transforms.starts.late_starts import (
+    classify_starts,
     estimate_missing_starts,
     find_cutoff,
     fit_frames,
-    judge_starts,
 )
 from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from tracklake.schemas.vehicles import VEHICLE_STARTS
@@ -30,7 +30,7 @@ def judge(rows, *, frame_rate_hz=10.0, first_frame=0, on_ramp_lanes=()):
         "end_x_m": pl.Float64,
         "start_lane": pl.Int16,
     }
-    starts, cutoffs = judge_starts(
+    starts, cutoffs = classify_starts(
         pl.DataFrame(rows, schema=schema, orient="row"),
         **NAMES,
         first_frame=first_frame,
@@ -175,7 +175,7 @@ def test_without_a_fully_tracked_vehicle_nobody_is_early():
 
 
 def estimate(tracks, *, first_frame=0, frame_rate_hz=10.0):
-    starts, cutoffs = judge_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=frame_rate_hz)
+    starts, cutoffs = classify_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=frame_rate_hz)
     missing = estimate_missing_starts(
         tracks,
         starts,
@@ -264,7 +264,7 @@ def test_tracks_with_a_gap_are_no_references():
 def test_nobody_late():
     tracks = make_tracks(steady(1, 20, 20, 8.0))
     assert estimate(tracks).is_empty()
-    starts, _ = judge_starts(summarise(tracks), **NAMES, first_frame=15, frame_rate_hz=10.0)
+    starts, _ = classify_starts(summarise(tracks), **NAMES, first_frame=15, frame_rate_hz=10.0)
     none = estimate_missing_starts(tracks, starts, **NAMES, cutoff_m=None, first_frame=15, frame_rate_hz=10.0)
     assert none.is_empty()
 
@@ -305,7 +305,7 @@ def test_estimates_agree_with_a_loop_on_tracks_that_creep_and_stop(seed):
         tracks.append(track)
     first_frame = -7
     frame = make_tracks([row for track in tracks for row in track])
-    _, cutoffs = judge_starts(summarise(frame), **NAMES, first_frame=first_frame, frame_rate_hz=10.0)
+    _, cutoffs = classify_starts(summarise(frame), **NAMES, first_frame=first_frame, frame_rate_hz=10.0)
     c = cutoffs["cutoff_m"][0]
     missing = estimate(frame, first_frame=first_frame).to_dicts()
 
@@ -342,7 +342,7 @@ def test_estimates_agree_with_a_loop_on_tracks_that_creep_and_stop(seed):
 def test_us101_excerpt():
     """DESIGN section 6: cut-off 14 m, and one of 289 tracks late (vehicle 407, first seen at 504.803 ft)."""
     tracks, first_frame = read_us101()
-    starts, cutoffs = judge_starts(
+    starts, cutoffs = classify_starts(
         summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=10.0, on_ramp_lanes=(7,)
     )
     row = cutoffs.row(0, named=True)

@@ -9,10 +9,10 @@ from start_scenes import NAMES, drive, make_tracks, summarise
 
 from tracklake.pipeline.transforms.starts.assessment import assess_starts
 from tracklake.pipeline.transforms.starts.late_starts import (
+    classify_starts,
     estimate_missing_starts,
     find_would_be_neighbors,
     fit_frames,
-    judge_starts,
 )
 from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from tracklake.schemas.start_assessments import START_ASSESSMENTS
@@ -47,7 +47,7 @@ def scenes(draw):
 def repair(tracks, *, first_frame=0, frame_rate_hz=10.0, on_ramp_lanes=()):
     """(vehicle_starts, start_cutoffs row, missing_starts), each as its schema has it."""
     times = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz}
-    starts, cutoffs = judge_starts(summarise(tracks), **NAMES, **times, on_ramp_lanes=on_ramp_lanes)
+    starts, cutoffs = classify_starts(summarise(tracks), **NAMES, **times, on_ramp_lanes=on_ramp_lanes)
     missing = estimate_missing_starts(tracks, starts, **NAMES, **times, cutoff_m=cutoffs["cutoff_m"][0])
     VEHICLE_STARTS.validate(starts, where="test")
     START_CUTOFFS.validate(cutoffs, where="test")

@@ -1,7 +1,7 @@
-"""Delimited text to typed columns with every line accounted for: kept, or rejected with line number and reason.
+"""The line reader: every line is kept as a typed row, or rejected with line number and reason.
 
-A file is read in chunks of whole lines. A chunk is parsed strictly and at once; only when that does not account for
-all of its lines is the chunk (not the file) looked at line by line.
+A file is read in chunks of whole lines. A chunk is parsed strictly at once; if that does not account for all of its
+lines, this chunk alone is parsed line by line.
 """
 
 import re
@@ -14,47 +14,47 @@ from typing import TypeVar
 
 import polars as pl
 
-from tracklake.pipeline.sources.csv.quoting import are_paired, unquote_thousands
-from tracklake.pipeline.sources.csv.raw_files import (
+from tracklake.pipeline.sources.csv.line_bytes import (
     BOM,
-    CHUNK_BYTES,
     LINE,
     count_byte,
     count_lines,
-    open_raw,
     separate_fields,
     split_lines,
     squeeze_blanks,
-    whole_lines,
 )
+from tracklake.pipeline.sources.csv.quoting import are_paired, unquote_thousands
+from tracklake.pipeline.sources.csv.raw_files import CHUNK_BYTES, open_raw, read_whole_lines
 from tracklake.pipeline.sources.source import RawFile
 
 Result = TypeVar("Result")
 
 REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
+"""Columns of the lines that were not kept."""
+
 THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
-"""A count or a length that may carry thousands separators: `1,156` is one, `1,15` is not."""
+"""Pattern of a number that may carry thousands separators: it fits `1,156`, not `1,15`."""
 
 UNNAMED = "#"
-"""In the name of a field that is not wanted, precedes its number where its own name is missing or taken."""
+"""Mark before the number of an unwanted field whose own name is missing or taken."""
 
 WELL_QUOTED = r'^("[^"]*"|[^",]*)(,("[^"]*"|[^",]*))*$'
-"""Quotes surround whole fields or do not occur."""
+"""Pattern of a line whose quotes surround whole fields."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the lines of a file are to be read.
+    """The layout of a file's lines.
 
     Args:
-        names: of all fields, in the file's order, as the raw schema calls them.
-        dtypes: of the fields that are wanted.
+        names: names of all fields, in the file's order, as in the raw schema.
+        dtypes: types of the wanted fields.
         required: wanted fields that may not be empty.
         thousands: wanted numeric fields that may carry thousands separators.
-        bounds: least and greatest value of numeric fields.
-        choices: the only values a text field may have (compared in lower case).
-        header_lines: 1 where line 1 names the fields, else 0.
-        blanks: fields are separated by runs of blanks instead of commas.
+        bounds: lowest and highest allowed value of numeric fields.
+        choices: allowed values of text fields, in lower case.
+        header_lines: 1 if line 1 names the fields, else 0.
+        blanks: whether runs of blanks separate fields instead of commas.
     """
 
     names: tuple[str, ...]
@@ -68,18 +68,18 @@ class Layout:
 
     @property
     def separator(self) -> str:
-        """Between fields, once runs of blanks are squeezed."""
+        """Character between fields, once runs of blanks are squeezed."""
         return " " if self.blanks else ","
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """What became of some consecutive lines.
+    """The kept and the rejected rows of some consecutive lines.
 
     Args:
-        frame: kept rows: the wanted fields plus `line` (Int64, from 1).
-        rejects: `line`, `reason`, `text` of the others.
-        rows_read: data lines seen; always the sum of the two.
+        frame: kept rows with the wanted fields and `line` (Int64, from 1).
+        rejects: `line`, `reason`, `text` of the other rows.
+        rows_read: number of data lines, always the sum of the two.
     """
 
     frame: pl.DataFrame
@@ -100,14 +100,14 @@ def map_chunks(
     threads: int,
     chunk_bytes: int = CHUNK_BYTES,
 ) -> Iterator[Result]:
-    """Read a file chunk by chunk and do something with each; gives the results in order.
+    """Apply a function to a file's chunks in threads, and yield its results in order.
 
     Args:
         file: the file, compressed or not.
-        layout: how to read its lines.
-        work: takes a chunk's number, from 0, and the chunk; called in the thread that parsed it.
-        threads: how many chunks are parsed and worked on at once; as many are held, and one more.
-        chunk_bytes: about how much is read at once.
+        layout: layout of its lines.
+        work: function of a chunk's number, from 0, and the chunk; called in the thread that parsed it.
+        threads: number of chunks parsed and worked on at once; one more is held in memory.
+        chunk_bytes: approximate size of a chunk.
 
     Raises:
         SourceError: a compressed file is damaged or cut short.
@@ -117,10 +117,10 @@ def map_chunks(
     ahead: deque[Future[Result]] = deque()
 
     def parse_and_work(number: int, data: bytes, first_line: int) -> Result:
-        return work(number, parse(data, layout, first_line=first_line))
+        return work(number, parse_lines(data, layout, first_line=first_line))
 
     with open_raw(file) as handle, ThreadPoolExecutor(threads) as pool:
-        for data in whole_lines(handle, chunk_bytes, file, heading_lines=layout.header_lines):
+        for data in read_whole_lines(handle, chunk_bytes, file, heading_lines=layout.header_lines):
             if line > layout.header_lines:
                 ahead.append(pool.submit(parse_and_work, next(numbers), data, line))
             line += count_lines(data)
@@ -129,17 +129,11 @@ def map_chunks(
         while ahead:
             yield ahead.popleft().result()
     if line == layout.header_lines + 1 > 1:
-        yield parse_and_work(0, b"", line)  # a header and nothing under it is not an empty file
+        yield parse_and_work(0, b"", line)  # a header without rows is not an empty file
 
 
-def parse(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:
-    """Parse whole lines.
-
-    Args:
-        data: the lines; the last may lack its newline.
-        layout: how to read them.
-        first_line: number of the first of them in its file.
-    """
+def parse_lines(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:
+    """Parse whole lines, of which the last may lack its newline; `first_line` is the number of the first."""
     if first_line == 1:
         data = data.removeprefix(BOM)
     rows_read = count_lines(data)
@@ -150,8 +144,8 @@ def parse(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:
 
 
 def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int) -> pl.DataFrame | None:
-    """All lines typed at once, or None where a single one cannot be accounted for."""
-    # A byte order mark inside a file comes from joining files; the CSV reader would take it only at a chunk's start.
+    """Parse all lines at once; None if a single one cannot be accounted for."""
+    # A byte order mark inside a file comes from joining files; the CSV reader accepts one only at a chunk's start.
     if b"\0" in data or (BOM[:1] in data and BOM in data):
         return None
     if not rows_read:
@@ -168,8 +162,8 @@ def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int
         frame = _scan(data, layout, layout.dtypes, first_line=first_line)
     except (pl.exceptions.ComputeError, pl.exceptions.NoDataError, pl.exceptions.SchemaError):
         return None
-    # Where a line has too few fields its last one is missing; if then the separators come to the right number, no
-    # line has too many either, which the reader, looking no further than what it was asked for, would not notice.
+    # A line with too few fields lacks its last one. If no line does and the number of separators is right, no line
+    # has too many fields either; the CSV reader would ignore those.
     if frame.height != rows_read or frame[layout.names[-1]].null_count():
         return None
     surplus = count_byte(data, layout.separator) - rows_read * (len(layout.names) - 1)
@@ -182,20 +176,20 @@ def _parse_strictly(data: bytes, layout: Layout, rows_read: int, first_line: int
 
 
 def _count_separators(fields: pl.DataFrame, layout: Layout) -> int:
-    """Separators inside quoted fields."""
+    """Count the separators inside quoted fields."""
     counts = fields.select(pl.all().str.count_matches(layout.separator, literal=True).sum())
     return int(counts.sum_horizontal().sum())
 
 
 def _is_sound(layout: Layout) -> pl.Expr:
-    """True for typed rows without a value that may not be: empty, not finite or not among those allowed."""
+    """Return an expression that is true if no value is forbidden: empty, not finite, out of bounds or unknown."""
     sound = [pl.col(name).null_count() == 0 for name in sorted(layout.required)]
     sound += [pl.col(name).is_finite().all() for name, dtype in layout.dtypes.items() if dtype.is_float()]
     for name, (low, high) in layout.bounds.items():
         sound += [] if low is None else [pl.col(name).min().fill_null(low) >= low]
         sound += [] if high is None else [pl.col(name).max().fill_null(high) <= high]
     sound += [~_not_among(pl.col(name).unique(), allowed).any() for name, allowed in layout.choices.items()]
-    # Blanks around a text are taken off line by line only; texts of given choices have none, as those are compared.
+    # Only the line parser strips blanks around a text. Texts with given choices have none: they are compared above.
     free = [name for name, dtype in layout.dtypes.items() if dtype == pl.String() and name not in layout.choices]
     sound += [~pl.col(name).ne_missing(pl.col(name).str.strip_chars()).any() for name in free]
     return pl.all_horizontal(sound)
@@ -218,13 +212,13 @@ def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line:
     fields = _split_fields(sound["text"].str.replace_all(BOM.decode(), "", literal=True), layout)
     cells = fields.with_columns(sound[LINE])
     numeric = [name for name, dtype in layout.dtypes.items() if dtype.is_numeric()]
-    # What is not well formed stays as it is and fails its cast below.
+    # A malformed number stays as it is and fails its cast below.
     well_formed = {name: pl.col(name).str.contains(THOUSANDS) for name in layout.thousands & layout.dtypes.keys()}
     cells = cells.with_columns(
         pl.when(yes).then(pl.col(name).str.replace_all(",", "", literal=True)).otherwise(pl.col(name)).alias(name)
         for name, yes in well_formed.items()
     ).with_columns(
-        # Programs that know no empty whole number write 1156 as 1156.0.
+        # Programs without a null for whole numbers write 1156 as 1156.0.
         pl.col(name).str.replace(r"^([+-]?\d+)\.0+$", "${1}")
         for name in numeric
         if layout.dtypes[name].is_integer()
@@ -236,43 +230,43 @@ def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line:
             for name, dtype in layout.dtypes.items()
         ),
     )
-    complaint = pl.coalesce(_complaints(layout, numeric))
-    judged = typed.with_columns(cells[name].alias(f"{name}.cell") for name in numeric).with_columns(
-        complaint.alias("reason")
+    checked = typed.with_columns(cells[name].alias(f"{name}.cell") for name in numeric).with_columns(
+        reason=pl.coalesce(_list_value_reasons(layout, numeric))
     )
-    kept = judged.filter(pl.col("reason").is_null()).select(LINE, *layout.dtypes)
+    kept = checked.filter(pl.col("reason").is_null()).select(LINE, *layout.dtypes)
     rejects = pl.concat(
         [
             lines.with_columns(reason).filter(pl.col("reason").is_not_null()),
-            judged.select(LINE, "reason").filter(pl.col("reason").is_not_null()).join(lines, on=LINE),
+            checked.select(LINE, "reason").filter(pl.col("reason").is_not_null()).join(lines, on=LINE),
         ],
         how="diagonal",
     ).select(pl.col(name).cast(dtype) for name, dtype in REJECT_SCHEMA.items())
     return Chunk(kept, rejects.sort(LINE), rows_read)
 
 
-def _complaints(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
-    """What is wrong with a row's values, the first complaint that applies; `<name>.cell` is the text of a number."""
-    complaints = [pl.lit(None, pl.String)]
+def _list_value_reasons(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
+    """List why a row's values may be rejected, in the order of precedence; `<name>.cell` is a number's text."""
+    reasons = [pl.lit(None, pl.String)]
     for name in numeric:
         cell = pl.col(f"{name}.cell")
         finite = cell.cast(pl.Float64, strict=False).is_finite().fill_null(value=False)
-        complaints.append(_say(cell.is_not_null() & ~finite, f"not a number: {name}"))
+        reasons.append(_reject_if(cell.is_not_null() & ~finite, f"not a number: {name}"))
         if layout.dtypes[name].is_integer():
             unread = cell.is_not_null() & pl.col(name).is_null()
             whole = cell.str.contains(r"^[+-]?\d+$")
-            complaints.append(_say(unread & ~whole, f"not a plain whole number: {name}"))
-            complaints.append(_say(unread, f"out of range: {name}"))
-    complaints += [_say(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
-    complaints += [_say(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
-    complaints += [
-        _say(_not_among(pl.col(name), allowed), f"unknown value: {name}") for name, allowed in layout.choices.items()
+            reasons.append(_reject_if(unread & ~whole, f"not a plain whole number: {name}"))
+            reasons.append(_reject_if(unread, f"out of range: {name}"))
+    reasons += [_reject_if(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
+    reasons += [_reject_if(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
+    reasons += [
+        _reject_if(_not_among(pl.col(name), allowed), f"unknown value: {name}")
+        for name, allowed in layout.choices.items()
     ]
-    return complaints
+    return reasons
 
 
-def _say(applies: pl.Expr, complaint: str) -> pl.Expr:
-    return pl.when(applies).then(pl.lit(complaint))
+def _reject_if(applies: pl.Expr, reason: str) -> pl.Expr:
+    return pl.when(applies).then(pl.lit(reason))
 
 
 def _structural_reason(lines: pl.DataFrame, layout: Layout) -> pl.Series:
@@ -300,7 +294,7 @@ def _structural_reason(lines: pl.DataFrame, layout: Layout) -> pl.Series:
 
 
 def _split_fields(text: pl.Series, layout: Layout) -> pl.DataFrame:
-    """The wanted fields of structurally sound lines, as text; empty is null."""
+    """Split structurally sound lines into the wanted fields, as text; an empty field is null."""
     if text.is_empty():
         return pl.DataFrame(schema=dict.fromkeys(layout.dtypes, pl.String()))
     data = "\n".join(text.to_list()).encode()
@@ -313,7 +307,7 @@ def _scan_text(data: bytes, layout: Layout, names: Sequence[str]) -> pl.DataFram
 
 
 def _scan(data: bytes, layout: Layout, dtypes: Mapping[str, pl.DataType], *, first_line: int) -> pl.DataFrame:
-    """The fields of `dtypes`, the line's last one, and its number."""
+    """Scan the fields of `dtypes`, each line's last field and its number."""
     wanted = list(dict.fromkeys((*dtypes, layout.names[-1])))
     return (
         pl.scan_csv(

@@ -10,8 +10,9 @@ from polars.testing import assert_frame_equal
 from raw_texts import physical_lines
 from raw_texts import write as write_bytes
 
-from tracklake.pipeline.sources.csv.lines import Layout, _parse_line_by_line, _parse_strictly, parse, read_chunks
-from tracklake.pipeline.sources.csv.raw_files import fetch_lines, read_head, split_lines, squeeze_blanks
+from tracklake.pipeline.sources.csv import Layout, fetch_lines, read_chunks, read_head
+from tracklake.pipeline.sources.csv.line_bytes import split_lines, squeeze_blanks
+from tracklake.pipeline.sources.csv.reader import _parse_line_by_line, _parse_strictly, parse_lines
 from tracklake.pipeline.sources.source import RawFile, SourceError
 
 DTYPES = {"id": pl.Int32(), "count": pl.Int32(), "x": pl.Float64(), "site": pl.String()}
@@ -292,7 +293,7 @@ def test_no_damage_crashes_or_loses_a_line(tmp_path_factory, edits, chunk_bytes,
     assert sum(chunk.rows_read for chunk in chunks) == len(lines)
     assert rejected == {line: lines[line] for line in rejected}
     # The size of the chunks, and so which of the two parsers reads a line, changes nothing.
-    whole = parse(data, layout)
+    whole = parse_lines(data, layout)
     if chunks:
         assert_frame_equal(whole.frame, pl.concat([chunk.frame for chunk in chunks]))
         assert_frame_equal(whole.rejects, pl.concat([chunk.rejects for chunk in chunks]))

@@ -1,4 +1,4 @@
-"""Canonical entries to the tables of a subset: what every source does the same way."""
+"""Tables of a subset from its canonical entries, the same for every source."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,18 +22,18 @@ def assemble_subset(
     use_recorded_headway: bool,
     files: Sequence[RawFile],
 ) -> Subset:
-    """Compute what follows from the oriented entries and cast everything to the schemas.
+    """Compute the derived columns of oriented entries and cast everything to the schemas.
 
     Args:
-        entries: sorted by vehicle_id, frame; x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
-            headway_recorded_m, and lateral_speed_mps where the source has it.
-        sizes: per vehicle_id: source_vehicle_id, class, length_m, width_m, entries_announced.
-        dataset: of the subset.
-        name: of the subset.
+        entries: rows sorted by vehicle_id, frame: x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
+            headway_recorded_m, and lateral_speed_mps if the source has it.
+        sizes: one row per vehicle_id: source_vehicle_id, class, length_m, width_m, entries_announced.
+        dataset: name of the dataset.
+        name: name of the subset.
         facts: recording, site, direction, freeway, frame_rate_hz, lanes, seconds, first_frame, on_ramp_lanes,
             lane_markings_m, ids_split, columns_missing.
-        use_recorded_headway: see `add_gaps`.
-        files: the raw files of the recording.
+        use_recorded_headway: whether a recorded headway replaces a missing leader; see `add_gaps`.
+        files: raw files of the recording.
     """
     rate_hz, first_frame = facts["frame_rate_hz"], facts["first_frame"]
     entries = add_kinematics(entries, rate_hz).with_columns(
@@ -44,7 +44,7 @@ def assemble_subset(
     entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)
     tracks = entries.lazy().pipe(TRACKS.conform).collect()
     del entries
-    vehicles = _summarise(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
+    vehicles = _summarise_vehicles(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
     vehicles = (
         vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()
     )
@@ -62,7 +62,7 @@ def assemble_subset(
     return Subset(name, tracks, vehicles, pl.DataFrame([row], schema=SUBSETS.dtypes))
 
 
-def _summarise(tracks: pl.DataFrame) -> pl.DataFrame:
+def _summarise_vehicles(tracks: pl.DataFrame) -> pl.DataFrame:
     lane = pl.col("lane")
     changes = (lane != lane.shift(1)).sum()
     return (

@@ -1,0 +1,76 @@
+"""Options and results of an export in the format of convolutional social pooling."""
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.transforms.csp.parts import REASONS
+
+
+@dataclass(frozen=True)
+class CspOptions:
+    """The options of an export beside the original's.
+
+    Args:
+        clean: whether late starts, gaps, overwritten neighbors and leaks are left out.
+        full_future: whether a sample needs 5 s of future.
+        dataset: the only dataset to export; None = all.
+    """
+
+    clean: bool = False
+    full_future: bool = False
+    dataset: str | None = None
+
+
+@dataclass
+class CspFile:
+    """The counts of one file; `dropped` are entries of its tracks that are no samples, by reason."""
+
+    name: str
+    part: str
+    samples: int = 0
+    sampled_tracks: int = 0
+    tracks: int = 0
+    entries: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
+class CspExport:
+    """The result of an export.
+
+    Args:
+        out: folder of the files.
+        options: options of the export.
+        files: counts of each file, one per part.
+        rows: number of rows of `tracks`.
+        datasets: id, dataset, subset and recording of each row of `tracks` that is not empty.
+        left_out: entries that are in no file, by reason.
+        overwritten: neighbors lost because a later row had the same cell (without --clean).
+        collisions: neighbors whose cell was taken (with --clean); all but `crowded_out` moved to another cell.
+        crowded_out: neighbors for which no cell was free.
+        notes: messages for the user.
+    """
+
+    out: Path
+    options: CspOptions
+    files: list[CspFile]
+    rows: int
+    datasets: list[dict[str, Any]] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
+    overwritten: int = 0
+    collisions: int = 0
+    crowded_out: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    def count_drops(self) -> dict[str, int]:
+        """Count entries that are no samples by reason, in all files and in none."""
+        counts = dict(self.left_out)
+        for file in self.files:
+            for reason, count in file.dropped.items():
+                counts[reason] = counts.get(reason, 0) + count
+        return {reason: counts[reason] for reason in REASONS if reason in counts}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
