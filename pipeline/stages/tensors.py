@@ -19,7 +19,7 @@ from tracklake.schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLI
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import INDEX_FILE
 
-VERSION = 4
+VERSION = 5
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane", "speed_mps")
 SAMPLE_COLUMNS = ("protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver")

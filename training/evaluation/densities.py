@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.batches import Floats
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.training.models.prediction import Density
 
 

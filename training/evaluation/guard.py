@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, SEVERITIES
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS
-from tracklake.training.data.batches import Integers
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, Reads
@@ -216,7 +216,7 @@ def _another(folder: TensorFolder, arrays: Mapping[str, npt.NDArray[Any]]) -> It
     """The folder holds other arrays meanwhile, and nothing that was computed from its own."""
     kept = dict(vars(folder))
     own = {field.name: kept[field.name] for field in fields(folder)}
-    _put(folder, own | dict(arrays))
+    _put(folder, own | {"arrays": {**folder.arrays, **arrays}})
     try:
         yield
     finally:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.batches import Floats
 
 Codes = npt.NDArray[np.int8]
 """Columns: -1 left, 0 own, 1 right. Rows: -1 behind, 0 middle, 1 ahead. -2 and 2: outside on that side."""

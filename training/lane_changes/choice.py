@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Bytes
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.training.data.batches import Bytes, Floats
 from tracklake.training.lane_changes.features import NAMES
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.augmentation import SWAPPED
-from tracklake.training.data.batches import Bytes, Floats, Integers
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.schemas.arrays import Bytes, Integers
+from tracklake.schemas.arrays import Singles as Floats
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
 from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets
@@ -18,6 +18,8 @@ from tracklake.training.models.inputs import NEAREST
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: by the label."""
 SPEED_CHANGE_S = 1.0
+MIRRORED: Bytes = np.array([KEEP, RIGHT, LEFT], dtype=np.uint8)
+"""Maneuver of KEEP, LEFT and RIGHT on a road mirrored sideways."""
 LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
 """Why a sample is not judged: it has no lane now; its track ends before the horizon, or before T_d, so that a change
 would not have been seen; or its speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
@@ -82,8 +84,7 @@ class Examples:
 
     def mirror(self) -> "Examples":
         """The same on a road mirrored sideways: left is right, in features and classes."""
-        swapped = SWAPPED.astype(np.uint8)
-        return Examples(mirror_targets(self.feature), swapped[self.maneuver], swapped[self.ahead])
+        return Examples(mirror_targets(self.feature), MIRRORED[self.maneuver], MIRRORED[self.ahead])
 
     def shift(self, shift_m: Floats) -> "Examples":
         """The same with each ego so much further behind (B,); classes stay."""
@@ -126,7 +127,7 @@ def gather_examples(folder: TensorFolder, judged: Judged) -> Examples:
     feature, ahead = [], []
     for start in range(0, max(1, len(judged.sample)), READ_AT_ONCE):
         numbers = judged.sample[start : start + READ_AT_ONCE]
-        scene, truth = gather_surroundings(folder, numbers, nearest=NEAREST)
+        scene, truth = gather_nearest(folder, numbers, nearest=NEAREST)
         feature.append(describe_targets(scene, folder.protocol.rate_hz))
         ahead.append(name_columns(find_columns(truth.future[:, 0, ticks, 1], scene.lanes)))
     return Examples(np.concatenate(feature), judged.maneuver, np.concatenate(ahead))

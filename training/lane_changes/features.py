@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.batches import Floats, Integers
+from tracklake.schemas.arrays import Integers
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.cells import find_columns
 

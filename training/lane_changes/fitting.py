@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Bytes
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Bytes, Floats
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.choice import choose_features
 from tracklake.training.lane_changes.examples import (

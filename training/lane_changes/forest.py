@@ -13,9 +13,10 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Bytes
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.data.batches import Bytes, Floats
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.features import NAMES, NUMBER, describe_targets
 from tracklake.training.lane_changes.settings import LaneForestSettings

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Flags, Integers
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Flags, Floats, Integers
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.data.observed import Observed, ObservedScene, part_batch
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import BATCH_SIZE
@@ -243,7 +244,7 @@ class _Seen:
     @classmethod
     def read(cls, folder: TensorFolder, numbers: Integers) -> "_Seen":
         grid, truth = part_batch(folder.gather(numbers))
-        scene, _ = gather_surroundings(folder, numbers, nearest=NEAREST)
+        scene, _ = gather_nearest(folder, numbers, nearest=NEAREST)
         return cls(grid, scene, truth.future)
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from tracklake.schemas.arrays import Bytes
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Bytes
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import Examples, Judged, draw_balanced, gather_examples, judge_samples
 from tracklake.training.lane_changes.fitting import grow

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
+from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import NEAREST
@@ -40,7 +40,7 @@ class Weights(Protocol):
 class Looking(Protocol):
     """A network with attention: `training.models.attention.SceneAttention`."""
 
-    def look(self, observed: ObservedScene[Any]) -> Weights:
+    def read_attention(self, observed: ObservedScene[Any]) -> Weights:
         """Who attends to what."""
         ...
 
@@ -60,9 +60,9 @@ def map_attention(
         IndexError: a number below 0, or not below S.
     """
     numbers = np.asarray(samples, dtype=np.int64)
-    observed, _ = gather_surroundings(folder, numbers, nearest=nearest)
-    weights = network.look(observed)
-    ids = folder.run_vehicle_id[folder.runs_of(find_around(folder, numbers, nearest).row)]
+    observed, _ = gather_nearest(folder, numbers, nearest=nearest)
+    weights = network.read_attention(observed)
+    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, numbers, nearest).row)]
     return [
         _cut(folder, int(sample), each, observed, weights, ids[each, : observed.vehicle_mask[each].sum()])
         for each, sample in enumerate(numbers)

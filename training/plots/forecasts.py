@@ -8,12 +8,12 @@ from typing import Protocol as Interface
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Singles as Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from tracklake.training.data.batches import Floats
-from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
+from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
 from tracklake.training.data.observed import ObservedScene
+from tracklake.training.data.positions import check_numbers, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import check_numbers, place
 from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
@@ -148,8 +148,8 @@ def _forecast_around(
 ) -> dict[int, Forecast]:
     """What a model of scenes says of every vehicle that it is shown, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = gather_surroundings(folder, number, nearest=nearest)
-    said, around = model.predict_scene(observed), find_around(folder, number, nearest)
+    observed, _ = gather_nearest(folder, number, nearest=nearest)
+    said, around = model.predict_scene(observed), find_nearest(folder, number, nearest)
     ids = folder.run_vehicle_id[folder.runs_of(around.row[0])]
     origin = find_origins(folder, number)[0]
     variance = np.diagonal(said.covariance_m2[0], axis1=-2, axis2=-1)
@@ -165,8 +165,7 @@ def _forecast_around(
 
 def find_origins(folder: TensorFolder, samples: npt.NDArray[np.int64]) -> Doubles:
     """(B, 2) the samples' last positions on the carriageway."""
-    stored = folder.position_m[folder.sample_row[samples]][:, None, :]
-    return place(stored, folder.centre_m[folder.subset_of(samples)], folder.step_m)[:, 0].astype(np.float64)
+    return np.asarray(locate_rows(folder, folder.sample_row[samples]), dtype=np.float64)
 
 
 def place_forecast(model: str, said: Prediction, number: int, origin_m: Doubles) -> Forecast:

@@ -17,8 +17,8 @@ from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.columns import PARTS
 from tracklake.training.data.batches import Batch
+from tracklake.training.data.namespaces import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import spread
 
 Format = Literal["parquet", "npz"]
 CARD = "README.md"
@@ -150,7 +150,7 @@ def read_windows(folder: TensorFolder, part: str, *, absolute: bool) -> Iterator
     for batch in folder.batches(part, READ_AT_ONCE, absolute=absolute):
         row = folder.sample_row[batch.sample]
         run = folder.runs_of(row)
-        pair, _ = spread(folder.neighbor_offset, batch.sample)
+        pair, _ = expand_groups(folder.neighbor_offset, batch.sample)
         yield Windows(
             batch=batch,
             subset=folder.run_subset[run],

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,
@@ -284,7 +284,7 @@ def test_a_folder_is_learned_from(folder):
     drawn = sum(fitted.facts["drawn_by_stratum"].values())
     assert fitted.facts["examples"] == 3 * drawn
     judged = judge_samples(folder, "eval", replace(FEW, start_s=3.0))
-    scene, _ = gather_surroundings(folder, judged.sample, nearest=10)
+    scene, _ = gather_nearest(folder, judged.sample, nearest=10)
     decided = decide(fitted.predict(scene))
     examples = gather_examples(folder, judged)
     np.testing.assert_array_equal(decided, decide(fitted.predict_proba(examples.feature)))
