@@ -9,7 +9,7 @@ is then measured in processes of their own, each on one core and with one torch 
 - building: reading the tables, putting the tracks on the clock, building the arrays, writing the folder;
 - reading: histories, futures, masks, neighbors' histories, cells and maneuvers, by batches of 128 and of 1024, in the
   samples' own order and shuffled; from float32 and from int16 positions;
-- beside it a dataset that looks at one sample at a time, as the reference implementation's does: the 39 cells of its
+- beside it a dataset that reads one sample at a time, as the reference implementation's does: the 39 cells of its
   grid one by one, each vehicle's track searched for the frame, arrays filled row by row.
 
 Memory is what the process allocates (RssAnon, at its highest while reading) and what it has mapped of the folder, which
@@ -82,10 +82,10 @@ def main() -> None:
                 building.append((name, storage, built))
                 for batch_size in (128, 1024):
                     for order in ORDERS if storage == "float32" else ("shuffled",):
-                        asked = {"folder": str(out), "batch_size": batch_size, "order": order}
-                        reading.append((name, storage, best("--read", asked, options.seconds) | asked))
-            asked = {"folder": str(Path(work) / "float32"), "batch_size": 128, "order": "one at a time"}
-            reading.append((name, "float32", best("--read", asked, options.seconds) | asked))
+                        request = {"folder": str(out), "batch_size": batch_size, "order": order}
+                        reading.append((name, storage, best("--read", request, options.seconds) | request))
+            request = {"folder": str(Path(work) / "float32"), "batch_size": 128, "order": "one at a time"}
+            reading.append((name, "float32", best("--read", request, options.seconds) | request))
     show(building, reading)
 
 
@@ -109,9 +109,9 @@ def show(building: list[tuple[str, str, dict[str, Any]]], reading: list[tuple[st
         print(f"| {name} | {storage} | {run['order']} | {run['batch_size']} | {' | '.join(figures)} |", flush=True)
 
 
-def best(flag: str, asked: dict[str, Any], seconds: float = 0.0) -> dict[str, Any]:
+def best(flag: str, request: dict[str, Any], seconds: float = 0.0) -> dict[str, Any]:
     """Return the best of several runs, each in a process of its own on one core."""
-    command = [sys.executable, __file__, flag, json.dumps(asked), "--seconds", str(seconds)]
+    command = [sys.executable, __file__, flag, json.dumps(request), "--seconds", str(seconds)]
     environment = os.environ | {"POLARS_MAX_THREADS": "1", "OMP_NUM_THREADS": "1"}
     runs = [
         json.loads(subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout)
@@ -121,7 +121,7 @@ def best(flag: str, asked: dict[str, Any], seconds: float = 0.0) -> dict[str, An
 
 
 def report(found: dict[str, Any]) -> None:
-    """Print one run's figures for the process that asked."""
+    """Print one run's figures for the parent process."""
     print(json.dumps(found | {"peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}))
 
 
@@ -264,15 +264,15 @@ def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, 
     with watch:
         while (spent := time.process_time() - start) < seconds:
             for _ in range(10):
-                count, around = next(endless)
-                samples, neighbors = samples + count, neighbors + around
+                count, others = next(endless)
+                samples, neighbors = samples + count, neighbors + others
         spent = time.process_time() - start
     return {"samples": samples, "neighbors": neighbors, "processor_s": spent,
             "anonymous_mib": watch.anonymous_mib, "mapped_mib": watch.mapped_mib}  # fmt: skip
 
 
 class Watch:
-    """Looks at this process's memory ten times a second."""
+    """Reads this process's memory ten times a second."""
 
     def __init__(self) -> None:
         self.anonymous_mib = self.mapped_mib = 0.0

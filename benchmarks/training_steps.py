@@ -79,8 +79,8 @@ def main() -> None:
         for threads in options.threads:
             lines = LINES if options.model.startswith("cs-lstm") else LINES[-2:-1]
             for batches, step in lines:
-                asked = {"folder": str(folder), "model": options.model, "batches": batches, "step": step}
-                run = measure("--measure-step", asked | {"seconds": options.seconds}, threads)
+                request = {"folder": str(folder), "model": options.model, "batches": batches, "step": step}
+                run = measure("--measure-step", request | {"seconds": options.seconds}, threads)
                 figures = (
                     f"{run['samples'] / run['seconds']:,.0f}", f"{100 * run['data_s'] / run['seconds']:.1f}",
                     f"{1000 * run['seconds'] / run['steps']:.1f}", f"{1000 * run['processor_s'] / run['steps']:.1f}",
@@ -91,9 +91,9 @@ def main() -> None:
             print(f"| {name} | {wall_ms:.1f} | {processor_ms:.1f} |", flush=True)
 
 
-def measure(flag: str, asked: dict[str, Any], threads: int) -> dict[str, Any]:
+def measure(flag: str, request: dict[str, Any], threads: int) -> dict[str, Any]:
     """What a process of its own finds."""
-    command = [sys.executable, __file__, flag, json.dumps(asked)]
+    command = [sys.executable, __file__, flag, json.dumps(request)]
     environment = os.environ | {"POLARS_MAX_THREADS": "1", "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
     found: dict[str, Any] = json.loads(done.stdout)
@@ -177,7 +177,7 @@ def collate_batches(folder: TensorFolder) -> Iterator[Read]:
 
     dataset: Any = Subset(
         reference, folder.samples_of("train").tolist()
-    )  # it has __getitem__, which is all that is asked
+    )  # it has __getitem__, which is all that Subset needs
     yield from DataLoader(dataset, batch_size=BATCH, shuffle=True, collate_fn=collate)
 
 

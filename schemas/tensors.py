@@ -18,7 +18,7 @@ How positions are stored. As int16 they are whole steps from the subset's centre
 road decimetres or centimetres (these reach 327 m either way: longer roads are refused), across it millimetres."""
 
 STEPS_M = {"int16-decimetres": (0.1, 0.001), "int16-centimetres": (0.01, 0.001)}
-"""Of int16 positions: metres per step along and across the road."""
+"""Metres per step of int16 positions, along and across the road."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ SUBSET_KEYS = {
     "last_lane": "a whole number",
     "width_m": "a number",
 }
-"""Likewise of each subset."""
+"""Each key of a subset and the kind of its value."""
 
 SUBSET_MEANING = """\
 Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,

@@ -79,27 +79,18 @@ def train(
         where the split has no evaluation part).
 
     Raises:
-        TensorError: the tensors are absent or damaged.
         UnfinishedError: there is a checkpoint and `resume` is None; there is none and it is True; it is of a training
             with other settings or data; or another process is training the run.
-        DamagedFileError: the checkpoint is damaged.
-        DivergedError: the loss is not finite.
-        NotFiniteError: the trained network's predictions are not finite.
+        DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
         FutureInputError: the model sees what comes after the tick at which it predicts; raised before the first step
             where it does so untrained, else after the last. No checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
-        TracklakeError: unknown model or parameter; too little data, see `training.runs.config.make_plan`; or no time
-            for one step.
-        MissingExtraError: torch is needed and not installed.
+        TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
     """
     entry = find_model(model)
     folder = TensorFolder.open(tensors)
     if not entry.learns:
-        parameters = dict(config.parameters) if config else {}
-        evaluation = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
-        metrics = {"model": model, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
-        save_run(out, describe_run(model, parameters, {}, folder), metrics, None)
-        return metrics
+        return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
     refuse_wrong_start(out, resume=resume)
     with claim_folder(out) as unfinished:
@@ -126,6 +117,14 @@ def train(
     return metrics
 
 
+def _write_baseline(entry: Model, folder: TensorFolder, out: Path, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Evaluate a model that needs no training, write it as a run, and return its metrics."""
+    evaluation = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
+    metrics = {"model": entry.name, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
+    save_run(out, describe_run(entry.name, parameters, {}, folder), metrics, None)
+    return metrics
+
+
 def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: str) -> dict[str, Any] | None:
     """Return the scores on the evaluation part; None where the split has no such part."""
     if len(folder.samples_of("eval")) == 0:
@@ -136,15 +135,7 @@ def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: st
 def _fit(
     plan: Plan, run: dict[str, Any], unfinished: Path, stored: dict[str, Any] | None, progress: Progress | None
 ) -> tuple["Network", dict[str, Any]]:
-    """Run the training loop; return the trained network and its metrics.
-
-    Args:
-        plan: model, data and settings.
-        run: the plan as a checkpoint states it.
-        unfinished: folder for checkpoint and logs.
-        stored: checkpoint to resume from; None = start.
-        progress: called after every step.
-    """
+    """Run the training loop, from a stored checkpoint where there is one; return the network and its metrics."""
     config, checkpoint = plan.config, unfinished / CHECKPOINT_FILE
     with _isolate_torch(plan):
         network, optimizer, state = _start(plan, checkpoint, stored)
@@ -182,7 +173,7 @@ def _fit(
                     if progress is not None:
                         spent = plan.measure_spent(state.step, state.elapsed_s)
                         progress(min(1.0, spent / plan.budget), state.smooth_loss)
-                    if interrupted():
+                    if interrupted:
                         raise KeyboardInterrupt
                 except KeyboardInterrupt:  # from either of the two: the step is complete
                     save()
@@ -204,12 +195,7 @@ def _fit(
 def _start(
     plan: Plan, checkpoint: Path, stored: dict[str, Any] | None
 ) -> tuple["Network", "torch.optim.Optimizer", TrainingState]:
-    """Build network, optimiser and state, new or as in a checkpoint.
-
-    Raises:
-        FutureInputError: the untrained network sees the future.
-        DamagedFileError: the checkpoint is not of this network.
-    """
+    """Build network, optimiser and state, new or as in a checkpoint; a new network must not see the future."""
     import torch
 
     network: Network = plan.entry.build(plan.folder.protocol, **plan.parameters).to(plan.device).train()
@@ -267,29 +253,25 @@ def _isolate_torch(plan: Plan) -> Iterator[None]:
 
 
 @contextmanager
-def _hold_interrupts() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C wait until a step is complete and can be saved; a second Ctrl-C does not wait.
+def _hold_interrupts() -> Iterator[list[int]]:
+    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second Ctrl-C does not wait.
 
     Where the process handles the signal itself, or this is not the main thread, it is left as it is.
-
-    Yields:
-        A function that returns whether Ctrl-C was pressed.
     """
-    pressed = False
+    pressed: list[int] = []
 
-    def note(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal pressed
+    def note(number: int, _frame: FrameType | None) -> None:
         if pressed:
             raise KeyboardInterrupt
-        pressed = True
+        pressed.append(number)
 
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield lambda: False
+        yield pressed
         return
     signal.signal(signal.SIGINT, note)
     try:
-        yield lambda: pressed
+        yield pressed
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if pressed:  # after the last step
@@ -297,11 +279,7 @@ def _hold_interrupts() -> Iterator[Callable[[], bool]]:
 
 
 def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
-    """Return the loss.
-
-    Raises:
-        DivergedError: it is not finite.
-    """
+    """Return the loss, or raise DivergedError where it is not finite."""
     if not math.isfinite(loss):
         raise DivergedError(
             f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phases[-1][0]}`: train with a learning "
@@ -351,18 +329,11 @@ def _log_steps(
         return
     state.logged = (state.step, state.samples, state.stepping_s, state.reading_s)
     took_s = state.stepping_s - stepping_s
-    log(
-        {
-            "step": state.step,
-            "epoch": (state.step - 1) // plan.epoch_steps,
-            "phase": state.phases[-1][0],
-            "seconds": round(state.elapsed_s, 3),
-            "loss": sum(state.losses[step:]) / (state.step - step),
-            "learning_rate": optimizer.param_groups[0]["lr"],
-            "samples_per_s": round((state.samples - samples) / took_s, 1),
-            "data_share": round((state.reading_s - reading_s) / took_s, 4),
-        }
-    )
+    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phases[-1][0]}
+    row |= {"seconds": round(state.elapsed_s, 3), "loss": sum(state.losses[step:]) / (state.step - step)}
+    row |= {"learning_rate": optimizer.param_groups[0]["lr"]}
+    row |= {"samples_per_s": round((state.samples - samples) / took_s, 1)}
+    log(row | {"data_share": round((state.reading_s - reading_s) / took_s, 4)})
 
 
 def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:
@@ -374,13 +345,6 @@ def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> 
         it that reading took; phases (loss, steps, and loss_first and loss_last, its mean over their first and last
         twentieth); best (epoch and validation_loss of the weights that were kept; null without patience).
     """
-    ends = [*(first for _, first in state.phases[1:]), state.step]
-    phases = []
-    for (loss, first), end in zip(state.phases, ends, strict=True):
-        losses = state.losses[first:end]
-        some = max(1, len(losses) // 20)
-        means = {"loss_first": sum(losses[:some]) / some, "loss_last": sum(losses[-some:]) / some}
-        phases.append({"loss": loss, "steps": len(losses), **means})
     best = {"epoch": state.best_epoch, "validation_loss": state.best_loss}
     return {
         "model": plan.entry.name,
@@ -391,6 +355,6 @@ def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> 
         "samples_seen": state.samples,
         "samples_per_s": round(state.samples / state.stepping_s, 1),
         "data_share": round(state.reading_s / state.stepping_s, 4),
-        "phases": phases,
+        "phases": state.describe_phases(),
         "best": best if state.best_loss is not None else None,
     }

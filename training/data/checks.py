@@ -1,12 +1,12 @@
 """Checks of an opened tensor folder: kinds of the index's values, and arrays that agree with the index."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, conlist
 
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.columns import PARTS
@@ -20,32 +20,18 @@ class TensorError(TracklakeError):
     """A tensor folder is absent, unfinished or not what its index says."""
 
 
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)  # JSON's true and false are no numbers
-
-
-def _is_number(value: object) -> bool:
-    return _is_whole(value) or (isinstance(value, float) and math.isfinite(value))
-
-
-def _are_numbers(value: object) -> TypeGuard[list[Any]]:
-    return isinstance(value, list) and all(map(_is_number, value))
-
-
-KINDS: dict[str, Callable[[Any], bool]] = {
-    "text": lambda value: isinstance(value, str),
-    "a whole number": _is_whole,
-    "a number": _is_number,
-    "two numbers": lambda value: _are_numbers(value) and len(value) == 2,
-    "numbers or null": lambda value: value is None or _are_numbers(value),
-    "an object": lambda value: isinstance(value, dict),
-    "an object or null": lambda value: value is None or isinstance(value, dict),
-    "objects": lambda value: isinstance(value, list) and all(isinstance(one, dict) for one in value),
-    "counts by name": lambda value: (
-        isinstance(value, dict) and all(_is_whole(count) and count >= 0 for count in value.values())
-    ),
+KINDS: dict[str, TypeAdapter[Any]] = {
+    "text": TypeAdapter(str),
+    "a whole number": TypeAdapter(int),
+    "a number": TypeAdapter(FiniteFloat),
+    "two numbers": TypeAdapter(conlist(FiniteFloat, min_length=2, max_length=2)),
+    "numbers or null": TypeAdapter(list[FiniteFloat] | None),
+    "an object": TypeAdapter(dict[str, Any]),
+    "an object or null": TypeAdapter(dict[str, Any] | None),
+    "objects": TypeAdapter(list[dict[str, Any]]),
+    "counts by name": TypeAdapter(dict[str, NonNegativeInt]),
 }
-"""Test of each kind of value that `schemas.tensors` declares for keys."""
+"""Type of each kind of value that `schemas.tensors` declares for keys; checked strictly, as true is no number."""
 
 
 def check_index(file: Path, index: Mapping[str, Any]) -> None:
@@ -69,8 +55,12 @@ def check_index(file: Path, index: Mapping[str, Any]) -> None:
 
 def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mapping[str, str]) -> None:
     for key, kind in kinds.items():
-        if key in found and not KINDS[kind](found[key]):
-            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {str(found[key])[:60]}; {AGAIN}")
+        try:
+            if key in found:
+                KINDS[kind].validate_python(found[key], strict=True)
+        except ValidationError:
+            got = str(found[key])[:60]
+            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {got}; {AGAIN}") from None
 
 
 def check_arrays(path: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:

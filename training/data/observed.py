@@ -1,4 +1,4 @@
-"""What a model may see of samples and the truth that it predicts, kept in separate types."""
+"""Samples as a model may see them, and the truth that it predicts, in separate types."""
 
 from collections.abc import Callable
 from dataclasses import Field, dataclass, fields

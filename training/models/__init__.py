@@ -20,7 +20,7 @@ class Predictor(Interface):
     """The interface of every model; it never gets more than what may be seen at the tick of prediction."""
 
     def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays, as the model's `reads` says)
-        """Predict B samples."""
+        """Predict the positions of B samples."""
         ...
 
 

@@ -43,10 +43,9 @@ class ConstantVelocity:
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        """Read rate and horizon of a protocol."""
         self.ticks = velocity_ticks(protocol)
         self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
-        """Predict B samples."""
+        """Predict the positions of B samples."""
         return Prediction(position_m=extrapolate(observed.history, self.ticks, self.steps))

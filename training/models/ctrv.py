@@ -34,14 +34,13 @@ class ConstantTurnRate:
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        """Read rate, history and horizon of a protocol."""
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)
         self.turn_ticks = min(max(1, round(TURN_S * protocol.rate_hz)), (protocol.history_ticks - 1) // 2)
         self.ahead_s = np.arange(1, protocol.horizon_ticks + 1) / protocol.rate_hz
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
-        """Predict B samples."""
+        """Predict the positions of B samples."""
         history = observed.history.astype(np.float64)
         chord, duration_s = history[:, -1] - history[:, -1 - self.ticks], self.ticks / self.rate_hz
         turn = self._yaw_rate(history)[:, None]  # (B, 1) rad/s, positive to the right

@@ -58,7 +58,7 @@ class KalmanConstantVelocity:
         self.sigma_m: Floats = np.sqrt(ahead[:, :, 0, 0] + noise[:, None]).T  # (F, 2)
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
-        """Predict B samples."""
+        """Predict the positions of B samples."""
         history = observed.history.astype(np.float64)
         position, velocity = history[:, 1], (history[:, 1] - history[:, 0]) / self.tick_s  # (B, 2) by axis
         for tick, gain in enumerate(self.gains, start=2):

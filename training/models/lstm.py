@@ -20,16 +20,11 @@ class DeviationLstm(PlaceNetwork):
 
     Inputs per tick of history, 6: the deviation from where constant velocity would have been (along, across) in m, its
     change since the tick before in m/s (along, across), and the constant velocity itself (along, across), scaled.
-    Outputs per tick of future, 2: the change of the deviation; summed up over the ticks.
+    Outputs per tick of future, 2: the change of the deviation; summed up over the ticks. `hidden` is the width of
+    encoder and decoder.
     """
 
     def __init__(self, protocol: Protocol, *, hidden: int = 48) -> None:
-        """Build the layers for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            hidden: width of the encoder and the decoder.
-        """
         super().__init__()
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)

@@ -41,13 +41,6 @@ class SocialPooling(Network):
     """
 
     def __init__(self, protocol: Protocol, *, maneuvers: bool, residual: bool = True) -> None:
-        """Build the layers for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            maneuvers: whether it has the two heads and a density for each combination.
-            residual: count means from constant velocity, see `training.models.straight`.
-        """
         super().__init__()
         self.steps = protocol.horizon_ticks
         self.maneuvers = maneuvers

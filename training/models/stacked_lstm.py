@@ -10,17 +10,10 @@ from tracklake.training.models.straight import Straight
 class StackedLstm(PlaceNetwork):
     """Encodes H positions in m, and predicts F positions from its last state.
 
-    The plainest recurrent network that Choi et al. 2021 compare with; the width of 128 is ours.
+    The plainest recurrent network that Choi et al. 2021 compare with; the width (`hidden`) of 128 is ours.
     """
 
     def __init__(self, protocol: Protocol, *, hidden: int = 128, residual: bool = True) -> None:
-        """Build the layers for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            hidden: width of both layers.
-            residual: count positions from constant velocity, see `training.models.straight`.
-        """
         super().__init__()
         self.straight = Straight(protocol, residual=residual)
         self.encoder = nn.LSTM(2, hidden, num_layers=2, batch_first=True)

@@ -23,12 +23,6 @@ class VanillaLstm(Network):
     """
 
     def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
-        """Build the layers for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            residual: count means from constant velocity, see `training.models.straight`.
-        """
         super().__init__()
         self.steps = protocol.horizon_ticks
         self.straight = Straight(protocol, residual=residual)

@@ -4,7 +4,7 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ TRAINED_BY = ("tracklake", "torch")
 KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "blocks": list}
 """Keys that a run's config must hold, and their types."""
 HASHED_BYTES = 1 << 22
-"""Bytes that are hashed at a time, so that Ctrl-C does not wait for a whole array."""
+"""Size of the pieces that are hashed, in bytes, so that Ctrl-C does not wait for a whole array."""
 
 
 class StaleRunError(TracklakeError):
@@ -59,15 +59,7 @@ def describe_run(
     folder: TensorFolder,
     recipe: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of `config.json` without the versions, as plain values.
-
-    Args:
-        model: name in the registry.
-        parameters: keywords of the model's `build`.
-        config: settings of the training.
-        folder: tensors it was trained on.
-        recipe: recipe of the training; None where the model does not learn.
-    """
+    """Return the content of `config.json` without the versions; a model without recipe does not learn."""
     run = {
         "version": RUN_VERSION,
         "model": model,
@@ -103,13 +95,7 @@ def digest_tensors(folder: TensorFolder) -> str:
 
 def find_versions() -> dict[str, str | None]:
     """Return the installed versions of the packages that train; None where one is not installed."""
-    found: dict[str, str | None] = {}
-    for name in TRAINED_BY:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
+    return {name: version(name) if any(distributions(name=name)) else None for name in TRAINED_BY}
 
 
 def save_run(
@@ -206,11 +192,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def refuse_unfinished(path: Path) -> None:
-    """Refuse a run whose training was interrupted and has not been resumed.
-
-    Raises:
-        StaleRunError: says how to finish it.
-    """
+    """Raise StaleRunError for a run whose training was interrupted and has not been resumed."""
     if not (path / "config.json").is_file() and is_unfinished(path):
         raise StaleRunError(
             f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "

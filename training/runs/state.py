@@ -51,6 +51,17 @@ class TrainingState:
         self.smooth_loss = math.nan
         self.best_loss = self.best_epoch = self.best_weights = None
 
+    def describe_phases(self) -> list[dict[str, Any]]:
+        """Describe each phase: loss, steps, and the loss's mean over their first and last twentieth."""
+        ends = [*(first for _, first in self.phases[1:]), self.step]
+        phases = []
+        for (loss, first), end in zip(self.phases, ends, strict=True):
+            losses = self.losses[first:end]
+            some = max(1, len(losses) // 20)
+            means = {"loss_first": sum(losses[:some]) / some, "loss_last": sum(losses[-some:]) / some}
+            phases.append({"loss": loss, "steps": len(losses), **means})
+        return phases
+
     def count_step(self, loss: float, samples: int) -> None:
         """Count one more step with its loss and number of samples."""
         self.step += 1

@@ -289,7 +289,7 @@ def test_a_training_does_not_go_on_as_another_model_or_recipe(interrupted, tenso
     ("made", "told"),
     [
         ({"seed": 1}, r"data: tensors \w{12} then, \w{12} now\."),
-        ({"protocol": replace(TINY, horizon_s=1.0)}, r"otherwise: protocol.digest \w{12} then, \w{12} now; "),
+        ({"protocol": replace(TINY, horizon_s=1.0)}, r"data: protocol.digest \w{12} then, \w{12} now; "),
         ({"splits": PARTS[:2], "subsets": "ab"}, "data: other blocks; tensors"),
     ],
 )
