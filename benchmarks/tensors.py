@@ -8,8 +8,8 @@ is then measured in processes of their own, each on one core and with one torch 
 
 - building: reading the tables, putting the tracks on the clock, building the arrays, writing the folder;
 - reading: histories, futures, masks, neighbors' histories, cells and maneuvers, by batches of 128 and of 1024, in the
-  samples' own order, shuffled throughout, and shuffled by blocks; from float32 and from int16 positions;
-- beside it a dataset that looks at one sample at a time, as the reference implementation's does: the 39 cells of its
+  samples' own order and shuffled; from float32 and from int16 positions;
+- beside it a dataset that reads one sample at a time, as the reference implementation's does: the 39 cells of its
   grid one by one, each vehicle's track searched for the frame, arrays filled row by row.
 
 Memory is what the process allocates (RssAnon, at its highest while reading) and what it has mapped of the folder, which
@@ -37,6 +37,7 @@ from reference_loader import Reference
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
+from tracklake.schemas.arrays import expand_ranges
 from tracklake.schemas.columns import Table
 from tracklake.schemas.findings import FINDINGS
 from tracklake.schemas.protocols import CSP
@@ -49,12 +50,8 @@ CASES = {
     "20 x 500,000 at 25 Hz, 3 lanes": {"subsets": 20, "entries": 500_000, "rate": 25.0, "lanes": 3, "apart_m": 45.0},
     "7 x 1,500,000 at 10 Hz, 6 lanes": {"subsets": 7, "entries": 1_500_000, "rate": 10.0, "lanes": 6, "apart_m": 11.0},
 }
-ORDERS: dict[str, tuple[int | None, int | None]] = {
-    "own": (None, None),
-    "shuffled": (1, None),
-    "shuffled by blocks": (1, 2**16),
-}
-"""Of reading: seed and block of the shuffle."""
+ORDERS: dict[str, int | None] = {"own": None, "shuffled": 1}
+"""Seed of the shuffle for each order of reading."""
 HALF_GRID_M, CELL_M = 27.432, 4.572
 
 
@@ -85,10 +82,10 @@ def main() -> None:
                 building.append((name, storage, built))
                 for batch_size in (128, 1024):
                     for order in ORDERS if storage == "float32" else ("shuffled",):
-                        asked = {"folder": str(out), "batch_size": batch_size, "order": order}
-                        reading.append((name, storage, best("--read", asked, options.seconds) | asked))
-            asked = {"folder": str(Path(work) / "float32"), "batch_size": 128, "order": "one at a time"}
-            reading.append((name, "float32", best("--read", asked, options.seconds) | asked))
+                        request = {"folder": str(out), "batch_size": batch_size, "order": order}
+                        reading.append((name, storage, best("--read", request, options.seconds) | request))
+            request = {"folder": str(Path(work) / "float32"), "batch_size": 128, "order": "one at a time"}
+            reading.append((name, "float32", best("--read", request, options.seconds) | request))
     show(building, reading)
 
 
@@ -112,9 +109,9 @@ def show(building: list[tuple[str, str, dict[str, Any]]], reading: list[tuple[st
         print(f"| {name} | {storage} | {run['order']} | {run['batch_size']} | {' | '.join(figures)} |", flush=True)
 
 
-def best(flag: str, asked: dict[str, Any], seconds: float = 0.0) -> dict[str, Any]:
-    """The best of several runs, each in a process of its own on one core."""
-    command = [sys.executable, __file__, flag, json.dumps(asked), "--seconds", str(seconds)]
+def best(flag: str, request: dict[str, Any], seconds: float = 0.0) -> dict[str, Any]:
+    """Return the best of several runs, each in a process of its own on one core."""
+    command = [sys.executable, __file__, flag, json.dumps(request), "--seconds", str(seconds)]
     environment = os.environ | {"POLARS_MAX_THREADS": "1", "OMP_NUM_THREADS": "1"}
     runs = [
         json.loads(subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout)
@@ -124,7 +121,7 @@ def best(flag: str, asked: dict[str, Any], seconds: float = 0.0) -> dict[str, An
 
 
 def report(found: dict[str, Any]) -> None:
-    """Print one run's figures for the process that asked."""
+    """Print one run's figures for the parent process."""
     print(json.dumps(found | {"peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20}))
 
 
@@ -166,7 +163,7 @@ def save(folder: Path, number: int, case: dict[str, Any], scale: float) -> None:
     high = np.floor((first + each - 2) / stride).astype(np.int64)
     sampled, last = low + CSP.history_ticks - 1, high - CSP.min_future_ticks
     counts = np.maximum(last - sampled + 1, 0)
-    who, tick = np.repeat(own, counts), expand(sampled, counts)
+    who, tick = np.repeat(own, counts), expand_ranges(sampled, counts)[0]
     shown = {"protocol": CSP.name, "dataset": "highd", "subset": folder.name}
     table(SAMPLES, len(who), shown | {
         "vehicle_id": who, "tick": tick, "lane": who % lanes + 1,
@@ -178,14 +175,9 @@ def save(folder: Path, number: int, case: dict[str, Any], scale: float) -> None:
     begin, end = np.maximum(sampled[one], low[other]), np.minimum(last[one], high[other])
     counts = np.maximum(end - begin + 1, 0)
     table(NEIGHBORS, int(counts.sum()), shown | {
-        "vehicle_id": np.repeat(one, counts), "tick": expand(begin, counts), "cell": np.repeat(cell, counts),
+        "vehicle_id": np.repeat(one, counts), "tick": expand_ranges(begin, counts)[0], "cell": np.repeat(cell, counts),
         "neighbor_id": np.repeat(other, counts), "dx_m": 0.0,
     }).sort("vehicle_id", "tick", "cell").write_parquet(folder / "neighbors.parquet")  # fmt: skip
-
-
-def expand(first: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """first, first + 1, ... of each, so many of them."""
-    return np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
 
 
 def pair(
@@ -249,7 +241,7 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
 
 
 def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, Any]:
-    """Read batches of the training part for so long, beginning anew where it ends."""
+    """Read batches of the training part for so long, starting over where it ends."""
     from tracklake.training.data.tensor_folder import TensorFolder
 
     opened = TensorFolder.open(Path(folder))
@@ -261,8 +253,7 @@ def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, 
     else:
 
         def batches() -> Iterator[tuple[int, int]]:
-            seed, block = ORDERS[order]
-            for batch in opened.batches("train", batch_size, shuffle_seed=seed, shuffle_block=block):
+            for batch in opened.batches("train", batch_size, shuffle_seed=ORDERS[order]):
                 yield len(batch), len(batch.neighbor_sample)
 
     samples, neighbors, watch = 0, 0, Watch()
@@ -273,15 +264,15 @@ def read(folder: str, batch_size: int, order: str, seconds: float) -> dict[str, 
     with watch:
         while (spent := time.process_time() - start) < seconds:
             for _ in range(10):
-                count, around = next(endless)
-                samples, neighbors = samples + count, neighbors + around
+                count, others = next(endless)
+                samples, neighbors = samples + count, neighbors + others
         spent = time.process_time() - start
     return {"samples": samples, "neighbors": neighbors, "processor_s": spent,
             "anonymous_mib": watch.anonymous_mib, "mapped_mib": watch.mapped_mib}  # fmt: skip
 
 
 class Watch:
-    """Looks at this process's memory ten times a second."""
+    """Reads this process's memory ten times a second."""
 
     def __init__(self) -> None:
         self.anonymous_mib = self.mapped_mib = 0.0

@@ -1,4 +1,4 @@
-"""CS-LSTM on a processor: samples a second of a training step, and how long predicting 30 vehicles takes.
+"""Training on a CPU: samples a second of a training step, and how long predicting 30 vehicles takes.
 
     python benchmarks/training_steps.py [--scale 0.02] [--seconds 8] [--model cs-lstm] [--threads 1 2] [--work DIR]
 
@@ -9,10 +9,10 @@ seconds, after ten that do not count:
 - batches: gathered as the training loop does; or sample by sample, by a torch Dataset and a DataLoader that fills
   arrays row by row, as the reference implementation's does (`benchmarks/reference_loader.py`);
 - step: `plain`, by PyTorch's layers; `plain, kept`, the same where the process keeps freed memory as the training
-  loop does; `quick, kept`, the model's own step of the same mathematics, which is the one that trains (its LSTMs are
-  the model's own on one thread only).
+  loop does; `sparse, kept`, without the grid's empty cells, which is the step that trains (`models.social_grid`).
 
-The share of data is that of the time in which the step waits for its batch. Processor time is that of all threads.
+With a model that reads scenes only the gathered batches are measured. The share of data is the part of a step's time in
+which it waits for its batch. Processor time is that of all threads.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,10 @@ from tensors import CASES, build, save
 
 from tracklake.training.data.observed import Observed, Truth
 from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models import Reads
 from tracklake.training.models.inputs import read_samples
 
-Read = tuple[Observed[Any], Truth[Any]]
+Read = tuple[Any, Truth[Any]]
 
 DENSE = "7 x 1,500,000 at 10 Hz, 6 lanes"
 BATCH = 128
@@ -43,10 +45,10 @@ UNCOUNTED = 10
 VEHICLES = 30
 LINES = (
     ("sample by sample", "plain"),
-    ("sample by sample", "quick, kept"),
+    ("sample by sample", "sparse, kept"),
     ("gathered", "plain"),
     ("gathered", "plain, kept"),
-    ("gathered", "quick, kept"),
+    ("gathered", "sparse, kept"),
 )
 
 
@@ -55,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scale", type=float, default=0.02, help="of the number of entries")
     parser.add_argument("--seconds", type=float, default=8.0, help="for each line")
-    parser.add_argument("--model", default="cs-lstm", help="cs-lstm or cs-lstm-m")
+    parser.add_argument("--model", default="cs-lstm", help="a model that learns")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--work", type=Path, help="folder for the files")
     for name in ("step", "predict"):
@@ -75,9 +77,10 @@ def main() -> None:
         print("| threads | batches | step | samples/s | data, % of a step | ms a step | processor ms a step |")
         print("| --- | --- | --- | --- | --- | --- | --- |", flush=True)
         for threads in options.threads:
-            for batches, step in LINES:
-                asked = {"folder": str(folder), "model": options.model, "batches": batches, "step": step}
-                run = measure("--measure-step", asked | {"seconds": options.seconds}, threads)
+            lines = LINES if options.model.startswith("cs-lstm") else LINES[-2:-1]
+            for batches, step in lines:
+                request = {"folder": str(folder), "model": options.model, "batches": batches, "step": step}
+                run = measure("--measure-step", request | {"seconds": options.seconds}, threads)
                 figures = (
                     f"{run['samples'] / run['seconds']:,.0f}", f"{100 * run['data_s'] / run['seconds']:.1f}",
                     f"{1000 * run['seconds'] / run['steps']:.1f}", f"{1000 * run['processor_s'] / run['steps']:.1f}",
@@ -88,9 +91,9 @@ def main() -> None:
             print(f"| {name} | {wall_ms:.1f} | {processor_ms:.1f} |", flush=True)
 
 
-def measure(flag: str, asked: dict[str, Any], threads: int) -> dict[str, Any]:
+def measure(flag: str, request: dict[str, Any], threads: int) -> dict[str, Any]:
     """What a process of its own finds."""
-    command = [sys.executable, __file__, flag, json.dumps(asked)]
+    command = [sys.executable, __file__, flag, json.dumps(request)]
     environment = os.environ | {"POLARS_MAX_THREADS": "1", "OMP_NUM_THREADS": str(threads)}
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment)
     found: dict[str, Any] = json.loads(done.stdout)
@@ -110,9 +113,9 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
     torch.manual_seed(1)
     entry = find_model(model)
     network = entry.build(opened.protocol).train()
-    network.fast = step.startswith("quick")
+    network.fast = step.startswith("sparse")
     optimizer = torch.optim.Adam(network.parameters(), lr=entry.recipe.learning_rate)
-    source = gather_batches if batches == "gathered" else collate_batches
+    source = partial(gather_batches, reads=entry.reads) if batches == "gathered" else collate_batches
     endless = (batch for _ in iter(int, 1) for batch in source(opened))
     found = {"samples": 0, "steps": 0, "data_s": 0.0}
     began = processor = time.perf_counter()
@@ -125,7 +128,7 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
         observed, truth = next(endless)
         found["data_s"] += time.perf_counter() - start
         optimizer.zero_grad(set_to_none=True)
-        network.loss(observed, truth, "nll").backward()
+        network.loss(observed, truth, entry.recipe.phases[-1].loss).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), entry.recipe.max_gradient_norm)
         optimizer.step()
         found["samples"] += len(observed.history)
@@ -133,13 +136,13 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
     return found | {"seconds": time.perf_counter() - began, "processor_s": time.process_time() - processor}
 
 
-def gather_batches(folder: TensorFolder) -> Iterator[Read]:
+def gather_batches(folder: TensorFolder, reads: Reads) -> Iterator[Read]:
     """The training part once, shuffled, as the training loop reads it."""
     import torch
 
     numbers = np.random.default_rng(1).permutation(folder.samples_of("train"))
     for start in range(0, len(numbers), BATCH):
-        observed, truth = read_samples(folder, numbers[start : start + BATCH], "grid")
+        observed, truth = read_samples(folder, numbers[start : start + BATCH], reads)
         yield observed.each(torch.from_numpy), truth.each(torch.from_numpy)
 
 
@@ -174,7 +177,7 @@ def collate_batches(folder: TensorFolder) -> Iterator[Read]:
 
     dataset: Any = Subset(
         reference, folder.samples_of("train").tolist()
-    )  # it has __getitem__, which is all that is asked
+    )  # it has __getitem__, which is all that Subset needs
     yield from DataLoader(dataset, batch_size=BATCH, shuffle=True, collate_fn=collate)
 
 

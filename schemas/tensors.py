@@ -1,17 +1,15 @@
 """The files under `tensors/<split>/<fingerprint>/`: flat arrays and an index of samples, declared once.
 
-Two files. `arrays.safetensors` holds every array of ARRAYS in the safetensors layout: the header's length (8 bytes,
-little-endian), the header (JSON: dtype, shape and place of each array), then the arrays one after the other, so that
-any reader of that format can open it, memory-mapped. `index.json` says what they are: INDEX_KEYS.
+Every array of ARRAYS is a file of its own in NumPy's format, `sample_row.npy`, which `numpy.load(file, mmap_mode="r")`
+maps into memory. `index.json` says what they are: INDEX_KEYS.
 """
 
 from dataclasses import dataclass
 
-ARRAYS_FILE = "arrays.safetensors"
 INDEX_FILE = "index.json"
 
-TENSORS_VERSION = 3
-"""Version of the two files; it grows when older readers cannot read them."""
+TENSORS_VERSION = 4
+"""Number of the folder's layout; it grows when older readers cannot read the files."""
 
 POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
 
@@ -22,23 +20,13 @@ road decimetres or centimetres (these reach 327 m either way: longer roads are r
 STEPS_M = {"int16-decimetres": (0.1, 0.001), "int16-centimetres": (0.01, 0.001)}
 """Metres per step of int16 positions, along and across the road."""
 
-SAFETENSORS_DTYPES = {
-    "float32": "F32",
-    "int64": "I64",
-    "int32": "I32",
-    "int16": "I16",
-    "int8": "I8",
-    "uint8": "U8",
-}
-"""Names of NumPy's dtypes in the safetensors format."""
-
 
 @dataclass(frozen=True)
 class Array:
     """One array of a tensor folder.
 
     Args:
-        name: its key in the file.
+        name: name of the array, and of its file without the ending.
         dtype: NumPy's name of it; `position` = float32 or int16, as the index's `storage` says.
         shape: a letter for each axis, or a number: N rows (entries on the clock), R runs, S samples, K (sample,
             neighbor) pairs, C scenes, M vehicles in scenes. `S+1` is one more.
@@ -52,6 +40,11 @@ class Array:
     meaning: str
     counts: str = ""
 
+    @property
+    def file(self) -> str:
+        """Name of the array's file."""
+        return f"{self.name}.npy"
+
     def sizes(self, letters: dict[str, int]) -> tuple[int, ...]:
         """Return the shape in numbers."""
         axes = (axis.partition("+") for axis in self.shape)
@@ -62,7 +55,6 @@ class Array:
         return self.dtype if self.dtype != "position" else storage.partition("-")[0]
 
 
-# Wider elements first: each array then begins at a multiple of its element's size, as memory-mapping wants it.
 ARRAYS = (
     Array("run_first_row", "int64", ("R+1",), "rows of run r are [run_first_row[r], run_first_row[r + 1])", "N"),
     Array(
@@ -147,7 +139,7 @@ SUBSET_KEYS = {
     "last_lane": "a whole number",
     "width_m": "a number",
 }
-"""Keys of each subset in the index and the kinds of their values."""
+"""Each key of a subset and the kind of its value."""
 
 SUBSET_MEANING = """\
 Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,

@@ -20,11 +20,10 @@ HEAD = f"""# Tensors
 
 Derived from `schemas/tensors.py`; do not edit (`make docs` writes it). Version {TENSORS_VERSION}.
 
-`tracklake tensors` writes a folder of two files, which `training.data.tensor_folder.TensorFolder.open` maps into
-memory and
-checks: `{tensors.ARRAYS_FILE}`, every array in the safetensors layout, and `{tensors.INDEX_FILE}`, what they are.
+`tracklake tensors` writes a folder that `tracklake.training.data.tensor_folder.TensorFolder.open` maps into memory and
+checks: a file of NumPy's format for each array (`sample_row.npy`), and `{tensors.INDEX_FILE}`, which describes them.
 
-Shapes, order and units of the batches gathered from them (numpy, torch, or on a device) are those of
+Shapes, order and units of the batches gathered from them (NumPy arrays, or torch tensors on a device) are those of
 `training.data.batches.Batch` and `SceneBatch`. Under the protocol `{CSP.name}` a history has H = \
 {CSP.history_ticks} positions, a future F = {CSP.horizon_ticks}; of others see [protocols](protocols.md).
 

@@ -164,7 +164,7 @@ def list_arrays(holder: Any) -> list[tuple[str, np.ndarray]]:
 def digest_tensors(root: Path) -> Digests:
     """Every array of the opened tensors, and the batches that are gathered from them."""
     folder = TensorFolder.open(find_tensors(root))
-    arrays = {f"arrays/{name}": [value] for name, value in list_arrays(folder)}
+    arrays = {f"arrays/{name}": [value] for name, value in folder.arrays.items()}
     for part, absolute in product(PARTS, (False, True)):
         # One batch of all: where a batch begins is no matter of the tensors.
         for kind, batches in (("batches", folder.batches), ("scene_batches", folder.scene_batches)):

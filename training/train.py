@@ -1,11 +1,14 @@
-"""Train a model: one loop, and the run that comes of it."""
+"""Training of a model: one visible loop, and the run that it writes."""
 
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from tracklake.schemas.errors import TracklakeError
@@ -15,11 +18,10 @@ from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Model, Predictor, find_model, require_torch
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.checkpoints import find_config, read_checkpoint, refuse_other_run, restore, save_checkpoint
+from tracklake.training.runs.checkpoint import read_checkpoint, refuse_other_run, restore, save_checkpoint
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
-from tracklake.training.runs.feeding import Batches, Read, make_reader, read_batches
-from tracklake.training.runs.interrupts import holding_interrupts
-from tracklake.training.runs.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, writing_rows
+from tracklake.training.runs.loader import Read, load_batches, make_reader
+from tracklake.training.runs.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, open_log
 from tracklake.training.runs.memory import keep_freed_memory
 from tracklake.training.runs.run_folder import describe_run, save_run
 from tracklake.training.runs.state import TrainingState
@@ -36,16 +38,17 @@ Progress = Callable[[float, float], None]
 """Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss."""
 
 VALIDATION_BATCH = 1024
+"""Samples in a batch of validation."""
 BRIEF_S = 2.0
-"""An epoch that ends so soon after a checkpoint writes none: writing it may take longer than doing the epoch again."""
+"""Least time between a checkpoint and that of an epoch's end, in s: a shorter epoch is as quickly done again."""
 
 
 class DivergedError(TracklakeError):
-    """The loss is no number any more; nothing good can come of going on."""
+    """The loss is not finite, and more steps would not mend it."""
 
 
 class TrainingInterruptedError(KeyboardInterrupt):
-    """Ctrl-C, with a checkpoint to go on from."""
+    """Ctrl-C stopped a training that has a checkpoint to resume from."""
 
 
 def train(
@@ -59,52 +62,41 @@ def train(
 ) -> dict[str, Any]:
     """Train a model on the training part, evaluate it on the evaluation part, and write the run.
 
-    The evaluation part decides nothing: it is read once, after the last step.
+    The evaluation part is read once, after the last step, and decides nothing.
 
     Args:
-        model: its name in the registry. One that does not learn is evaluated and written all the same.
+        model: name in the registry. A model that needs no training is evaluated and written all the same.
         tensors: the tensor folder.
-        out: the run's folder, `models/<run>`; replaced where it exists, and only once the training is done. Until then
-            checkpoint and logs stand in a hidden folder beside it.
-        config: how; None = by the model's recipe, or, where it goes on, as it was begun.
-        progress: told how it goes.
-        resume: True: go on from the checkpoint; False: begin anew whatever there is; None: begin, unless there is a
+        out: the run's folder, `models/<run>`; replaced where it exists, after the training. Until then checkpoint and
+            logs are in a hidden folder beside it.
+        config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
+        progress: called after every step.
+        resume: True: resume from the checkpoint; False: start over, whatever there is; None: start, unless there is a
             checkpoint, which would be lost.
 
     Returns:
-        What `metrics.json` holds: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
+        Content of `metrics.json`: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
         where the split has no evaluation part).
 
     Raises:
-        TensorError: the tensors are absent or broken.
-        UnfinishedError: a checkpoint stands there and `resume` is None; there is none and it is True; it is of a
-            training with other settings or data; or another process is at it.
-        DamagedFileError: the checkpoint is not what was written.
-        DivergedError: the loss is not finite.
-        NotFiniteError: what the network predicts in the end is not.
-        FutureInputError: the model sees what comes after the moment at which it predicts; told before the first step
+        UnfinishedError: there is a checkpoint and `resume` is None; there is none and it is True; it is of a training
+            with other settings or data; or another process is training the run.
+        DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
+        FutureInputError: the model sees what comes after the tick at which it predicts; raised before the first step
             where it does so untrained, else after the last. No checkpoint is left.
-        TrainingInterruptedError: Ctrl-C; the checkpoint says where the training stands.
-        ValueError: unknown model or parameter; not enough to train with, see `training.runs.config.make_plan`; or no
-            time for one step.
-        ImportError: torch is needed and missing.
+        TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
+        TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
     """
     entry = find_model(model)
     folder = TensorFolder.open(tensors)
     if not entry.learns:
-        parameters = dict(config.parameters) if config else {}
-        predictor = entry.build(folder.protocol, **parameters)
-        evaluation = _evaluate(predictor, entry, folder, out.name)
-        metrics = {"model": model, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
-        save_run(out, describe_run(model, parameters, {}, folder), metrics, None)
-        return metrics
+        return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
     refuse_wrong_start(out, resume=resume)
     with claim_folder(out) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
-        stored = read_checkpoint(checkpoint) if resume else None
-        begun = find_config(checkpoint, stored) if stored else TrainConfig()
-        plan = make_plan(entry, folder, config or begun)
+        stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
+        plan = make_plan(entry, folder, config or started_with)
         run = plan.describe()
         if stored:
             refuse_other_run(checkpoint, stored["run"], run)
@@ -116,17 +108,25 @@ def train(
             save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
             checkpoint.unlink()
         except (DivergedError, NotFiniteError, FutureInputError):
-            checkpoint.unlink(missing_ok=True)  # it leads to the same, or was learnt from what came after
+            checkpoint.unlink(missing_ok=True)  # resumed, it would end the same, or it has learned from the future
             raise
         except KeyboardInterrupt:
             if not checkpoint.is_file():
                 raise
-            raise TrainingInterruptedError(f"interrupted; the training stands in {checkpoint}") from None
+            raise TrainingInterruptedError(f"interrupted; the checkpoint is {checkpoint}") from None
+    return metrics
+
+
+def _write_baseline(entry: Model, folder: TensorFolder, out: Path, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Evaluate a model that needs no training, write it as a run, and return its metrics."""
+    evaluation = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
+    metrics = {"model": entry.name, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
+    save_run(out, describe_run(entry.name, parameters, {}, folder), metrics, None)
     return metrics
 
 
 def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: str) -> dict[str, Any] | None:
-    """The evaluation part's scores; None where the split has no such part."""
+    """Return the scores on the evaluation part; None where the split has no such part."""
     if len(folder.samples_of("eval")) == 0:
         return None
     return measure_errors(predictor, folder, "eval", name=name, reads=entry.reads).to_dict()
@@ -135,30 +135,22 @@ def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: st
 def _fit(
     plan: Plan, run: dict[str, Any], unfinished: Path, stored: dict[str, Any] | None, progress: Progress | None
 ) -> tuple["Network", dict[str, Any]]:
-    """The training loop: (the trained network, its course in figures).
-
-    Args:
-        plan: what is done.
-        run: the same, as a checkpoint states it.
-        unfinished: the folder for checkpoint and logs.
-        stored: the checkpoint to go on from; None = begin.
-        progress: told how it goes.
-    """
+    """Run the training loop, from a stored checkpoint where there is one; return the network and its metrics."""
     config, checkpoint = plan.config, unfinished / CHECKPOINT_FILE
-    with _own_torch(plan):
-        network, optimizer, state = _begin(plan, checkpoint, stored)
+    with _isolate_torch(plan):
+        network, optimizer, state = _start(plan, checkpoint, stored)
         save = partial(save_checkpoint, checkpoint, run, network, optimizer, state, plan.device)
-        read = make_reader(plan)
-        batches = read_batches(plan, read, state.step)
+        read = make_reader(plan.folder, plan.entry.reads, plan.device)
+        batches = load_batches(plan, read, state.step)
         with (
-            holding_interrupts() as interrupted,
-            writing_rows(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
-            writing_rows(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
+            _hold_interrupts() as interrupted,
+            open_log(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
+            open_log(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
         ):
-            began = time.monotonic() - state.elapsed_s
+            started = time.monotonic() - state.elapsed_s
             saved = time.monotonic()
             while True:
-                state.elapsed_s = time.monotonic() - began
+                state.elapsed_s = time.monotonic() - started
                 spent = plan.measure_spent(state.step, state.elapsed_s)
                 if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
@@ -167,31 +159,31 @@ def _fit(
                     _log_steps(plan, state, optimizer, log_steps)  # a row is of one phase
                     state.begin_phase(phase.loss)
                 _take_step(plan, state, network, optimizer, batches, spent)
-                state.elapsed_s = time.monotonic() - began
+                state.elapsed_s = time.monotonic() - started
                 if state.step % config.log_steps == 0:
                     _log_steps(plan, state, optimizer, log_steps)
-                ends = state.step % plan.epoch_steps == 0
-                if ends:
+                ends_epoch = state.step % plan.epoch_steps == 0
+                if ends_epoch:
                     log_epoch(_end_epoch(plan, state, network, read))
                 since_saved = time.monotonic() - saved
-                if since_saved > config.checkpoint_s or (ends and since_saved > BRIEF_S):
+                if since_saved > config.checkpoint_s or (ends_epoch and since_saved > BRIEF_S):
                     save()
                     saved = time.monotonic()
                 try:
                     if progress is not None:
                         spent = plan.measure_spent(state.step, state.elapsed_s)
                         progress(min(1.0, spent / plan.budget), state.smooth_loss)
-                    if interrupted():
+                    if interrupted:
                         raise KeyboardInterrupt
-                except KeyboardInterrupt:  # whoever it comes from: the step is done, the state is whole
+                except KeyboardInterrupt:  # from either of the two: the step is complete
                     save()
                     raise
 
             if state.step == 0:
-                raise TracklakeError(f"not one step was done within {config.seconds} s: give it more time")
+                raise TracklakeError(f"not one step was done within {config.seconds} s: allow more time (`--seconds`)")
             _log_steps(plan, state, optimizer, log_steps)
             if not state.epochs or state.epochs[-1]["step"] != state.step:
-                log_epoch(_end_epoch(plan, state, network, read))  # one that the budget cut short
+                log_epoch(_end_epoch(plan, state, network, read))  # an epoch that the budget cut short
             save()
         if state.best_weights is not None:
             network.load_state_dict(state.best_weights)
@@ -200,23 +192,18 @@ def _fit(
     return network.eval(), _describe_training(plan, state, network)
 
 
-def _begin(
+def _start(
     plan: Plan, checkpoint: Path, stored: dict[str, Any] | None
 ) -> tuple["Network", "torch.optim.Optimizer", TrainingState]:
-    """Network, optimiser and state before the first step, or as a checkpoint says.
-
-    Raises:
-        FutureInputError: the network sees the future before it has learnt anything.
-        DamagedFileError: the checkpoint is not of this network.
-    """
+    """Build network, optimiser and state, new or as in a checkpoint; a new network must not see the future."""
     import torch
 
     network: Network = plan.entry.build(plan.folder.protocol, **plan.parameters).to(plan.device).train()
     adam = torch.optim.AdamW if plan.recipe.optimizer == "adamw" else torch.optim.Adam
     optimizer = adam(network.parameters(), lr=plan.recipe.learning_rate)
-    if stored:  # looked at when it began
+    if stored:
         return network, optimizer, restore(checkpoint, stored, network, optimizer, plan.device)
-    # On `train`: that tells as much, and the evaluation part is left alone until the end.
+    # On `train`, which shows a leak as well, so that the evaluation part is not read before the end.
     refuse_future(network, plan.folder, "train", name=plan.entry.name, reads=plan.entry.reads)
     return network, optimizer, TrainingState()
 
@@ -226,10 +213,10 @@ def _take_step(
     state: TrainingState,
     network: "Network",
     optimizer: "torch.optim.Optimizer",
-    batches: Batches,
+    batches: Iterator[tuple[int, Any, Any]],
     spent: float,
 ) -> None:
-    """One step of the optimiser on the next batch, after so much of the budget is spent."""
+    """Take one step of the optimiser on the next batch, at the learning rate of the budget spent."""
     import torch
 
     start = time.perf_counter()
@@ -242,13 +229,13 @@ def _take_step(
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(network.parameters(), plan.recipe.max_gradient_norm)
     optimizer.step()
-    state.take_step(_require_finite(loss.item(), plan, state), samples)
+    state.count_step(_require_finite(loss.item(), plan, state), samples)
     state.stepping_s += time.perf_counter() - start
 
 
 @contextmanager
-def _own_torch(plan: Plan) -> Iterator[None]:
-    """Threads and random numbers as the plan says; the caller's are as before, afterwards."""
+def _isolate_torch(plan: Plan) -> Iterator[None]:
+    """Set threads and random state as the plan says, and restore the caller's afterwards."""
     import torch
 
     cuda = [plan.device] if plan.device.type == "cuda" else []
@@ -265,12 +252,34 @@ def _own_torch(plan: Plan) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
-    """The loss, which must be a number.
+@contextmanager
+def _hold_interrupts() -> Iterator[list[int]]:
+    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second Ctrl-C does not wait.
 
-    Raises:
-        DivergedError: it is none.
+    Where the process handles the signal itself, or this is not the main thread, it is left as it is.
     """
+    pressed: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield pressed
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if pressed:  # after the last step
+        raise KeyboardInterrupt
+
+
+def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
+    """Return the loss, or raise DivergedError where it is not finite."""
     if not math.isfinite(loss):
         raise DivergedError(
             f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phases[-1][0]}`: train with a learning "
@@ -280,9 +289,9 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
 
 
 def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read) -> Row:
-    """A row of epochs.csv; where there is patience, after validating, which keeps the weights where they are better."""
+    """Validate where there is patience, keep the weights if they are the best, and return a row of epochs.csv."""
     epoch, phase = (state.step - 1) // plan.epoch_steps, state.phases[-1][0]
-    losses = state.losses[max(epoch * plan.epoch_steps, state.phases[-1][1]) :]  # of one phase: others are no number
+    losses = state.losses[max(epoch * plan.epoch_steps, state.phases[-1][1]) :]  # of one phase, to be comparable
     row: Row = {"epoch": epoch, "step": state.step, "phase": phase, "seconds": round(state.elapsed_s, 3)}
     row |= {"loss": sum(losses) / len(losses), "validation_loss": None, "best": None}
     if plan.config.patience is None:
@@ -298,7 +307,7 @@ def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read)
 
 
 def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> float:
-    """A phase's mean loss over the samples of `val`."""
+    """Return a phase's mean loss over the samples of `val`."""
     import torch
 
     total = 0.0
@@ -314,42 +323,28 @@ def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> flo
 def _log_steps(
     plan: Plan, state: TrainingState, optimizer: "torch.optim.Optimizer", log: Callable[[Row], None]
 ) -> None:
-    """A row of course.csv on the steps since the row before, if there are any."""
-    step, samples, stepping_s, reading_s = state.marked
+    """Log a row of course.csv for the steps since the row before, if there are any."""
+    step, samples, stepping_s, reading_s = state.logged
     if state.step == step:
         return
-    state.marked = (state.step, state.samples, state.stepping_s, state.reading_s)
+    state.logged = (state.step, state.samples, state.stepping_s, state.reading_s)
     took_s = state.stepping_s - stepping_s
-    log(
-        {
-            "step": state.step,
-            "epoch": (state.step - 1) // plan.epoch_steps,
-            "phase": state.phases[-1][0],
-            "seconds": round(state.elapsed_s, 3),
-            "loss": sum(state.losses[step:]) / (state.step - step),
-            "learning_rate": optimizer.param_groups[0]["lr"],
-            "samples_per_s": round((state.samples - samples) / took_s, 1),
-            "data_share": round((state.reading_s - reading_s) / took_s, 4),
-        }
-    )
+    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phases[-1][0]}
+    row |= {"seconds": round(state.elapsed_s, 3), "loss": sum(state.losses[step:]) / (state.step - step)}
+    row |= {"learning_rate": optimizer.param_groups[0]["lr"]}
+    row |= {"samples_per_s": round((state.samples - samples) / took_s, 1)}
+    log(row | {"data_share": round((state.reading_s - reading_s) / took_s, 4)})
 
 
 def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:
-    """What `metrics.json` holds, but for the evaluation.
+    """Describe a finished training for `metrics.json`, without its evaluation.
 
     Returns:
-        model; train_samples, in the part; weights, how many numbers were learned; seconds, of the loop; steps;
+        model; train_samples, in the part; weights, number of learned numbers; seconds, of the loop; steps;
         samples_seen, in all steps; samples_per_s and data_share, of the steps' time (reading included) and the share of
         it that reading took; phases (loss, steps, and loss_first and loss_last, its mean over their first and last
         twentieth); best (epoch and validation_loss of the weights that were kept; null without patience).
     """
-    ends = [*(first for _, first in state.phases[1:]), state.step]
-    phases = []
-    for (loss, first), end in zip(state.phases, ends, strict=True):
-        losses = state.losses[first:end]
-        some = max(1, len(losses) // 20)
-        means = {"loss_first": sum(losses[:some]) / some, "loss_last": sum(losses[-some:]) / some}
-        phases.append({"loss": loss, "steps": len(losses), **means})
     best = {"epoch": state.best_epoch, "validation_loss": state.best_loss}
     return {
         "model": plan.entry.name,
@@ -360,6 +355,6 @@ def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> 
         "samples_seen": state.samples,
         "samples_per_s": round(state.samples / state.stepping_s, 1),
         "data_share": round(state.reading_s / state.stepping_s, 4),
-        "phases": phases,
+        "phases": state.describe_phases(),
         "best": best if state.best_loss is not None else None,
     }

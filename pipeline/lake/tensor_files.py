@@ -1,10 +1,10 @@
-"""Tensor folders on disk: `arrays.safetensors` and `index.json`, written subset by subset."""
+"""Tensor folders on disk: a .npy file for each array, and `index.json`, written subset by subset."""
 
 import json
-import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import polars as pl
@@ -13,7 +13,7 @@ from tracklake.pipeline.transforms.tensors.arrays import Arrays, SubsetTensors, 
 from tracklake.pipeline.transforms.tensors.index import describe_subset, describe_tensors
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.tensors import ARRAYS, ARRAYS_FILE, INDEX_FILE, SAFETENSORS_DTYPES
+from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, Array
 
 
 def write_tensors(
@@ -41,13 +41,14 @@ def write_tensors(
     Raises:
         ValueError: an array is missing, not of the declared dtype or shape, or there are too many rows.
     """
-    spooled = {array.name: folder / f"{array.name}.part" for array in ARRAYS}
     sizes = dict.fromkeys(("N", "R", "S", "K", "C", "M"), 0)
     described: list[dict[str, Any]] = []
     by_part = np.zeros(len(PARTS), dtype=np.int64)
     worst, squares = np.zeros(2), np.zeros(2)
-    files = {name: path.open("wb") for name, path in spooled.items()}
-    try:
+    with ExitStack() as opened:
+        files = {array.name: opened.enter_context((folder / array.file).open("wb")) for array in ARRAYS}
+        for array in ARRAYS:
+            _write_header(files[array.name], array, storage, sizes)
         for facts, tensors in subsets:
             _check_arrays(tensors.arrays, storage, f"{facts['dataset']}/{facts['subset']}")
             for name, values in join_after(tensors.arrays, sizes, len(described)).items():
@@ -58,13 +59,10 @@ def write_tensors(
             worst = np.maximum(worst, tensors.max_error_m)
             squares += tensors.squared_error_m2
             described.append(describe_subset(facts, tensors))
-        if not described:
-            for array in ARRAYS:  # offsets of nothing
-                files[array.name].write(bytes(8) if array.shape[0].endswith("+1") else b"")
-    finally:
-        for file in files.values():
-            file.close()
-    _join_files(folder / ARRAYS_FILE, spooled, sizes, storage)
+        for array in ARRAYS:
+            if not described and array.shape[0].endswith("+1"):
+                files[array.name].write(bytes(8))  # the one offset of no groups
+            _write_header(files[array.name], array, storage, sizes)
     index = describe_tensors(
         described,
         splits,
@@ -80,35 +78,12 @@ def write_tensors(
     return index
 
 
-def make_header(sizes: Mapping[str, int], storage: str) -> bytes:
-    """Return the head of a safetensors file: its length, and dtype, shape and offsets of every array, in order.
-
-    Padded with blanks, so that the arrays begin at a multiple of 8 bytes, and arrays of wide elements stay aligned.
-    """
-    header: dict[str, Any] = {"__metadata__": {"format": "np"}}
-    start = 0
-    for array in ARRAYS:
-        dtype, shape = array.stored_as(storage), array.sizes(dict(sizes))
-        end = start + int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        header[array.name] = {
-            "dtype": SAFETENSORS_DTYPES[dtype],
-            "shape": list(shape),
-            "data_offsets": [start, end],
-        }
-        start = end
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text
-
-
-def _join_files(target: Path, spooled: Mapping[str, Path], sizes: Mapping[str, int], storage: str) -> None:
-    """Put the header and the spooled arrays into one file; each is deleted when it has been copied."""
-    with target.open("wb") as out:
-        out.write(make_header(sizes, storage))
-        for array in ARRAYS:
-            with spooled[array.name].open("rb") as values:
-                shutil.copyfileobj(values, out, 4 * 2**20)
-            spooled[array.name].unlink()
+def _write_header(file: BinaryIO, array: Array, storage: str, sizes: Mapping[str, int]) -> None:
+    """Write an array's header at the file's begin; it is as long for any number of rows, so that it can be replaced."""
+    file.seek(0)
+    descr = np.lib.format.dtype_to_descr(np.dtype(array.stored_as(storage)))
+    header = {"descr": descr, "fortran_order": False, "shape": array.sizes(dict(sizes))}
+    np.lib.format.write_array_header_1_0(file, header)
 
 
 def _check_arrays(arrays: Arrays, storage: str, where: str) -> None:

@@ -43,7 +43,7 @@ class Forgetful(Network):
             return mean_squared_distance(predicted, truth.future, truth.future_mask)
         return (predicted - truth.future).norm(dim=-1)[truth.future_mask].mean()
 
-    def say(self, observed):
+    def predict_tensors(self, observed):
         return Prediction(position_m=to_numpy(self(observed.history)))
 
 

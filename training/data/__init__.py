@@ -1,1 +1,1 @@
-"""Tensor folders from within: opened, checked, drawn from, and gathered as their rows lie."""
+"""Tensor folders opened and checked, and batches gathered from them."""

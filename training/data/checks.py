@@ -1,13 +1,14 @@
-"""What an opened tensor folder must be: the index's keys of their kinds, and arrays that agree with it."""
+"""Checks of an opened tensor folder: kinds of the index's values, and arrays that agree with the index."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, conlist
 
+from tracklake.schemas.arrays import Integers
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, SUBSET_KEYS
@@ -19,41 +20,25 @@ class TensorError(TracklakeError):
     """A tensor folder is absent, unfinished or not what its index says."""
 
 
-def is_whole(value: object) -> bool:
-    """A whole number; JSON's true and false are none."""
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def is_pair(value: object, is_one: Callable[[object], bool]) -> TypeGuard[list[Any]]:
-    """A list of two such values."""
-    return isinstance(value, list) and len(value) == 2 and all(map(is_one, value))
-
-
-def _is_number(value: object) -> bool:
-    return is_whole(value) or (isinstance(value, float) and math.isfinite(value))
-
-
-KINDS: dict[str, Callable[[Any], bool]] = {
-    "text": lambda value: isinstance(value, str),
-    "a whole number": is_whole,
-    "a number": _is_number,
-    "two numbers": lambda value: is_pair(value, _is_number),
-    "numbers or null": lambda value: value is None or (isinstance(value, list) and all(map(_is_number, value))),
-    "an object": lambda value: isinstance(value, dict),
-    "an object or null": lambda value: value is None or isinstance(value, dict),
-    "objects": lambda value: isinstance(value, list) and all(isinstance(one, dict) for one in value),
-    "counts by name": lambda value: (
-        isinstance(value, dict) and all(is_whole(count) and count >= 0 for count in value.values())
-    ),
+KINDS: dict[str, TypeAdapter[Any]] = {
+    "text": TypeAdapter(str),
+    "a whole number": TypeAdapter(int),
+    "a number": TypeAdapter(FiniteFloat),
+    "two numbers": TypeAdapter(conlist(FiniteFloat, min_length=2, max_length=2)),
+    "numbers or null": TypeAdapter(list[FiniteFloat] | None),
+    "an object": TypeAdapter(dict[str, Any]),
+    "an object or null": TypeAdapter(dict[str, Any] | None),
+    "objects": TypeAdapter(list[dict[str, Any]]),
+    "counts by name": TypeAdapter(dict[str, NonNegativeInt]),
 }
-"""Which values are of the kinds that `schemas.tensors` declares for keys."""
+"""Type of each kind of value that `schemas.tensors` declares for keys; checked strictly, as true is no number."""
 
 
 def check_index(file: Path, index: Mapping[str, Any]) -> None:
     """Refuse an index that lacks a key, or whose values are not of the kinds declared.
 
     Raises:
-        TensorError: it is so.
+        TensorError: names the first such value, or the missing keys.
     """
     _check_kinds(file, "", index, INDEX_KEYS)
     subsets = index.get("subsets", [])
@@ -70,14 +55,18 @@ def check_index(file: Path, index: Mapping[str, Any]) -> None:
 
 def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mapping[str, str]) -> None:
     for key, kind in kinds.items():
-        if key in found and not KINDS[kind](found[key]):
-            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {str(found[key])[:60]}; {AGAIN}")
+        try:
+            if key in found:
+                KINDS[kind].validate_python(found[key], strict=True)
+        except ValidationError:
+            got = str(found[key])[:60]
+            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {got}; {AGAIN}") from None
 
 
-def check_arrays(file: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Refuse arrays that do not agree with each other or the index: wrong values would be read, or others' rows.
+def check_arrays(path: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Refuse arrays that do not agree with each other or with the index, and would give wrong values.
 
-    Looks at run-, sample- and scene-sized arrays only, in whole passes: a few ms for a million samples.
+    Only arrays by run, sample and scene are read, once each: a few ms for a million samples.
 
     Raises:
         TensorError: offsets do not begin at 0, fall, or do not end where what they count ends; a run is of a subset
@@ -85,11 +74,11 @@ def check_arrays(file: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.
     """
     for array in ARRAYS:
         if array.shape[0].endswith("+1"):
-            _check_offsets(f"{file}: array `{array.name}`", arrays[array.name], index["sizes"][array.counts])
+            _check_offsets(f"{path}: array `{array.name}`", arrays[array.name], index["sizes"][array.counts])
     subset, last = arrays["run_subset"], len(index["subsets"]) - 1
     if len(subset) and (subset.min() < 0 or subset.max() > last):
         raise TensorError(
-            f"{file}: array `run_subset`: expected 0 to {last}, the index's subsets, got {subset.min()} to "
+            f"{path}: array `run_subset`: expected 0 to {last}, the index's subsets, got {subset.min()} to "
             f"{subset.max()}; {AGAIN}"
         )
     part = arrays["sample_part"]
@@ -97,18 +86,18 @@ def check_arrays(file: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.
         expected, got = index["samples_by_part"][name], np.count_nonzero(part == number)
         if got != expected:
             raise TensorError(
-                f"{file}: array `sample_part`: expected {expected:,} samples of {name}, as the index counts, got "
+                f"{path}: array `sample_part`: expected {expected:,} samples of {name}, as the index counts, got "
                 f"{got:,}; {AGAIN}"
             )
     others = len(part) - sum(index["samples_by_part"][name] for name in PARTS)
     if others:
         raise TensorError(
-            f"{file}: array `sample_part`: expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no "
+            f"{path}: array `sample_part`: expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no "
             f"part); {AGAIN}"
         )
 
 
-def _check_offsets(what: str, offset: npt.NDArray[np.int64], end: int) -> None:
+def _check_offsets(what: str, offset: Integers, end: int) -> None:
     if (offset[0], offset[-1]) != (0, end):
         raise TensorError(f"{what}: expected offsets from 0 to {end}, got {offset[0]} to {offset[-1]}; {AGAIN}")
     falls = offset[1:] < offset[:-1]

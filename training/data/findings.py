@@ -1,31 +1,31 @@
-"""Which samples stand on tracks with findings: scores of clean samples can then be told from those of all."""
+"""Samples on tracks with findings, so that scores of clean samples can be given beside those of all."""
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Flags
 from tracklake.schemas.columns import SEVERITIES
-from tracklake.training.data.batches import Flags
-from tracklake.training.data.windows import check_numbers
+from tracklake.training.data.positions import check_numbers
 
 if TYPE_CHECKING:
     from tracklake.training.data.tensor_folder import TensorFolder
 
 
-def touched(folder: "TensorFolder", samples: npt.ArrayLike, severity: str) -> Flags:
-    """(B,) whether the sample's own vehicle breaks a rule within its history or its known future.
+def mark_flagged(folder: "TensorFolder", samples: npt.ArrayLike, severity: str) -> Flags:
+    """Return (B,) whether the sample's own vehicle breaks a rule within its history or its known future.
 
-    What a row of tensors counts as its frames, see `finding` in `schemas.tensors.ARRAYS`: the first row of a history
-    also answers for the frames since the tick before it.
+    `finding` in `schemas.tensors.ARRAYS` says which frames a row stands for: the first row of a history also stands for
+    the frames since the tick before it.
 
     Args:
-        folder: where from.
+        folder: tensors to read from.
         samples: (B,) numbers of samples, in any order.
-        severity: of `schemas.columns.SEVERITIES`; worse ones count as well.
+        severity: one of `schemas.columns.SEVERITIES`; worse ones count as well.
 
     Raises:
-        IndexError: a number below 0, or not below S.
+        IndexError: a number is below 0 or not below S.
         ValueError: no such severity.
     """
     if severity not in SEVERITIES:

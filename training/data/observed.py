@@ -1,41 +1,38 @@
-"""What a model may see of samples, and what it is to predict, kept apart: a prediction is never given the truth."""
+"""Samples as a model may see them, and the truth that it predicts, in separate types."""
 
 from collections.abc import Callable
 from dataclasses import Field, dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, Self, TypeVar
+from typing import Any, ClassVar, Generic, NoReturn, Self, TypeVar
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Batch
 
-if TYPE_CHECKING:
-    from tracklake.training.data.torch_batches import TorchBatch
-
 Array = TypeVar("Array")
-"""NumPy's arrays or torch's tensors; shapes, units and order are the same."""
+"""NumPy arrays or torch tensors, of the same shapes, units and order."""
 
 
 class FutureInputError(TracklakeError, AttributeError):
-    """A model asked for what is known only after the moment at which it predicts."""
+    """A model reads what is known only after the tick at which it predicts."""
 
 
 class _Arrays:
-    """Arrays of one kind, by name; every heir is a dataclass."""
+    """Arrays of one kind by name; every subclass is a dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def each(self, change: Callable[[Any], Any]) -> Self:
-        """The same with every array changed, for instance to a tensor on a device."""
+        """Return a copy with every array changed, for instance to a tensor on a device."""
         return type(self)(**{own.name: change(getattr(self, own.name)) for own in fields(self)})
 
 
 class _Blind(_Arrays):
-    """Arrays known at the moment of prediction; asking for any other is refused."""
+    """Arrays known at the tick of prediction; reading any other is refused."""
 
     def __getattr__(self, name: str) -> NoReturn:
-        """Called for what is not there.
+        """Refuse a name that is no array here.
 
         Raises:
-            FutureInputError: always, but for Python's own names.
+            FutureInputError: always, except for Python's own names.
         """
         if name.startswith("__"):
             raise AttributeError(name)
@@ -47,7 +44,7 @@ class _Blind(_Arrays):
 
 @dataclass(frozen=True)
 class Observed(_Blind, Generic[Array]):
-    """Samples with the neighbors in their grids. B samples, K neighbors of all of them, H ticks of history.
+    """B samples with K neighbors in their grids, over H ticks of history.
 
     Positions in m, relative to the sample's last one: along the direction of travel, and across, positive to the right.
 
@@ -68,7 +65,7 @@ class Observed(_Blind, Generic[Array]):
 
 @dataclass(frozen=True)
 class ObservedScene(_Blind, Generic[Array]):
-    """Samples (egos) with the vehicles nearest to them, whatever their lanes. B egos, V vehicles of each, H ticks.
+    """B samples (egos), each with the V - 1 vehicles nearest to it in any lane, over H ticks of history.
 
     Positions in m, all of a scene relative to its ego's last one, axes as in `Observed`. Vehicle 0 is the ego; the
     others stand in order of distance; where there are fewer, rows are masked and hold zeros.
@@ -80,9 +77,9 @@ class ObservedScene(_Blind, Generic[Array]):
         size_m: (B, V, 2) length and width; 0 where unknown.
         lanes: (B, 3, 3) lanes left of, under and right of the ego: the centre's offset from the ego's last position
             (m, positive to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is
-            knowledge of the map, not of the moment: where no markings are known, the rightmost lane is the highest that
-            anybody drives in during the whole recording (`last_lane` of `schemas.tensors`), so that a lane may exist
-            here because somebody is in it later.
+            knowledge of the map: where no markings are known, the rightmost lane is the highest that any vehicle uses
+            during the whole recording (`last_lane` of `schemas.tensors`), so that a lane may exist here because a
+            vehicle uses it later.
     """
 
     history: Array
@@ -94,7 +91,7 @@ class ObservedScene(_Blind, Generic[Array]):
 
 @dataclass(frozen=True)
 class Truth(_Arrays, Generic[Array]):
-    """What came: for `loss` and for scores, never for a prediction.
+    """The true futures and maneuvers: for `loss` and for scores, never for a prediction.
 
     Args:
         future: (B, F, 2) in m, axes and origin as the history's; of scenes (B, V, F, 2).
@@ -109,11 +106,11 @@ class Truth(_Arrays, Generic[Array]):
     longitudinal: Array
 
 
-def part_batch(batch: "Batch | TorchBatch") -> tuple[Observed[Any], Truth[Any]]:
-    """A batch as what may be seen of it and what is to be predicted; nothing is copied.
+def part_batch(batch: Batch) -> tuple[Observed[Any], Truth[Any]]:
+    """Split a batch into what may be seen of it and the truth; nothing is copied.
 
     Raises:
-        ValueError: an absolute batch.
+        ValueError: the batch is absolute.
     """
     if batch.absolute:
         raise ValueError("models see positions relative to the sample's last one: gather without `absolute`")

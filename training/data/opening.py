@@ -1,7 +1,6 @@
-"""Opening tensor folders: both files checked against their declaration; of the arrays, only their index is read."""
+"""Opening of tensor folders: the index and the arrays' headers, checked against their declaration."""
 
 import json
-import math
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,23 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.tensors import (
-    ARRAYS,
-    ARRAYS_FILE,
-    INDEX_FILE,
-    POSITION_STORAGES,
-    SAFETENSORS_DTYPES,
-    STEPS_M,
-    TENSORS_VERSION,
-)
-from tracklake.training.data.checks import AGAIN, TensorError, check_arrays, check_index, is_pair, is_whole
+from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, POSITION_STORAGES, STEPS_M, TENSORS_VERSION
+from tracklake.training.data.checks import AGAIN, TensorError, check_arrays, check_index
 
 
 def read_index(path: Path) -> dict[str, Any]:
-    """`index.json` of a folder: of this version, keys of their kinds, rounding errors that its storage can have.
+    """Read `index.json` of a folder and check its version, its keys and its rounding errors.
 
     Raises:
-        TensorError: it is absent, or not so.
+        TensorError: it is absent, of another version, damaged, or its errors are larger than its storage can make.
     """
     file = path / INDEX_FILE
     if not file.is_file():
@@ -44,7 +35,7 @@ def read_index(path: Path) -> dict[str, Any]:
 
 
 def _check_storage(file: Path, index: dict[str, Any]) -> None:
-    """Refuse rounding errors beyond half a step: centres or steps are then not those of the arrays."""
+    """Refuse rounding errors beyond half a step, as centres or steps are then not those of the arrays."""
     storage, errors = index["storage"], index["max_error_m"]
     if storage not in POSITION_STORAGES:
         raise TensorError(f"{file}: expected storage {' or '.join(POSITION_STORAGES)}, got {storage!r}; {AGAIN}")
@@ -58,10 +49,10 @@ def _check_storage(file: Path, index: dict[str, Any]) -> None:
 
 
 def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
-    """The protocol whose parameters the index holds.
+    """Read the protocol whose parameters the index holds.
 
     Raises:
-        TensorError: they are others than this version's, or do not give the digest beside them.
+        TensorError: the parameters are not those of this version, or do not give the digest beside them.
     """
     file = path / INDEX_FILE
     parameters = {name: value for name, value in index["protocol"].items() if name != "digest"}
@@ -83,61 +74,27 @@ def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
 
 
 def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
-    """Every array of ARRAYS, mapped read-only, of the declared dtype and shape, and in agreement with the index.
+    """Map every array of ARRAYS read-only, and check it against its declaration and the index.
 
     Raises:
-        TensorError: the file is absent, cut short or too long, no safetensors file, or lacks an array or holds it with
-            another dtype or shape; or see `training.data.checks.check_arrays`.
+        TensorError: a file is absent, cut short or too long, is no .npy file, or holds another dtype or shape; or see
+            `training.data.checks.check_arrays`.
     """
-    file = path / ARRAYS_FILE
-    header, start = _read_header(file)
-    size = file.stat().st_size - start
-    # Plain views: indexing np.memmap itself runs Python code for every result.
-    mapped = np.memmap(file, np.uint8, "r", start).view(np.ndarray) if size else np.empty(0, np.uint8)
     arrays = {}
     for array in ARRAYS:
-        dtype, shape = array.stored_as(index["storage"]), array.sizes(index["sizes"])
-        found = header.get(array.name, {})
-        if not isinstance(found, dict):
-            raise TensorError(f"{file}: array `{array.name}`: expected an object in the header, got {found!r}; {AGAIN}")
-        if (found.get("dtype"), found.get("shape")) != (SAFETENSORS_DTYPES[dtype], list(shape)):
+        file = path / array.file
+        dtype, shape = np.dtype(array.stored_as(index["storage"])), array.sizes(index["sizes"])
+        try:
+            mapped = np.lib.format.open_memmap(file, mode="r")
+        except (OSError, ValueError) as broken:
+            raise TensorError(f"{file}: cannot be read ({broken}); {AGAIN}") from broken
+        if (mapped.dtype, mapped.shape) != (dtype, shape):
             raise TensorError(
-                f"{file}: array `{array.name}`: expected {SAFETENSORS_DTYPES[dtype]} of shape {list(shape)}, got "
-                f"{found.get('dtype', 'nothing')} of shape {found.get('shape')}; {AGAIN}"
+                f"{file}: expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}; {AGAIN}"
             )
-        place = found.get("data_offsets")
-        if not is_pair(place, is_whole) or place[0] < 0:
-            raise TensorError(
-                f"{file}: array `{array.name}`: expected its two `data_offsets` in bytes, got {place!r}; {AGAIN}"
-            )
-        first, end = place
-        if end - first != math.prod(shape) * np.dtype(dtype).itemsize or first % np.dtype(dtype).itemsize:
-            raise TensorError(f"{file}: array `{array.name}` cannot stand at bytes {first} to {end}; {AGAIN}")
-        if end > size:
-            raise TensorError(
-                f"{file}: cut short: array `{array.name}` ends at byte {start + end:,}, the file at {start + size:,}; "
-                f"{AGAIN}"
-            )
-        arrays[array.name] = mapped[first:end].view(dtype).reshape(shape)
-    ends = max(header[array.name]["data_offsets"][1] for array in ARRAYS)
-    if size != ends:
-        raise TensorError(f"{file}: expected {start + ends:,} bytes, got {start + size:,}; {AGAIN}")
-    check_arrays(file, index, arrays)
+        size, wanted = file.stat().st_size, mapped.offset + mapped.nbytes
+        if size != wanted:
+            raise TensorError(f"{file}: expected {wanted:,} bytes, got {size:,}; {AGAIN}")
+        arrays[array.name] = mapped.view(np.ndarray)  # indexing np.memmap itself runs Python code for every result
+    check_arrays(path, index, arrays)
     return arrays
-
-
-def _read_header(file: Path) -> tuple[dict[str, Any], int]:
-    """A safetensors file's header, and the byte at which the arrays begin."""
-    try:
-        with file.open("rb") as stream:
-            length = int.from_bytes(stream.read(8), "little")
-            if not 2 <= length <= file.stat().st_size - 8:
-                raise TensorError(f"{file}: not a whole safetensors file ({file.stat().st_size:,} bytes); {AGAIN}")
-            header = json.loads(stream.read(length))
-    except (OSError, ValueError) as broken:
-        if isinstance(broken, TensorError):
-            raise
-        raise TensorError(f"{file}: cannot be read ({broken}); {AGAIN}") from broken
-    if not isinstance(header, dict):
-        raise TensorError(f"{file}: expected a safetensors header, got {type(header).__name__}; {AGAIN}")
-    return header, 8 + length

@@ -1,17 +1,25 @@
-"""Whole scenes: every vehicle of a moment, with what is known of its lane."""
+"""Whole scenes: every vehicle at a tick, with its place in its lane."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Bytes, Floats, Integers
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.batches import Floats, Integers, SceneBatch
+from tracklake.training.data.batches import SceneBatch
 from tracklake.training.data.checks import AGAIN, TensorError
-from tracklake.training.data.windows import place, spread, subtract
+from tracklake.training.data.namespaces import expand_groups
+from tracklake.training.data.positions import (
+    find_runs,
+    locate_rows,
+    read_future,
+    read_history,
+    to_absolute,
+    to_relative,
+)
 
 if TYPE_CHECKING:
     from tracklake.training.data.tensor_folder import TensorFolder
@@ -19,26 +27,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Lanes:
-    """Where the lanes of each subset lie. L is one more than the highest lane of all of them.
+    """Where the lanes of each subset lie; L is one more than the highest lane of all subsets.
 
     Args:
         last: (subsets,) the rightmost lane.
-        width_m: (subsets,) of the carriageway.
         centre_m: (subsets, L + 1) y of the lanes' centres; NaN where unknown, at lane 0 and at L.
-        lane_width_m: (subsets, L + 1) likewise.
+        lane_width_m: (subsets, L + 1) widths of the lanes; NaN where the centre is.
     """
 
     last: npt.NDArray[np.int16]
-    width_m: npt.NDArray[np.float64]
-    centre_m: npt.NDArray[np.float64]
-    lane_width_m: npt.NDArray[np.float64]
+    centre_m: Floats
+    lane_width_m: Floats
 
-    @cached_property
-    def around(self) -> npt.NDArray[np.float64]:
-        """(subsets, O, 3, 3) lanes left of, under and right of lanes 0 to O - 1: y of the centre, width, 1; or zeros.
+    def find_adjacent(self) -> Floats:
+        """Return (subsets, O, 3, 3) the lanes left of, under and right of lanes 0 to O - 1.
 
-        Zeros stand for lanes that do not exist, and for all three of lane 0, which is none; of lanes above O - 1, none
-        has a neighbor. Where a subset has no markings, lanes of NOMINAL_LANE_M from the left edge on are taken.
+        Each is y of the centre, width, and 1; or zeros where the lane does not exist. Lane 0 stands for no lane and has
+        no neighbors, and neither has any lane above O - 1. Where a subset has no markings, lanes of NOMINAL_LANE_M from
+        the left edge on are taken.
         """
         own = np.arange(int(self.last.max(initial=0)) + 3)[:, None]
         lane = own + np.arange(-1, 2)
@@ -52,7 +58,7 @@ class Lanes:
 
 
 def find_lanes(subsets: Sequence[Mapping[str, Any]]) -> Lanes:
-    """Read the lanes off a folder's `subsets`; see `schemas.tensors.SUBSET_KEYS`."""
+    """Read the lanes from a folder's `subsets`; see `schemas.tensors.SUBSET_KEYS`."""
     most = max((len(subset["lane_markings_m"] or [0]) for subset in subsets), default=1)
     centre = np.full((len(subsets), most + 1), np.nan)
     width = centre.copy()
@@ -63,14 +69,13 @@ def find_lanes(subsets: Sequence[Mapping[str, Any]]) -> Lanes:
             width[number, 1 : len(markings)] = np.diff(markings)
     return Lanes(
         last=np.array([subset["last_lane"] for subset in subsets], dtype=np.int16),
-        width_m=np.array([subset["width_m"] for subset in subsets], dtype=np.float64),
         centre_m=centre,
         lane_width_m=width,
     )
 
 
 def find_scenes_of_samples(folder: "TensorFolder") -> npt.NDArray[np.int32]:
-    """(S,) the scene that each sample stands in.
+    """Return (S,) the scene that each sample stands in.
 
     Raises:
         TensorError: a sample stands in no scene, or in several.
@@ -89,42 +94,41 @@ def find_scenes_of_samples(folder: "TensorFolder") -> npt.NDArray[np.int32]:
 
 
 def gather_scenes(folder: "TensorFolder", scene: Integers, *, absolute: bool = False) -> SceneBatch:
-    """Read scenes by their numbers (B,); no vehicle is looked at by itself."""
-    member, vehicle_scene = spread(folder.scene_offset, scene)
-    row, sample = folder.scene_row[member].astype(np.intp), folder.scene_sample[member]
-    run = folder.runs_of(row)
-    first, last = folder.run_first_row[run], folder.run_first_row[run + 1] - 1
-    history_ticks, horizon_ticks = folder.protocol.history_ticks, folder.protocol.horizon_ticks
-    history_known = np.minimum(row - first + 1, history_ticks)
-    future_known = np.minimum(last - row, horizon_ticks)
-    history = folder.histories.take(row + 1 - history_ticks, first, row, history_known < history_ticks)
-    future = folder.futures.take(row + 1, row, last, future_known < horizon_ticks)
-    subset = folder.run_subset[run]
-    stored, centre = folder.position_m[row], folder.centre_m[subset]
-    origin = place(stored[:, None, :], centre, folder.step_m)[:, 0]
+    """Read scenes by their numbers (B,); no vehicle is read by itself.
+
+    Args:
+        folder: tensors to read from.
+        scene: numbers of scenes, each within the folder.
+        absolute: measure positions on the carriageway.
+    """
+    member, vehicle_scene = expand_groups(folder.scene_offset, scene)
+    row, sample = folder.scene_row[member].astype(np.int64), folder.scene_sample[member]
+    run = find_runs(folder, row)
+    history, history_mask = read_history(folder, row, folder.run_first_row[run])
+    future, future_mask = read_future(folder, row, folder.run_first_row[run + 1] - 1)
     if absolute:
-        history, future = place(history, centre, folder.step_m), place(future, centre, folder.step_m)
+        history, future = to_absolute(folder, history, row), to_absolute(folder, future, row)
     else:
-        history, future = subtract(history, stored, folder.step_m), subtract(future, stored, folder.step_m)
+        stored = folder.position_m[row]
+        history, future = to_relative(folder, history, stored), to_relative(folder, future, stored)
+    origin, subset = locate_rows(folder, row), folder.run_subset[run]
     lane, lanes = folder.lane[row], folder.lanes
     known_lane = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
-    offset: Floats = (origin[:, 1] - lanes.centre_m[subset, known_lane]).astype(np.float32)
-    none = np.int8(-1)
     return SceneBatch(
         scene=scene,
         vehicle_scene=vehicle_scene,
         vehicle_id=folder.run_vehicle_id[run],
         sample=sample,
         history=history,
-        history_mask=folder.history_masks.take(history_known.astype(np.uint8)),
+        history_mask=history_mask,
         future=future,
-        future_mask=folder.future_masks.take(future_known.astype(np.uint8)),
-        lateral=_of_samples(folder.sample_lateral, sample, none),
-        longitudinal=_of_samples(folder.sample_longitudinal, sample, none),
+        future_mask=future_mask,
+        lateral=_read_maneuvers(folder.sample_lateral, sample),
+        longitudinal=_read_maneuvers(folder.sample_longitudinal, sample),
         origin=origin,
         speed_mps=folder.speed_mps[row],
         lane=lane,
-        lane_offset_m=offset,
+        lane_offset_m=(origin[:, 1] - lanes.centre_m[subset, known_lane]).astype(np.float32),
         lane_width_m=lanes.lane_width_m[subset, known_lane].astype(np.float32),
         has_left=lane > 1,
         has_right=(lane > 0) & (lane < lanes.last[subset]),
@@ -132,8 +136,8 @@ def gather_scenes(folder: "TensorFolder", scene: Integers, *, absolute: bool = F
     )
 
 
-def _of_samples(values: npt.NDArray[np.uint8], sample: npt.NDArray[np.int32], none: np.int8) -> npt.NDArray[np.int8]:
-    """(V,) values of samples; `none` where the vehicle is no sample."""
-    found = np.full(len(sample), none, dtype=np.int8)
+def _read_maneuvers(values: Bytes, sample: npt.NDArray[np.int32]) -> npt.NDArray[np.int8]:
+    """Return (V,) the maneuvers of vehicles that are samples, -1 for the others."""
+    found = np.full(len(sample), -1, dtype=np.int8)
     found[sample >= 0] = values[sample[sample >= 0]]
     return found

@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Integers, Singles
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.augmentation import SWAPPED
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
 from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets
@@ -20,6 +19,8 @@ from tracklake.training.models.inputs import NEAREST
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Groups of samples. Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: the label
 is not keep."""
+MIRRORED: Bytes = np.array([KEEP, RIGHT, LEFT], dtype=np.uint8)
+"""Maneuver of KEEP, LEFT and RIGHT on a road mirrored sideways."""
 ALL = "all"
 """Name of the group of all samples."""
 SPEED_CHANGE_S = 1.0
@@ -105,8 +106,7 @@ class Examples:
         """Append a mirrored and a shifted copy of all examples, as set."""
         copies = [self]
         if "mirror" in settings.augmentation:
-            swapped = SWAPPED.astype(np.uint8)  # left is right on the mirrored road
-            copies.append(Examples(mirror_targets(self.feature), swapped[self.maneuver], swapped[self.ahead]))
+            copies.append(Examples(mirror_targets(self.feature), MIRRORED[self.maneuver], MIRRORED[self.ahead]))
         if "shift" in settings.augmentation:
             shift_m = random.uniform(-settings.shift_m, settings.shift_m, len(self)).astype(np.float32)
             copies.append(replace(self, feature=shift_targets(self.feature, shift_m)))
@@ -183,7 +183,7 @@ def read_targets(folder: TensorFolder, sample: Integers, ticks: Sequence[int]) -
     at = np.array(ticks, dtype=np.intp) - 1
     feature, lanes, place_m = [], [], []
     for numbers in cut_numbers(sample, READ_SAMPLES):
-        scene, truth = gather_surroundings(folder, numbers, nearest=NEAREST)
+        scene, truth = gather_nearest(folder, numbers, nearest=NEAREST)
         feature.append(describe_targets(scene, folder.protocol.rate_hz))
         lanes.append(scene.lanes)
         place_m.append(truth.future[:, 0, at])

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
+from tracklake.training.data.positions import locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import place
 
 KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))
 
@@ -112,6 +112,6 @@ def _find_offsets(folder: TensorFolder, row: Integers) -> Floats:
     subset, lane, lanes = folder.run_subset[folder.runs_of(row)], folder.lane[row].astype(np.intp), folder.lanes
     centre = lanes.centre_m[subset, np.minimum(lane, lanes.centre_m.shape[1] - 1)]
     centre = np.where(np.isnan(centre), (lane - 0.5) * NOMINAL_LANE_M, centre)
-    y_m = place(folder.position_m[row][:, None, :], folder.centre_m[subset], folder.step_m)[:, 0, 1]
+    y_m = locate_rows(folder, row)[:, 1]
     offset: Floats = y_m.astype(np.float64) - centre
     return offset

@@ -1,4 +1,4 @@
-"""The registry of models: a name, what it is, what it reads, and how it is built and trained."""
+"""The registry of models: their names, inputs, parameters and recipes."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,14 +13,14 @@ from tracklake.training.models.prediction import Prediction
 from tracklake.training.models.recipes import Phase, Recipe
 
 Reads = Literal["grid", "scene"]
-"""What a model is given: `training.data.observed.Observed` or `ObservedScene`."""
+"""Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
 
 class Predictor(Interface):
-    """What every model that predicts places can do; it is never given more than what may be seen."""
+    """The interface of every model; it never gets more than what may be seen at the tick of prediction."""
 
     def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays, as the model's `reads` says)
-        """Predict B samples."""
+        """Predict the positions of B samples."""
         ...
 
 
@@ -29,14 +29,14 @@ class Model:
     """One entry of the registry.
 
     Args:
-        name: what the command line calls it.
-        meaning: one line.
-        source: where it is published; empty where it is ours.
-        module: of `training.models`, imported only when the model is built.
-        builder: the class there; called with the protocol, and the parameters as keywords.
-        parameters: its own, with their defaults.
-        reads: what it is given.
-        recipe: how it is trained, if it is a torch network; None: it predicts as it is.
+        name: name on the command line.
+        meaning: one line for the documentation.
+        source: publication; empty where the model is ours.
+        module: module of `training.models`, imported only when the model is built.
+        builder: class in the module; called with the protocol, and the parameters as keywords.
+        parameters: the model's own parameters with their defaults.
+        reads: kind of input.
+        recipe: how a torch network is trained; None where the model needs no training.
     """
 
     name: str
@@ -50,15 +50,15 @@ class Model:
 
     @property
     def learns(self) -> bool:
-        """Whether it is to be trained before it predicts."""
+        """Whether the model is trained before it predicts."""
         return self.recipe is not None
 
     def build(self, protocol: Protocol, **parameters: Any) -> Any:  # noqa: ANN401  (a Predictor; where it learns, an nn.Module too)
-        """Make it for a protocol.
+        """Build the model for a protocol.
 
         Raises:
-            UsageError: a parameter that it does not have.
-            MissingExtraError: it needs torch, which is missing.
+            UsageError: the model has no parameter of a name.
+            MissingExtraError: torch is needed and not installed.
         """
         unknown = sorted(set(parameters) - set(self.parameters))
         if unknown:
@@ -83,7 +83,7 @@ MODELS = {
     for model in (
         Model(
             "constant-velocity",
-            "goes on as it went during its last 0.2 s",
+            "continues with the velocity of the last 0.2 s",
             "",
             module="constant_velocity",
             builder="ConstantVelocity",
@@ -124,7 +124,7 @@ MODELS = {
         ),
         Model(
             "stacked-lstm",
-            "two stacked LSTM layers over the history and a linear layer to all places ahead",
+            "two stacked LSTM layers over the history and a linear layer to all positions ahead",
             CHOI,
             module="stacked_lstm",
             builder="StackedLstm",
@@ -183,10 +183,10 @@ MODELS = {
 
 
 def find_model(name: str) -> Model:
-    """Look a model up.
+    """Return the model of a name.
 
     Raises:
-        UsageError: no such model.
+        UsageError: no model has the name.
     """
     if name not in MODELS:
         raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}")
@@ -194,10 +194,10 @@ def find_model(name: str) -> Model:
 
 
 def require_torch(model: str) -> None:
-    """Say what to install where torch is missing.
+    """Refuse to go on without torch, with the command that installs it.
 
     Raises:
-        MissingExtraError: torch cannot be imported.
+        MissingExtraError: torch is not installed.
     """
     if find_spec("torch") is None:
         raise MissingExtraError(

@@ -1,46 +1,51 @@
-"""Constant velocity: the plainest prediction, which every other one has to beat. NumPy only."""
+"""Constant velocity: the simplest prediction and the baseline of all others, with NumPy only."""
 
 from typing import Any
 
 import numpy as np
 
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.batches import Floats
 from tracklake.training.data.observed import Observed
 from tracklake.training.models.prediction import Prediction
 
 VELOCITY_S = 0.2
-"""Seconds of history that the velocity is taken from."""
+"""Length of history that the velocity is taken from, in seconds."""
 
 
 def velocity_ticks(protocol: Protocol) -> int:
-    """Ticks of history that the velocity is taken from: one at 5 Hz, two at 10 Hz."""
+    """Return the ticks of history that the velocity is taken from: one at 5 Hz, two at 10 Hz."""
     return min(max(1, round(VELOCITY_S * protocol.rate_hz)), protocol.history_ticks - 1)
 
 
 def extrapolate(history: Any, ticks: int, steps: Any) -> Any:  # noqa: ANN401  (NumPy's arrays or torch's tensors, all of one kind)
-    """Go on in a straight line, as over the last `ticks`: (..., H, 2), (F,) numbers of ticks ahead -> (..., F, 2).
+    """Continue histories in a straight line, with NumPy arrays or torch tensors.
 
-    In m, relative to the last position, with NumPy's arrays and torch's tensors alike.
+    Args:
+        history: (..., H, 2) positions in m.
+        ticks: ticks of history that the velocity is taken from.
+        steps: (F,) numbers of ticks ahead.
+
+    Returns:
+        (..., F, 2) positions in m relative to the last one.
     """
     velocity = (history[..., -1, :] - history[..., -1 - ticks, :]) / ticks  # m per tick
     return velocity[..., None, :] * steps[:, None]
 
 
 class ConstantVelocity:
-    """Goes on as it went last.
+    """Continues with the last velocity.
 
     The velocity is the displacement over the last 0.2 s, along and across the road alike. Only positions are used, so
-    it means the same for every source. It is the strongest of the plain choices: a longer window is less noisy, but
+    it means the same for every source. It is the strongest of the simple choices: a longer window is less noisy, but
     its velocity is older, which costs more (on the public excerpt of US-101, RMSE after 5 s: 7.9 m over 0.2 s, 8.6 m
     over 1 s, 10.3 m over 3 s).
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        """Prepare for a protocol's rate and horizon."""
         self.ticks = velocity_ticks(protocol)
         self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)
 
-    def predict(self, observed: Observed[Floats]) -> Prediction:
-        """Predict B samples."""
+    def predict(self, observed: Observed[Singles]) -> Prediction:
+        """Predict the positions of B samples."""
         return Prediction(position_m=extrapolate(observed.history, self.ticks, self.steps))

@@ -1,47 +1,46 @@
-"""Constant turn rate and velocity: goes on along the arc on which the vehicle drove last. NumPy only."""
+"""Constant turn rate and velocity: continues along the vehicle's last arc, with NumPy only."""
 
 import numpy as np
 
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.batches import Floats
 from tracklake.training.data.observed import Observed
 from tracklake.training.models.constant_velocity import velocity_ticks
 from tracklake.training.models.prediction import Prediction
 
 TURN_S = 1.0
-"""Seconds that each of the two ways lasts whose directions give the yaw rate."""
+"""Duration of each of the two displacements whose directions give the yaw rate, in seconds."""
 
 LEAST_SPEED_MPS = 2.0
-"""Slower over the last such way, or the one before, a vehicle is taken to go straight on."""
+"""Least speed over both displacements, in m/s; a slower vehicle is taken to drive straight on."""
 
 
 class ConstantTurnRate:
-    """Goes on with the speed and the yaw rate it had last.
+    """Continues with the last speed and yaw rate.
 
     Speed and heading are those of the last 0.2 s, as in the model `constant-velocity`: without a turn the two predict
-    the same. The yaw rate is the angle between the way of the last second and that of the second before, per second.
+    the same. The yaw rate is the angle between the displacements of the last second and the second before, per second.
     Recorded positions are noisy, and the noise of an acceleration across the road got from three positions so far apart
     falls with the square of the time between them: sqrt(6) x 0.1 m / (1 s)^2 = 0.24 m/s2, which is 3 m after 5 s;
-    over half a second it would be 12 m. Below 2 m/s the direction of a way of 2 m says nothing about a turn.
+    over half a second it would be 12 m. Below 2 m/s the direction of a displacement of 2 m shows no turn.
 
-    Of a circle every chord of the same duration is the one before, turned, so that a place ahead follows from the last
-    chord d of duration s without any heading: at time t it is t sinc(w t / 2) / (s sinc(w s / 2)) times d, turned
+    Every chord of a circle of the same duration is the one before, turned, so that a position ahead follows from the
+    last chord d of duration s without any heading: at time t it is t sinc(w t / 2) / (s sinc(w s / 2)) times d, turned
     by w (t + s) / 2, where w is the yaw rate and sinc(a) = sin(a) / a. This is the closed form of Schubert, Richter and
     Wanielik 2008, written so that w = 0 is no special case.
 
     On the public excerpt of US-101 it is worse than constant velocity (after 5 s the RMSE is 18 % larger): on a freeway
-    vehicles hardly turn, and what positions say of their turning is mostly noise.
+    vehicles hardly turn, and the turn in their positions is mostly noise.
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        """Prepare for a protocol's rate, history and horizon."""
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)
         self.turn_ticks = min(max(1, round(TURN_S * protocol.rate_hz)), (protocol.history_ticks - 1) // 2)
         self.ahead_s = np.arange(1, protocol.horizon_ticks + 1) / protocol.rate_hz
 
-    def predict(self, observed: Observed[Floats]) -> Prediction:
-        """Predict B samples."""
+    def predict(self, observed: Observed[Singles]) -> Prediction:
+        """Predict the positions of B samples."""
         history = observed.history.astype(np.float64)
         chord, duration_s = history[:, -1] - history[:, -1 - self.ticks], self.ticks / self.rate_hz
         turn = self._yaw_rate(history)[:, None]  # (B, 1) rad/s, positive to the right
@@ -53,9 +52,9 @@ class ConstantTurnRate:
         return Prediction(position_m=position.astype(np.float32))
 
     def _yaw_rate(self, history: np.ndarray) -> np.ndarray:
-        """(B, H, 2) -> (B,) rad/s; from along towards across, so positive to the right."""
+        """Return (B,) yaw rates of histories (B, H, 2) in rad/s, positive to the right."""
         ticks = self.turn_ticks
-        if ticks == 0:  # two positions tell of no turn
+        if ticks == 0:  # two positions show no turn
             return np.zeros(len(history))
         last, before = history[:, -1] - history[:, -1 - ticks], history[:, -1 - ticks] - history[:, -1 - 2 * ticks]
         cross = before[:, 0] * last[:, 1] - before[:, 1] * last[:, 0]
@@ -66,5 +65,5 @@ class ConstantTurnRate:
 
 
 def _sinc(angle: np.ndarray) -> np.ndarray:
-    """sin(a) / a, 1 at 0."""
+    """Return sin(a) / a, which is 1 at 0."""
     return np.sinc(angle / np.pi)

@@ -1,9 +1,9 @@
-"""Bivariate normal densities over places: what a network's five numbers mean, and how well they fit.
+"""Bivariate normal densities of positions, read from five numbers of a network, and their likelihood.
 
 A negative log likelihood here is the negative logarithm of the density in nats, with every constant, of positions in
 metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`. In training and in
 evaluation (`training.evaluation.densities`, which also mixes alternatives) it is the same. The code published with
-convolutional social pooling departs from it in two places, neither repeated here: the branch of its test that mixes
+convolutional social pooling differs in two places, neither repeated here: the branch of its test that mixes
 maneuvers halves the second axis's square and the term between the axes twice, and what it subtracts to turn a density
 per square foot into one per square metre is 0.516, the decimal logarithm of 3.2808, where it should be 2 ln 3.2808 =
 2.376.
@@ -17,15 +17,21 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from tracklake.training.models.network import to_numpy
+from tracklake.training.models.prediction import Density
+
+Gaussian = tuple[Tensor, Tensor, Tensor]
+"""Mean (..., F, 2) in m, sigma (..., F, 2) in m, and rho (..., F)."""
+
 SIGMA_LIMITS_M = (0.01, 1000.0)
-"""Positions are recorded to the centimetre: a narrower density would describe their rounding, and that of a vehicle at
-a standstill would have no bound."""
+"""Least and largest standard deviation, in m. Positions are recorded to the centimetre: a narrower density would
+describe their rounding, and that of a vehicle at a standstill would have no bound."""
 
 CORRELATION_LIMIT = 0.999
-"""Beyond it 1 - rho^2 loses its digits in single precision."""
+"""Largest absolute correlation; beyond it 1 - rho^2 loses its digits in single precision."""
 
 
-def to_gaussian(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def to_gaussian(raw: Tensor) -> Gaussian:
     """Read five numbers as a bivariate normal density.
 
     As published (Graves 2013, and convolutional social pooling's code): two means, the logarithms of 1 / sigma, and rho
@@ -45,31 +51,42 @@ def to_gaussian(raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def gaussian_nll(mean: Tensor, sigma: Tensor, rho: Tensor, future: Tensor, mask: Tensor) -> Tensor:
-    """Mean negative log density in nats over the known positions; 0 where none is known.
+    """Return () the mean negative log density in nats over the known positions; 0 where none is known.
 
     Args:
         mean: (..., F, 2) in m.
         sigma: (..., F, 2) in m, above 0.
         rho: (..., F) within (-1, 1).
-        future: (..., F, 2) in m; what is masked is not looked at.
-        mask: (..., F) True where it is known.
-
-    Returns:
-        ().
+        future: (..., F, 2) in m; masked positions are ignored.
+        mask: (..., F) True where the position is known.
     """
     away = torch.where(mask[..., None], future - mean, 0.0) / sigma
-    missed = torch.where(mask, -_log_density(away, sigma, rho), 0.0)
-    return missed.sum() / mask.sum().clamp(min=1)
+    nll = torch.where(mask, -_log_density(away, sigma, rho), 0.0)
+    return nll.sum() / mask.sum().clamp(min=1)
+
+
+def to_density(mean: Tensor, sigma: Tensor, rho: Tensor, weight: Tensor | None = None) -> Density:
+    """Convert tensors to the density of a prediction.
+
+    Args:
+        mean: (B, A, F, 2) in m; without weights (B, F, 2), of the one alternative.
+        sigma: standard deviations of the same shape.
+        rho: correlations of the same shape but for the last axis.
+        weight: (B, A) probabilities of the alternatives.
+    """
+    if weight is None:
+        weight, mean, sigma, rho = mean.new_ones((len(mean), 1)), mean[:, None], sigma[:, None], rho[:, None]
+    return Density(*(to_numpy(part) for part in (weight, mean, sigma, rho)))
 
 
 def keep_within(value: Tensor, low: float, high: float) -> Tensor:
-    """Clamp; the gradient is dropped only where a step against it would lead further out."""
+    """Clamp values; the gradient is dropped only where a step against it would lead further out."""
     clamp: Callable[..., Tensor] = _Within.apply
     return clamp(value, low, high)
 
 
 def _log_density(away: Tensor, sigma: Tensor, rho: Tensor) -> Tensor:
-    """Of distances in standard deviations (..., 2)."""
+    """Return the log density (...) of distances in standard deviations (..., 2)."""
     along, across = away[..., 0], away[..., 1]
     rest = (1 - rho) * (1 + rho)
     distance = (along**2 + across**2 - 2 * rho * along * across) / rest

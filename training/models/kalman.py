@@ -1,39 +1,38 @@
-"""Kalman filter with constant velocity: the whole history weighed by its noise, and a density ahead. NumPy only."""
+"""Kalman filter with constant velocity: filters the whole history and predicts a density, with NumPy only."""
 
 import numpy as np
-import numpy.typing as npt
 
+from tracklake.schemas.arrays import Floats, Singles
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.batches import Floats
 from tracklake.training.data.observed import Observed
 from tracklake.training.models.prediction import Density, Prediction
 
-Doubles = npt.NDArray[np.float64]
-
 MEASUREMENT_M = (0.15, 0.10)
-"""Standard deviation of a recorded position, along and across the road.
+"""Standard deviation of a recorded position in m, along and across the road.
 
-More than the jitter from tick to tick (0.03 m and 0.02 m about a cubic over 1.5 s of the public excerpt of US-101): the
-errors of tracking in video last longer than a tick, and along the road a vehicle's front is less sure than its side.
+Larger than the jitter from tick to tick (0.03 m and 0.02 m about a cubic over 1.5 s of the public excerpt of US-101):
+the errors of tracking in video last longer than a tick, and along the road a vehicle's front is less certain than its
+side.
 """
 
 ACCELERATION_M2PS3 = (1.0, 0.04)
-"""Power spectral density q of the acceleration, along and across: over T seconds the velocity changes by sqrt(q T).
+"""Power spectral density q of the acceleration in m2/s3, along and across the road.
 
-That is 2.2 m/s along and 0.45 m/s across in 5 s; in the same excerpt, dense traffic, it is 2.4 m/s and 0.39 m/s.
+Over T seconds the velocity changes by sqrt(q T): 2.2 m/s along and 0.45 m/s across in 5 s; in the same excerpt, dense
+traffic, it is 2.4 m/s and 0.39 m/s.
 """
 
 
 class KalmanConstantVelocity:
-    """Each axis by itself: position and velocity, driven by white-noise acceleration, observed through noise.
+    """Filters position and velocity of each axis by itself, under white-noise acceleration and noisy observation.
 
     Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and Navigation: the discretised
     continuous white-noise acceleration model of section 6.2.2, the filter of 5.2.4, begun with the first two positions
-    (two-point differencing, 5.5.3). Gains and covariances do not depend on the data: they are worked out once, and
-    every sample is filtered with the same.
+    (two-point differencing, 5.5.3). Gains and covariances do not depend on the data: they are computed once for all
+    samples.
 
-    The density is that of the position as it will be recorded, since that is what a prediction is compared with: the
-    state's variance and the measurement's. The axes are independent of each other.
+    The density is that of the position as it will be recorded, with the variances of state and measurement, since
+    predictions are compared with recorded positions. The axes are independent of each other.
     """
 
     def __init__(
@@ -43,7 +42,7 @@ class KalmanConstantVelocity:
         measurement_m: tuple[float, float] = MEASUREMENT_M,
         acceleration_m2ps3: tuple[float, float] = ACCELERATION_M2PS3,
     ) -> None:
-        """Work out gains and variances for a protocol's rate, history and horizon.
+        """Compute gains and variances for a protocol's rate, history and horizon.
 
         Args:
             protocol: gives the time between ticks, H and F.
@@ -51,46 +50,46 @@ class KalmanConstantVelocity:
             acceleration_m2ps3: power spectral density of the acceleration, along and across.
         """
         self.tick_s = 1.0 / protocol.rate_hz
-        self.ahead_s: Doubles = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float64) * self.tick_s
+        self.ahead_s: Floats = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float64) * self.tick_s
         noise = np.square(np.array(measurement_m))  # (2,) m2, by axis
         density = np.array(acceleration_m2ps3)
         self.gains, covariance = _gains(noise, density, self.tick_s, protocol.history_ticks)
         ahead = _predicted(covariance[:, None], density[:, None], self.ahead_s)  # (2, F, 2, 2)
-        self.sigma_m: Doubles = np.sqrt(ahead[:, :, 0, 0] + noise[:, None]).T  # (F, 2)
+        self.sigma_m: Floats = np.sqrt(ahead[:, :, 0, 0] + noise[:, None]).T  # (F, 2)
 
-    def predict(self, observed: Observed[Floats]) -> Prediction:
-        """Predict B samples."""
+    def predict(self, observed: Observed[Singles]) -> Prediction:
+        """Predict the positions of B samples."""
         history = observed.history.astype(np.float64)
-        place, velocity = history[:, 1], (history[:, 1] - history[:, 0]) / self.tick_s  # (B, 2) by axis
+        position, velocity = history[:, 1], (history[:, 1] - history[:, 0]) / self.tick_s  # (B, 2) by axis
         for tick, gain in enumerate(self.gains, start=2):
-            expected = place + velocity * self.tick_s
+            expected = position + velocity * self.tick_s
             surprise = history[:, tick] - expected
-            place, velocity = expected + gain[:, 0] * surprise, velocity + gain[:, 1] * surprise
-        position = (place[:, None] + velocity[:, None] * self.ahead_s[:, None]).astype(np.float32)  # (B, F, 2)
-        samples, steps, _ = position.shape
+            position, velocity = expected + gain[:, 0] * surprise, velocity + gain[:, 1] * surprise
+        predicted = (position[:, None] + velocity[:, None] * self.ahead_s[:, None]).astype(np.float32)  # (B, F, 2)
+        samples, steps, _ = predicted.shape
         density = Density(
             weight=np.ones((samples, 1), dtype=np.float32),
-            mean_m=position[:, None],
+            mean_m=predicted[:, None],
             sigma_m=np.tile(self.sigma_m.astype(np.float32), (samples, 1, 1, 1)),
             correlation=np.zeros((samples, 1, steps), dtype=np.float32),
         )
-        return Prediction(position_m=position, density=density)
+        return Prediction(position_m=predicted, density=density)
 
 
-def _gains(noise: Doubles, density: Doubles, tick_s: float, ticks: int) -> tuple[Doubles, Doubles]:
-    """Filter H positions: gains (H - 2, 2 axes, 2) from the third on, and the last covariance (2 axes, 2, 2)."""
+def _gains(noise: Floats, density: Floats, tick_s: float, ticks: int) -> tuple[Floats, Floats]:
+    """Compute gains (H - 2, 2 axes, 2) from the third position on, and the last covariance (2 axes, 2, 2)."""
     covariance = noise[:, None, None] * np.array([[1.0, 1.0 / tick_s], [1.0 / tick_s, 2.0 / tick_s**2]])
     gains = np.empty((ticks - 2, 2, 2))
     for tick in range(ticks - 2):
         covariance = _predicted(covariance, density, np.array(tick_s))
-        seen = covariance[:, :, 0]  # (2 axes, 2) of position and velocity with the position
-        gains[tick] = seen / (seen[:, :1] + noise[:, None])
-        covariance = covariance - gains[tick][:, :, None] * seen[:, None, :]
+        column = covariance[:, :, 0]  # (2 axes, 2) of position and velocity with the position
+        gains[tick] = column / (column[:, :1] + noise[:, None])
+        covariance = covariance - gains[tick][:, :, None] * column[:, None, :]
     return gains, covariance
 
 
-def _predicted(covariance: Doubles, density: Doubles, time_s: Doubles) -> Doubles:
-    """Covariances (..., 2, 2) after a time (...), with what white-noise acceleration of a density (...) adds."""
+def _predicted(covariance: Floats, density: Floats, time_s: Floats) -> Floats:
+    """Return covariances (..., 2, 2) after a time (...) of white-noise acceleration of a density (...)."""
     shape = np.broadcast_shapes(density.shape, time_s.shape)
     move = np.zeros((*shape, 2, 2))
     move[..., 0, 0] = move[..., 1, 1] = 1.0

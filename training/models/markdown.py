@@ -11,18 +11,18 @@ Derived from `training/models/__init__.py`; do not edit (`make docs` writes it).
 
 `tracklake train MODEL` trains one by its own recipe; `--set name=value` changes a parameter or what is learned by
 (batch_size, learning_rate, optimizer, schedule, max_gradient_norm). Those without a recipe predict as they are. None is
-ever given the future or a true maneuver: `predict` sees `training.data.observed.Observed` (the sample and the
+given the future or a true maneuver: `predict` gets `training.data.observed.Observed` (the sample and the
 neighbors in its grid) or `ObservedScene` (the sample and the vehicles nearest to it), and nothing else.
 """
 
 
 def write_models() -> str:
-    """The page."""
+    """Return the page as Markdown."""
     return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values())])
 
 
 def _describe(model: Model) -> str:
-    """One model's section."""
+    """Return the section of one model."""
     lines = [f"## {model.name}", "", f"{model.meaning[0].upper()}{model.meaning[1:]}.", ""]
     lines.append(f"- source: {model.source or 'ours'}")
     lines.append(f"- reads: {'the grid' if model.reads == 'grid' else 'the scene'}")

@@ -1,4 +1,4 @@
-"""What the training loop asks of a torch network, and the way from its tensors to a prediction."""
+"""The interface of the torch networks that the training loop trains, and their way to a prediction."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -11,23 +11,23 @@ from torch import Tensor, nn
 from tracklake.training.data.observed import Observed, Truth
 from tracklake.training.models.prediction import Prediction
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 class Network(nn.Module):
-    """A model that learns. Heirs give `loss` and `say`; `forward` is theirs to define."""
+    """A model that learns; subclasses define `loss` and `predict_tensors`."""
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return next(self.parameters()).device
 
     def loss(self, observed: Any, truth: Truth[Tensor], phase: str) -> Tensor:  # noqa: ANN401  (Observed or ObservedScene of tensors)
-        """() what a step of training makes smaller, over all B samples.
+        """Return () the loss over all B samples.
 
         Args:
             observed: `Observed` or `ObservedScene`, as the registry's `reads` says.
-            truth: what came; the one place where a model is given it.
+            truth: futures and maneuvers; no other method of a model gets them.
             phase: the recipe's `Phase.loss`.
 
         Raises:
@@ -35,40 +35,40 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
-    def say(self, observed: Any) -> Prediction:  # noqa: ANN401  (as above)
-        """Predict; called without gradients, in evaluation mode, with tensors on the weights' device."""
+    def predict_tensors(self, observed: Any) -> Prediction:  # noqa: ANN401  (as above)
+        """Predict B samples given as tensors on the weights' device; called by `infer`."""
         raise NotImplementedError
 
     def predict(self, observed: Any) -> Prediction:  # noqa: ANN401  (Observed or ObservedScene of NumPy arrays)
         """Predict B samples given as NumPy arrays."""
-        return self.ask(observed, self.say)
+        return self.infer(observed, self.predict_tensors)
 
-    def ask(self, observed: Any, question: Callable[[Any], Answer]) -> Answer:  # noqa: ANN401  (as above)
-        """Let a function see tensors on the weights' device: without gradients, in evaluation mode.
+    def infer(self, observed: Any, function: Callable[[Any], Result]) -> Result:  # noqa: ANN401  (as above)
+        """Call a function with tensors on the weights' device, without gradients and in evaluation mode.
 
         Args:
-            observed: of NumPy arrays.
-            question: what to do with the same of tensors.
+            observed: `Observed` or `ObservedScene` of NumPy arrays.
+            function: called with the same of tensors.
         """
         trained = self.training
         self.eval()
         try:
             with torch.no_grad():
-                return question(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
+                return function(observed.each(lambda array: torch.from_numpy(np.asarray(array)).to(self.device)))
         finally:
             self.train(trained)
 
 
 class PlaceNetwork(Network):
-    """A network that puts out places alone, of a sample's own history. Heirs give `forward` (B, H, 2) -> (B, F, 2)."""
+    """A network that predicts positions from a sample's own history: `forward` (B, H, 2) -> (B, F, 2)."""
 
     def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """() mean squared distance in m2; the only phase is `mse`."""
+        """Return () the mean squared distance in m2; the only phase is `mse`."""
         check_phase(phase, "mse")
         return mean_squared_distance(self(observed.history), truth.future, truth.future_mask)
 
-    def say(self, observed: Observed[Tensor]) -> Prediction:
-        """Places only."""
+    def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
+        """Return the positions alone."""
         return Prediction(position_m=to_numpy(self(observed.history)))
 
 
@@ -83,11 +83,11 @@ def check_phase(phase: str, *known: str) -> None:
 
 
 def to_numpy(tensor: Tensor) -> npt.NDArray[Any]:
-    """A tensor of any device as an array."""
+    """Convert a tensor on any device to an array."""
     return tensor.detach().cpu().numpy()
 
 
 def mean_squared_distance(predicted: Tensor, future: Tensor, known: Tensor) -> Tensor:
-    """Mean squared distance in m2 over the known positions: (..., F, 2), (..., F, 2), (..., F) -> ()."""
+    """Return () the mean squared distance in m2 over known positions: (..., F, 2), (..., F, 2), (..., F)."""
     squares = ((predicted - future) ** 2).sum(dim=-1)
     return (squares * known).sum() / known.sum().clamp(min=1)

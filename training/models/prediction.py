@@ -1,16 +1,16 @@
-"""What a model says of samples: a place at every tick, and where it has one, a density and the maneuvers' odds."""
+"""A model's prediction: a position at every tick and, where it has them, a density and maneuver probabilities."""
 
 from dataclasses import dataclass
 
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Floats
 
 
 class NotFiniteError(TracklakeError):
-    """A model predicts what is no number.
+    """A model predicts values that are not finite.
 
     Args:
-        model: its name, or the run's.
+        model: name of the model or run.
         what: positions or densities.
     """
 
@@ -22,36 +22,36 @@ class NotFiniteError(TracklakeError):
 
 @dataclass(frozen=True)
 class Density:
-    """A mixture of bivariate normal densities over places, at every tick.
+    """A mixture of bivariate normal densities of the position at every tick.
 
     B samples, A alternatives (maneuvers; 1 where the model has none), F ticks.
 
     Args:
-        weight: (B, A) of the alternatives; they sum to 1.
+        weight: (B, A) probabilities of the alternatives; they sum to 1.
         mean_m: (B, A, F, 2) along and across the road, relative to the sample's last position.
         sigma_m: (B, A, F, 2) standard deviations, above 0.
         correlation: (B, A, F) between the axes, within (-1, 1).
     """
 
-    weight: Floats
-    mean_m: Floats
-    sigma_m: Floats
-    correlation: Floats
+    weight: Singles
+    mean_m: Singles
+    sigma_m: Singles
+    correlation: Singles
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model says of B samples.
+    """A model's prediction of B samples.
 
     Args:
-        position_m: (B, F, 2) the places it is scored by, relative to the sample's last position; of a mixture, the mean
-            of the most probable alternative.
-        density: None where the model gives none.
+        position_m: (B, F, 2) positions that are scored, relative to the sample's last one; of a mixture, the mean of
+            the most probable alternative.
+        density: density of the position; None where the model gives none.
         lateral: (B, 3) probabilities in the order of `schemas.columns.LATERAL_MANEUVERS`; None where it gives none.
-        longitudinal: (B, 2) likewise of `LONGITUDINAL_MANEUVERS`.
+        longitudinal: (B, 2) probabilities in the order of `LONGITUDINAL_MANEUVERS`; None likewise.
     """
 
-    position_m: Floats
+    position_m: Singles
     density: Density | None = None
-    lateral: Floats | None = None
-    longitudinal: Floats | None = None
+    lateral: Singles | None = None
+    longitudinal: Singles | None = None

@@ -1,4 +1,4 @@
-"""How a model is trained when nobody says otherwise: phases of losses, and the optimiser's settings."""
+"""Recipes: how a model is trained by default, in phases of losses with the optimiser's settings."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,11 +6,11 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Phase:
-    """So many epochs with one loss.
+    """A number of epochs with one loss.
 
     Args:
-        loss: what the network's `loss` is told.
-        epochs: passes over the training part, or over as many samples of it as an epoch takes.
+        loss: name of the loss, given to the network's `loss`.
+        epochs: passes over the training part, or over as many samples as an epoch takes.
     """
 
     loss: str
@@ -19,15 +19,15 @@ class Phase:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A model's own way of being trained.
+    """A model's own settings of training.
 
     Args:
         phases: one after the other; where a time budget is given, they share it in proportion to their epochs.
         batch_size: samples per step.
-        learning_rate: of the optimiser, at its height.
+        learning_rate: highest learning rate of the optimiser.
         optimizer: `adam`, or `adamw` (decoupled weight decay).
-        schedule: of the learning rate: `constant`, or `cosine` after a short warm-up.
-        max_gradient_norm: gradients are scaled down to this.
+        schedule: course of the learning rate: `constant`, or `cosine` after a short warm-up.
+        max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
     """
 
     phases: tuple[Phase, ...]
@@ -39,11 +39,11 @@ class Recipe:
 
     @property
     def epochs(self) -> int:
-        """Of all phases together."""
+        """Number of epochs of all phases together."""
         return sum(phase.epochs for phase in self.phases)
 
     def phase_at(self, spent: float, budget: float) -> Phase:
-        """The phase after so much of a budget: in whole steps, or in seconds."""
+        """Return the phase after a part of a budget is spent, both in whole steps or both in seconds."""
         ended = 0
         for phase in self.phases:
             ended += phase.epochs

@@ -1,4 +1,4 @@
-"""Stacked LSTM: two layers over the history, and a linear layer to all places ahead at once."""
+"""Stacked LSTM: two layers over the history, and a linear layer to all positions ahead at once."""
 
 from torch import Tensor, nn
 
@@ -8,26 +8,19 @@ from tracklake.training.models.straight import Straight
 
 
 class StackedLstm(PlaceNetwork):
-    """Reads H positions in m, and puts out F places from its last state.
+    """Encodes H positions in m, and predicts F positions from its last state.
 
-    The plainest recurrent network that Choi et al. 2021 compare with; the width of 128 is ours.
+    The plainest recurrent network that Choi et al. 2021 compare with; the width (`hidden`) of 128 is ours.
     """
 
     def __init__(self, protocol: Protocol, *, hidden: int = 128, residual: bool = True) -> None:
-        """Prepare for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            hidden: width of both layers.
-            residual: places are counted from constant velocity, see `training.models.straight`.
-        """
         super().__init__()
         self.straight = Straight(protocol, residual=residual)
         self.encoder = nn.LSTM(2, hidden, num_layers=2, batch_first=True)
         self.out = nn.Linear(hidden, protocol.horizon_ticks * 2)
 
     def forward(self, history: Tensor) -> Tensor:
-        """(B, H, 2) -> (B, F, 2) positions in m relative to the sample's last one."""
+        """Predict (B, F, 2) from a history (B, H, 2): positions in m relative to the sample's last one."""
         _, (state, _) = self.encoder(history)
-        places: Tensor = self.straight(history) + self.out(state[-1]).unflatten(-1, (-1, 2))  # (B, F, 2)
-        return places
+        positions: Tensor = self.straight(history) + self.out(state[-1]).unflatten(-1, (-1, 2))  # (B, F, 2)
+        return positions

@@ -1,4 +1,4 @@
-"""What a network's places are counted from: where constant velocity would be, or the sample's last position."""
+"""The positions that a network's outputs are counted from: constant velocity, or the last position."""
 
 import torch
 from torch import Tensor, nn
@@ -8,15 +8,15 @@ from tracklake.training.models.constant_velocity import extrapolate, velocity_ti
 
 
 class Straight(nn.Module):
-    """Adds up to nothing that is learned: a fixed place per tick ahead, known at the moment of prediction.
+    """A fixed position per tick ahead, known at the tick of prediction; nothing in it is learned.
 
-    What a network puts out is added to it. A network that is residual is left with what constant velocity does not
-    explain (braking, accelerating, changing lanes), and an error of 1 % of the distance driven costs it nothing; the
-    layers are the published ones all the same, and a density stays one: only its mean is shifted.
+    The output of a network is added to it. A residual network is left with what constant velocity does not explain
+    (braking, accelerating, changing lanes), and an error of 1 % of the distance driven costs it nothing. Its layers are
+    the published ones, and of a density only the mean is shifted.
     """
 
     def __init__(self, protocol: Protocol, *, residual: bool) -> None:
-        """Prepare for a protocol's rate and horizon.
+        """Build the layers for a protocol's rate and horizon.
 
         Args:
             protocol: gives F and the ticks that the velocity is taken from.
@@ -29,6 +29,6 @@ class Straight(nn.Module):
         self.register_buffer("steps", steps if residual else torch.zeros_like(steps), persistent=False)
 
     def forward(self, history: Tensor) -> Tensor:
-        """(..., H, 2) -> (..., F, 2) in m relative to the last position."""
-        places: Tensor = extrapolate(history, self.ticks, self.steps)
-        return places
+        """Return (..., F, 2) in m relative to the last position of histories (..., H, 2)."""
+        positions: Tensor = extrapolate(history, self.ticks, self.steps)
+        return positions

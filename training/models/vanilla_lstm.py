@@ -1,34 +1,28 @@
-"""Vanilla LSTM: convolutional social pooling's encoder and decoder for a vehicle alone."""
+"""Vanilla LSTM: the encoder and decoder of convolutional social pooling without neighbors."""
 
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
-from tracklake.training.models.gaussians import gaussian_nll, to_gaussian
+from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
 from tracklake.training.models.network import Network, check_phase, mean_squared_distance, to_numpy
-from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.models.prediction import Prediction
 from tracklake.training.models.straight import Straight
 
 SLOPE = 0.1
-"""Of the leaky ReLUs where the input is negative."""
+"""Slope of the leaky ReLUs where the input is negative."""
 
 
 class VanillaLstm(Network):
     """Embeds H positions in m (32), encodes them (LSTM, 64), embeds that (32), and unrolls F steps (LSTM, 128).
 
-    The decoder is fed the same encoding at every step and starts from nothing; each step puts out five numbers, a
-    bivariate normal density (`training.models.gaussians` says how they are read). Sizes and activations are those of
-    convolutional social pooling (Deo and Trivedi 2018), of which the social tensor and all behind it are left out.
+    The decoder gets the same encoding at every step and starts from a zero state; each step puts out the five numbers
+    of a bivariate normal density (`training.models.gaussians`). Sizes and activations are those of
+    convolutional social pooling (Deo and Trivedi 2018), without the social tensor and its layers.
     """
 
     def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
-        """Prepare for a protocol's rate, history and horizon.
-
-        Args:
-            protocol: gives H and F.
-            residual: means are counted from constant velocity, see `training.models.straight`.
-        """
         super().__init__()
         self.steps = protocol.horizon_ticks
         self.straight = Straight(protocol, residual=residual)
@@ -38,8 +32,8 @@ class VanillaLstm(Network):
         self.decoder = nn.LSTM(32, 128, batch_first=True)
         self.out = nn.Linear(128, 5)
 
-    def forward(self, history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, H, 2) -> mean (B, F, 2) in m relative to the sample's last position, sigma (B, F, 2) in m, rho (B, F)."""
+    def forward(self, history: Tensor) -> Gaussian:
+        """Return the density after a history (B, H, 2): mean (B, F, 2) relative to the last position, sigma, rho."""
         _, (state, _) = self.encoder(leaky_relu(self.embedding(history), SLOPE))
         encoding = leaky_relu(self.dynamics(state[-1]), SLOPE)  # (B, 32)
         decoded, _ = self.decoder(encoding[:, None, :].expand(-1, self.steps, -1))  # (B, F, 128)
@@ -47,16 +41,14 @@ class VanillaLstm(Network):
         return self.straight(history) + mean, sigma, rho
 
     def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """() in phase `mse` the mean squared distance of the means in m2, in phase `nll` the mean NLL in nats."""
+        """Return () in phase `mse` the mean squared distance in m2, in phase `nll` the mean NLL in nats."""
         check_phase(phase, "mse", "nll")
         mean, sigma, rho = self(observed.history)
         if phase == "mse":
             return mean_squared_distance(mean, truth.future, truth.future_mask)
         return gaussian_nll(mean, sigma, rho, truth.future, truth.future_mask)
 
-    def say(self, observed: Observed[Tensor]) -> Prediction:
-        """Means, and their density of one alternative."""
+    def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
+        """Return the means and their density, of one alternative."""
         mean, sigma, rho = self(observed.history)
-        weight = mean.new_ones((len(mean), 1))
-        density = Density(*(to_numpy(part) for part in (weight, mean[:, None], sigma[:, None], rho[:, None])))
-        return Prediction(position_m=to_numpy(mean), density=density)
+        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))

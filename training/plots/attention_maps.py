@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
+from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.plots.forecasts import Doubles
@@ -100,9 +100,9 @@ def map_attention(
         IndexError: no sample has the number.
     """
     numbers = np.asarray(samples, dtype=np.int64)
-    observed, _ = gather_surroundings(folder, numbers, nearest=nearest)
-    weights = network.look(observed)
-    ids = folder.run_vehicle_id[folder.runs_of(find_around(folder, numbers, nearest).row)]
+    observed, _ = gather_nearest(folder, numbers, nearest=nearest)
+    weights = network.read_attention(observed)
+    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, numbers, nearest).row)]
     maps = []
     for row, (sample, present) in enumerate(zip(numbers.tolist(), observed.vehicle_mask.sum(axis=1), strict=True)):
         there = slice(int(present))  # padding comes last

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from tracklake.training.data.batches import Floats
-from tracklake.training.data.nearest_vehicles import find_around, gather_surroundings
+from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
+from tracklake.training.data.positions import check_numbers, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import check_numbers, place
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
@@ -124,10 +124,10 @@ def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaste
 def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, others: int) -> dict[int, Forecast]:
     """Predict a sample's vehicle and the others of its scene at once, by id."""
     number = np.asarray([sample], dtype=np.int64)
-    observed, _ = gather_surroundings(folder, number, nearest=others)
+    observed, _ = gather_nearest(folder, number, nearest=others)
     network: Any = model.predictor
     scene: SceneForecast = network.predict_scene(observed)
-    ids = folder.run_vehicle_id[folder.runs_of(find_around(folder, number, others).row[0])].tolist()
+    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, number, others).row[0])].tolist()
     origin = find_origins(folder, number)[0]
     sigma = np.sqrt(np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1))  # (V, F, 2)
     correlation = scene.covariance_m2[0, ..., 0, 1] / sigma.prod(axis=-1)
@@ -140,8 +140,7 @@ def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, oth
 
 def find_origins(folder: TensorFolder, samples: npt.NDArray[np.int64]) -> Doubles:
     """Find the samples' last positions on the carriageway (B, 2)."""
-    stored = folder.position_m[folder.sample_row[samples]][:, None, :]
-    return place(stored, folder.centre_m[folder.subset_of(samples)], folder.step_m)[:, 0].astype(np.float64)
+    return np.asarray(locate_rows(folder, folder.sample_row[samples]), dtype=np.float64)
 
 
 def place_forecast(model: str, prediction: Prediction, row: int, origin_m: Doubles) -> Forecast:
@@ -175,7 +174,7 @@ def _place_density(density: Density, row: int, origin_m: Doubles) -> tuple[Alter
     )
 
 
-def _name_maneuvers(names: tuple[str, ...], probabilities: Floats | None, row: int) -> dict[str, float] | None:
+def _name_maneuvers(names: tuple[str, ...], probabilities: Singles | None, row: int) -> dict[str, float] | None:
     if probabilities is None:
         return None
     return {name: round(float(share), 4) for name, share in zip(names, probabilities[row], strict=True)}

@@ -12,8 +12,8 @@ import numpy as np
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.batches import SceneBatch
+from tracklake.training.data.namespaces import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import spread
 from tracklake.training.plots.forecasts import Doubles, Forecast
 
 Role = Literal["own", "neighbor", "other"]
@@ -145,10 +145,10 @@ def _list_vehicles(
     folder: TensorFolder, batch: SceneBatch, sample: int, forecasts: Mapping[int, Sequence[Forecast]]
 ) -> tuple[Vehicle, ...]:
     """List the vehicles of the scene: the sample's own, then the others in their order."""
-    member, _ = spread(folder.scene_offset, batch.scene)
+    member, _ = expand_groups(folder.scene_offset, batch.scene)
     row = folder.scene_row[member]
     run = folder.runs_of(row)
-    pairs, _ = spread(folder.neighbor_offset, np.asarray([sample]))
+    pairs, _ = expand_groups(folder.neighbor_offset, np.asarray([sample]))
     near = np.isin(row, folder.neighbor_row[pairs])
     order = np.argsort(batch.sample != sample, kind="stable")
     return tuple(

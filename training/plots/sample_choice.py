@@ -5,9 +5,9 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.data.batches import Flags, Integers
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.runs.forecasters import Forecaster

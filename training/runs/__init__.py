@@ -1,1 +1,1 @@
-"""What a training stands on: its settings, batches, logs and checkpoints, and the run that is left of it."""
+"""Settings, data loader, logs and checkpoints of a training, and the run that it writes."""

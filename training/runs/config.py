@@ -1,4 +1,4 @@
-"""How a model is trained: what may be said about it, and what follows from that for a model and a tensor folder."""
+"""Settings of a training, and the plan that follows from them for a model and a tensor folder."""
 
 import math
 from collections.abc import Mapping
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.data.batches import Integers
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Model
 from tracklake.training.models.recipes import Recipe
@@ -20,40 +20,40 @@ if TYPE_CHECKING:
 OptimizerName = Literal["adam", "adamw"]
 ScheduleName = Literal["constant", "cosine"]
 RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm")
-"""What may be set of a model's recipe."""
+"""Settings of a model's recipe that a training may change."""
 BUDGETS = ("seconds", "steps", "epochs")
+"""Settings that end a training; one of them at most is given."""
 WHOLE_NUMBERS = ("steps", "epochs", "samples_per_epoch", "patience", "batch_size", "seed", "threads", "log_steps")
 NUMBERS = ("seconds", "learning_rate", "max_gradient_norm", "checkpoint_s")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How a model is trained. Where nothing is said, its own recipe (`training.models.recipes`) is followed.
+    """Settings of a training; those left out are the model's recipe (`training.models.recipes`).
 
     At most one of `seconds`, `steps` and `epochs` is given. The recipe's phases share it in proportion to their epochs.
 
     Args:
-        seconds: time budget of the training loop, all that it does included; the learning rate follows the time.
-        steps: optimiser steps. With these, or with epochs, the result depends on the seed (and on the machine's
-            arithmetic, and on the number of threads) alone; but for `device`.
-        epochs: of all phases together. None of the three = the recipe's epochs.
-        samples_per_epoch: an epoch takes so many samples at most, drawn anew for each.
-        patience: end the last phase after so many epochs without a smaller loss on the part `val`, and keep the weights
-            that had the smallest. Phases before it run their length: no model is judged by their loss.
+        seconds: time budget of the training loop with all its work; the learning rate follows the time.
+        steps: optimiser steps. With these, or with epochs, and on a CPU the result depends only on the seed, the
+            machine's arithmetic and the number of threads.
+        epochs: epochs of all phases together. None of the three = the recipe's epochs.
+        samples_per_epoch: most samples of an epoch; each epoch draws its own.
+        patience: epochs without a smaller loss on the part `val` after which the last phase ends; the weights with the
+            smallest loss are kept. Phases before it run their length, as their loss does not judge a model.
         batch_size: samples per step.
-        learning_rate: of the optimiser, at its height.
+        learning_rate: highest learning rate of the optimiser.
         optimizer: `adam` or `adamw`.
-        schedule: `constant`, or `cosine`: warms up over the first 2 % and decays to nothing.
-        max_gradient_norm: gradients are scaled down to this.
-        parameters: the model's own.
-        seed: of the weights, of the order of samples, and of what the network drops.
-        threads: of torch; None = its own choice. One by default: for networks this small a second one gains little on
-            an idle machine, and on a busy one it waits for its turn at every tick: a step takes ten times as long.
-        device: `cpu`; or `cuda`, where batches are gathered from tensors that stand there as a whole. There the seed
-            does not decide the weights bit for bit, interrupted or not: some sums (of pooled neighbors, for one) are
-            added up in whatever order the threads come.
-        log_steps: a row of course.csv every so many steps.
-        checkpoint_s: a checkpoint at least so often, besides those at the ends of epochs that took a while.
+        schedule: `constant`, or `cosine`: warms up over the first 2 % and decays to 0.
+        max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
+        parameters: parameters of the model.
+        seed: seed of the weights, of the order of samples, and of dropout.
+        threads: threads of torch; None = its own choice. For networks this small a second one gains little on an idle
+            machine, and on a busy one the threads wait for each other: a step takes ten times as long.
+        device: `cpu`; or `cuda`, where batches are gathered from tensors that are there as a whole. There the seed does
+            not decide the weights bit for bit, as threads add up some sums (of pooled neighbors, for one) in any order.
+        log_steps: steps between two rows of course.csv.
+        checkpoint_s: most seconds between two checkpoints; there is also one at the end of an epoch that took a while.
     """
 
     seconds: float | None = None
@@ -77,7 +77,7 @@ class TrainConfig:
         """Refuse values that cannot train anything.
 
         Raises:
-            UsageError: naming the value.
+            UsageError: names the value.
         """
         for own in fields(self):
             value = getattr(self, own.name)
@@ -101,17 +101,17 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """What follows from a config for a model and a tensor folder; the loop's constants.
+    """Constants of a training loop, which follow from model, tensor folder and settings.
 
     Args:
         entry: the model.
-        folder: what it learns from.
-        config: how.
-        recipe: the model's, with what the config changes in it.
+        folder: tensors to train on.
+        config: settings.
+        recipe: the model's recipe with the changes of the settings.
         parameters: keywords of the model's `build`.
         train: (n,) numbers of the samples to train on.
-        val: (v,) of those to validate with.
-        device: where the network is.
+        val: (v,) numbers of the samples to validate with.
+        device: device of the network.
     """
 
     entry: Model
@@ -125,48 +125,48 @@ class Plan:
 
     @property
     def epoch_samples(self) -> int:
-        """Samples that an epoch takes."""
+        """Samples of an epoch."""
         return min(len(self.train), self.config.samples_per_epoch)
 
     @property
     def epoch_steps(self) -> int:
-        """Steps of an epoch; the last of them may take fewer samples than the others."""
+        """Steps of an epoch; the last may have fewer samples than the others."""
         return math.ceil(self.epoch_samples / self.recipe.batch_size)
 
     @property
     def budget(self) -> float:
-        """Seconds, where the config gives them; else steps."""
+        """Length of the training: seconds where the settings give them, else steps."""
         epochs = self.config.epochs or self.recipe.epochs
         return self.config.seconds or self.config.steps or epochs * self.epoch_steps
 
     def measure_spent(self, step: int, elapsed_s: float) -> float:
-        """How much of the budget is spent, in its own unit."""
+        """Return how much of the budget is spent, in its own unit."""
         return elapsed_s if self.config.seconds else step
 
     def draw_epoch(self, epoch: int) -> Integers:
-        """(epoch_samples,) numbers of an epoch's samples in its order, every one once at most."""
+        """Draw (epoch_samples,) numbers of an epoch's samples in their order, each at most once."""
         random = np.random.default_rng((self.config.seed, epoch))
         return random.choice(self.train, self.epoch_samples, replace=False)
 
     def learning_rate(self, spent: float) -> float:
-        """That of a step before which so much of the budget is spent."""
+        """Return the learning rate of a step before which a part of the budget is spent."""
         if self.recipe.schedule == "constant":
             return self.recipe.learning_rate
         share = spent / self.budget
         return self.recipe.learning_rate * min(1.0, share / 0.02 + 0.05) * 0.5 * (1.0 + math.cos(math.pi * share))
 
     def describe(self) -> dict[str, Any]:
-        """What is trained on what, for `config.json` and for whoever would go on from a checkpoint."""
+        """Describe model, settings and data, for `config.json` and checkpoints."""
         settings = asdict(self.config) | {"parameters": dict(self.config.parameters)}
         return describe_run(self.entry.name, self.parameters, settings, self.folder, asdict(self.recipe))
 
 
 def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
-    """Put a model, what it learns from and how together.
+    """Combine model, tensor folder and settings.
 
     Raises:
-        TracklakeError: the model does not learn; there are no samples to train on, or none to validate with and
-            `patience` is given; or there is no such device.
+        TracklakeError: the model does not learn; `train` has no samples, or `val` has none and `patience` is given; or
+            there is no such device.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Models and runs by name, opened to be asked about samples of a tensor folder."""
+"""Models and runs by name, ready to predict samples of a tensor folder."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,14 +9,18 @@ from tracklake.training.models import MODELS, Predictor, Reads, find_model
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
 
 
+class UnknownRunError(TracklakeError):
+    """There is no run, and no model that needs no training, of this name."""
+
+
 @dataclass(frozen=True)
 class Forecaster:
-    """A model that is asked.
+    """A model that is ready to predict.
 
     Args:
-        name: the run's or model's.
-        predictor: the model, ready.
-        reads: what it is given.
+        name: name of the run or model.
+        predictor: the model.
+        reads: kind of its input.
     """
 
     name: str
@@ -24,24 +28,20 @@ class Forecaster:
     reads: Reads
 
 
-class UnknownRunError(TracklakeError):
-    """There is no run, and no model that needs no training, of this name."""
-
-
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
-    """Open a trained run, or a model that needs no training: that one as it is, whether or not it was written as a run.
+    """Open a trained run, or a model that needs no training, written as a run or not.
 
     Args:
         name: a run's folder in `models`, or the name of a model that does not learn.
-        folder: the tensors that it will be asked about.
-        models: the folder of the runs.
-        parts: of the split, that it will be asked about.
+        folder: tensors to predict on.
+        models: folder of the runs.
+        parts: parts of the split to predict on.
 
     Raises:
-        StaleRunError: the run was trained for another protocol, or on subsets that stand in these parts now (but for
-            `train`); or it is unfinished or damaged.
+        StaleRunError: the run was trained for another protocol, or on subsets of these parts (other than `train`); or
+            it is unfinished or damaged.
         UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
-        MissingExtraError: torch is needed and missing.
+        MissingExtraError: torch is needed and not installed.
     """
     if name in MODELS and not MODELS[name].learns:
         return Forecaster(name, MODELS[name].build(folder.protocol), MODELS[name].reads)

@@ -1,4 +1,4 @@
-"""How a training went, as CSV: a row every so many steps, and one per epoch, on the disk as soon as they are made."""
+"""Logs of a training as CSV: a row after a number of steps and one after each epoch."""
 
 import csv
 from collections.abc import Callable, Iterator
@@ -10,37 +10,37 @@ Row = dict[str, float | int | str | None]
 COURSE_FILE = "course.csv"
 COURSE = {
     "step": "optimiser steps done",
-    "epoch": "of the last of them, from 0",
+    "epoch": "epoch of the last of them, from 0",
     "phase": "the recipe's loss",
-    "seconds": "since the training began, without the time it was interrupted",
+    "seconds": "time since the training began, without interruptions",
     "loss": "mean over the steps since the row before",
-    "learning_rate": "of the last step",
-    "samples_per_s": "over the steps since the row before",
-    "data_share": "of the time of those steps, the share spent on reading batches",
+    "learning_rate": "learning rate of the last step",
+    "samples_per_s": "samples a second over the steps since the row before",
+    "data_share": "share of the time of those steps that reading batches took",
 }
-"""Columns and what they mean."""
+"""Columns of course.csv and their meanings."""
 
 EPOCHS_FILE = "epochs.csv"
 EPOCHS = {
     "epoch": "from 0; the last one may be shorter than the others",
     "step": "optimiser steps done by its end",
-    "phase": "the recipe's loss, of its last step",
+    "phase": "the recipe's loss in its last step",
     "seconds": "as in course.csv, before validating",
     "loss": "mean over its steps of that phase",
-    "validation_loss": "of the same phase over the part `val`; empty where it is not measured",
-    "best": "1 where that is the least of its phase so far, else 0; empty where it is not measured",
+    "validation_loss": "the same loss over the part `val`; empty where it is not measured",
+    "best": "1 where that is the smallest of its phase so far, else 0; empty where it is not measured",
 }
-"""Likewise of the epochs."""
+"""Columns of epochs.csv and their meanings."""
 
 
 @contextmanager
-def writing_rows(path: Path, columns: dict[str, str], rows: list[Row]) -> Iterator[Callable[[Row], None]]:
-    """A CSV file of certain rows, and a function that adds one to the file and to the list.
+def open_log(path: Path, columns: dict[str, str], rows: list[Row]) -> Iterator[Callable[[Row], None]]:
+    """Open a CSV file and yield a function that adds a row to the file, at once, and to the list.
 
     Args:
-        path: of the file; replaced where it exists, so that it holds the rows given and no others.
-        columns: their names, in order.
-        rows: what is known already; grows with the file.
+        path: file of the log, replaced where it exists by the rows known already.
+        columns: names of the columns, in order.
+        rows: rows known already; grows with the file.
     """
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(columns), lineterminator="\n")
@@ -48,9 +48,9 @@ def writing_rows(path: Path, columns: dict[str, str], rows: list[Row]) -> Iterat
         writer.writerows(rows)
         stream.flush()
 
-        def write(row: Row) -> None:
+        def write_row(row: Row) -> None:
             rows.append(row)
             writer.writerow(row)
             stream.flush()
 
-        yield write
+        yield write_row

@@ -1,23 +1,24 @@
-"""What the C library does with memory that is freed."""
+"""Settings of the C library for freed memory."""
 
 import ctypes
 import platform
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # malloc.h of glibc: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
 _KEPT_BYTES = 1 << 30
+"""Freed memory that the process keeps, in bytes."""
 _MOST_BYTES = 1 << 25
-"""Larger thresholds than this are refused by some versions."""
+"""Largest threshold that every version accepts, in bytes."""
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep up to 1 GiB that it frees, for what it asks for next.
+    """Let this process keep up to 1 GiB of freed memory, to allocate from it again.
 
-    A step of training frees tens of MB and asks for as many again. glibc gives blocks of that size back to the system,
-    which then hands out other pages, each of them zeroed first: for convolutional social pooling on a processor 12,000
-    of them a step, a fifth of its time. Where the C library is another one, nothing is done.
+    A training step frees and allocates tens of MB. glibc returns blocks of that size to the system, which then has to
+    zero new pages: for convolutional social pooling on a CPU 12,000 of them a step, a fifth of its time. With another C
+    library nothing is changed.
 
     Returns:
-        Whether it was done.
+        Whether the settings were changed.
     """
     if platform.libc_ver()[0] != "glibc":
         return False

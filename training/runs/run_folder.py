@@ -1,50 +1,51 @@
-"""Trained runs on disk: `config.json` (what was trained on what), `weights.pt`, `metrics.json`, and two logs."""
+"""Trained runs on disk: `config.json` (model, settings and data), `weights.pt`, `metrics.json`, and two logs."""
 
-import hashlib
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from uuid import uuid4
 
 import numpy as np
 
 from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.files import name_unfinished
+from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, find_model, require_torch
+from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file
 from tracklake.training.runs.unfinished import is_unfinished
 
 if TYPE_CHECKING:
     from torch import nn
 
 RUN_VERSION = 2
-"""Counts changes of `config.json` or of the models that older runs cannot be read with."""
+"""Number of the run folder's layout; it grows when older runs cannot be read."""
 
 AGAIN = "train it again"
 TRAINED_BY = ("tracklake", "torch")
-"""Distributions whose versions a run names."""
+"""Distributions whose versions a run records."""
 KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "blocks": list}
-"""Of what a run's config must hold."""
+"""Keys that a run's config must hold, and their types."""
 HASHED_BYTES = 1 << 22
-"""At a time: Ctrl-C does not wait for a whole array."""
+"""Size of the pieces that are hashed, in bytes, so that Ctrl-C does not wait for a whole array."""
 
 
 class StaleRunError(TracklakeError):
-    """A run cannot be judged on these tensors: it was made for others, is unfinished, or is damaged."""
+    """A run cannot be evaluated on these tensors: it was trained for others, is unfinished, or is damaged."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run, loaded.
+    """A trained run, ready to predict.
 
     Args:
-        config: what `config.json` holds.
-        predictor: the model, with the trained weights, ready to predict.
+        config: content of `config.json`.
+        predictor: the model with the trained weights.
     """
 
     config: dict[str, Any]
@@ -58,15 +59,7 @@ def describe_run(
     folder: TensorFolder,
     recipe: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `config.json` holds (but for the versions, see `save_run`), as plain values.
-
-    Args:
-        model: its name in the registry.
-        parameters: keywords of its `build`.
-        config: how it was trained, as the caller said.
-        folder: what it was trained on.
-        recipe: and as the model's recipe then said; None where it does not learn.
-    """
+    """Return the content of `config.json` without the versions; a model without recipe does not learn."""
     run = {
         "version": RUN_VERSION,
         "model": model,
@@ -85,27 +78,24 @@ def describe_run(
 
 
 def digest_tensors(folder: TensorFolder) -> str:
-    """First 12 hex digits of the sha256 of the index and of every array: all that a training can depend on.
+    """Return the digest of the index and of every array: everything that a training can depend on.
 
-    A training is gone on with on tensors of the same digest only; finished runs are judged without it.
+    A training resumes on tensors of the same digest only; finished runs are evaluated without it.
     """
-    digest = hashlib.sha256(json.dumps(folder.index, sort_keys=True).encode())  # says each array's dtype and shape
-    for array in ARRAYS:
-        data = getattr(folder, array.name).reshape(-1).view(np.uint8)
-        for first in range(0, len(data), HASHED_BYTES):
-            digest.update(data[first : first + HASHED_BYTES])
-    return digest.hexdigest()[:12]
+
+    def list_chunks() -> Iterator[Any]:
+        yield json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
+        for array in ARRAYS:
+            data = folder.arrays[array.name].reshape(-1).view(np.uint8)
+            for first in range(0, len(data), HASHED_BYTES):
+                yield data[first : first + HASHED_BYTES]
+
+    return hash_chunks(list_chunks(), 12)
 
 
 def find_versions() -> dict[str, str | None]:
-    """Versions that are installed of what trains; None of what is not."""
-    found: dict[str, str | None] = {}
-    for name in TRAINED_BY:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
+    """Return the installed versions of the packages that train; None where one is not installed."""
+    return {name: version(name) if any(distributions(name=name)) else None for name in TRAINED_BY}
 
 
 def save_run(
@@ -115,31 +105,30 @@ def save_run(
     network: "nn.Module | None",
     logs: Iterable[Path] = (),
 ) -> None:
-    """Write a run's folder aside and put it in place at once; a run of that name is replaced.
+    """Write a run's folder under a hidden name and rename it when it is whole; a run of that name is replaced.
 
     Args:
         out: the run's folder.
-        config: see `describe_run`. `config.json` also says, for whoever wonders why two runs differ, the `versions` of
-            `find_versions` that ended the training; nothing compares them.
-        metrics: plain values.
+        config: see `describe_run`; `config.json` also records the versions of `find_versions`.
+        metrics: plain values for `metrics.json`.
         network: the trained module; None where the model does not learn.
-        logs: files to copy into it.
+        logs: files to copy into the folder.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
-    aside = out.parent / f".{out.name}.{uuid4().hex}.partial"
+    aside = name_unfinished(out)
     aside.mkdir()
     try:
         if network is not None:
-            from tracklake.training.runs.torch_files import write_torch_file
+            import torch
 
-            write_torch_file(aside / "weights.pt", network.state_dict())
+            torch.save(network.state_dict(), aside / "weights.pt")
         for log in logs:
             shutil.copyfile(log, aside / log.name)
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
-        said = config | {"versions": find_versions()}
-        (aside / "config.json").write_text(json.dumps(said, indent=1, allow_nan=False), encoding="utf-8")
+        recorded = config | {"versions": find_versions()}
+        (aside / "config.json").write_text(json.dumps(recorded, indent=1, allow_nan=False), encoding="utf-8")
         if out.exists():
-            # A folder cannot be renamed over a full one: the old one steps aside first.
+            # A folder cannot be renamed over a full one.
             old = aside.with_suffix(".old")
             out.rename(old)
             aside.rename(out)
@@ -151,12 +140,12 @@ def save_run(
 
 
 def load_run(path: Path, protocol: Protocol) -> Run:
-    """Load a run for tensors of a protocol.
+    """Load a trained run for tensors of a protocol.
 
     Raises:
         StaleRunError: the run is of another version, was trained for another protocol, is of a model or has parameters
             that this version does not know, or is damaged.
-        ImportError: torch is needed and missing.
+        MissingExtraError: torch is needed and not installed.
     """
     config = read_config(path)
     if config["protocol"]["digest"] != protocol.digest:
@@ -171,11 +160,9 @@ def load_run(path: Path, protocol: Protocol) -> Run:
         raise StaleRunError(f"{path}: {wrong}; {AGAIN}") from None
     if model.learns:
         require_torch(model.name)
-        from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file
-
         weights = path / "weights.pt"
         try:
-            load_weights(predictor, read_torch_file(weights, AGAIN), str(weights), AGAIN)
+            load_weights(predictor, read_torch_file(weights, AGAIN), weights, AGAIN)
         except DamagedFileError as damaged:
             raise StaleRunError(str(damaged)) from None
         predictor.eval()
@@ -183,7 +170,7 @@ def load_run(path: Path, protocol: Protocol) -> Run:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """What a run's `config.json` holds.
+    """Read and check a run's `config.json`.
 
     Raises:
         StaleRunError: it is of another version, or damaged.
@@ -205,14 +192,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def refuse_unfinished(path: Path) -> None:
-    """Refuse a run of which there is nothing but a training that was interrupted.
-
-    Args:
-        path: the run's folder.
-
-    Raises:
-        StaleRunError: saying how to go on.
-    """
+    """Raise StaleRunError for a run whose training was interrupted and has not been resumed."""
     if not (path / "config.json").is_file() and is_unfinished(path):
         raise StaleRunError(
             f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "
@@ -221,19 +201,18 @@ def refuse_unfinished(path: Path) -> None:
 
 
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:
-    """Refuse to evaluate a run on what it was trained on.
+    """Refuse to evaluate a run on data that it was trained on.
 
-    The split may have been drawn anew since the run was trained. Where it has, no subset of the part may be one that
-    the run was trained on, or that its weights were chosen by (`patience`); where it has not, the split itself keeps
-    the parts apart.
+    The split may have changed since the run was trained. Then no subset of the part may be one that the run was trained
+    on, or that its weights were chosen by (`patience`); otherwise the split itself keeps the parts apart.
 
     Args:
-        config: the run's.
-        folder: the tensors to evaluate on.
-        part: the part to evaluate.
+        config: content of the run's `config.json`.
+        folder: tensors to evaluate on.
+        part: part to evaluate.
 
     Raises:
-        ValueError: naming the subsets.
+        StaleRunError: names the subsets.
     """
     if config["blocks"] == folder.index["blocks"]:
         return

@@ -1,4 +1,4 @@
-"""The folder of a run whose training is not done: where it is, whose it is, and who may begin or go on in it."""
+"""The hidden folder of a run whose training is not done, with its checkpoint and logs."""
 
 import fcntl
 import os
@@ -8,50 +8,51 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.runs.torch_files import PARTIAL
+from tracklake.schemas.files import remove_unfinished
 
 CHECKPOINT_FILE = "checkpoint.pt"
 LOCK_FILE = "lock"
-ANEW = "begin anew (`--anew`)"
+RESTART = "start over with `--anew`"
 
 
 class UnfinishedError(TracklakeError):
-    """A training cannot begin, or go on, as it stands on disk."""
+    """A training cannot start or resume because of what an interrupted one left."""
 
 
 def unfinished_folder(run: Path) -> Path:
-    """Where a run's training keeps checkpoint and logs until it is done: hidden, so that no one takes it for a run."""
+    """Return the folder where a run's training keeps checkpoint and logs; hidden, so that it is not taken for a run."""
     return run.parent / f".{run.name}.unfinished"
 
 
 def is_unfinished(run: Path) -> bool:
-    """Whether there is a checkpoint to go on from."""
+    """Return whether there is a checkpoint to resume from."""
     return (unfinished_folder(run) / CHECKPOINT_FILE).is_file()
 
 
 def refuse_wrong_start(run: Path, *, resume: bool | None) -> None:
-    """Refuse to lose a checkpoint unasked, or to go on from one that is not there.
+    """Refuse to discard a checkpoint without being told to, or to resume without one.
 
     Args:
         run: the run's folder.
-        resume: True: to go on; False: to begin anew; None: the caller did not say.
+        resume: True: resume; False: start over; None: start unless there is a checkpoint.
 
     Raises:
-        UnfinishedError: saying what to do.
+        UnfinishedError: says what to do.
     """
     folder = unfinished_folder(run)
     if resume is None and is_unfinished(run):
         raise UnfinishedError(
-            f"{folder}: a training of the run `{run.name}` was interrupted; go on with it (`--resume`), or lose it and "
-            f"{ANEW}"
+            f"{folder}: a training of the run `{run.name}` was interrupted; resume it (`--resume`), or {RESTART}"
         )
     if resume and not is_unfinished(run):
-        raise UnfinishedError(f"{folder}: no interrupted training of the run `{run.name}` to resume; train it anew")
+        raise UnfinishedError(
+            f"{folder}: no interrupted training of the run `{run.name}` to resume; train without `--resume`"
+        )
 
 
 @contextmanager
 def claim_folder(run: Path) -> Iterator[Path]:
-    """The folder for a run's checkpoint and logs, to oneself; where no checkpoint came of it, it is removed.
+    """Lock the folder of a run's checkpoint and logs; where it holds no checkpoint in the end, it is removed.
 
     Raises:
         UnfinishedError: another process is training this run.
@@ -64,12 +65,11 @@ def claim_folder(run: Path) -> Iterator[Path]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise UnfinishedError(
-                f"{folder}: another process is training the run `{run.name}`; wait for it to end, or name this run "
-                "otherwise (`--name`)"
+                f"{folder}: another process is training the run `{run.name}`; wait for it to end, or choose another "
+                "name (`--name`)"
             ) from None
+        remove_unfinished(folder)
         try:
-            for left in folder.glob(f"*{PARTIAL}"):
-                left.unlink()  # by a process that was killed while it wrote
             yield folder
         finally:
             if not (folder / CHECKPOINT_FILE).is_file():

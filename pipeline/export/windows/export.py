@@ -17,8 +17,8 @@ from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.columns import PARTS
+from tracklake.training.data.namespaces import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.data.windows import spread
 
 CARD = "README.md"
 """Name of the card's file."""
@@ -98,7 +98,7 @@ def read_windows(folder: TensorFolder, part: str, *, absolute: bool) -> Iterator
     for batch in folder.batches(part, BATCH_SAMPLES, absolute=absolute):
         row = folder.sample_row[batch.sample]
         run = folder.runs_of(row)
-        pair, _ = spread(folder.neighbor_offset, batch.sample)
+        pair, _ = expand_groups(folder.neighbor_offset, batch.sample)
         yield Windows(
             batch=batch,
             subset=folder.run_subset[run],

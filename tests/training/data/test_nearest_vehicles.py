@@ -12,7 +12,7 @@ from tensor_tables import CLOCK, TINY, sample_everything, sizes_of, split_row, w
 
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.checks import TensorError
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -110,7 +110,7 @@ def test_surroundings_equal_an_obvious_loop(tmp_path_factory, seed, splits, mark
     expected = loop_over_surroundings(tables, kept, nearest, markings)
     assert len(folder.sample_row) == len(expected)
     numbers = [order.randrange(len(expected)) for _ in range(12)] if expected else []  # in any order, some twice
-    observed, truth = gather_surroundings(folder, np.array(numbers, dtype=np.int64), nearest=nearest)
+    observed, truth = gather_nearest(folder, np.array(numbers, dtype=np.int64), nearest=nearest)
     assert observed.history.shape == (len(numbers), 1 + nearest, H, 2)
     assert truth.future.shape == (len(numbers), 1 + nearest, F, 2)
     assert observed.lanes.shape == (len(numbers), 3, 3)
@@ -119,7 +119,7 @@ def test_surroundings_equal_an_obvious_loop(tmp_path_factory, seed, splits, mark
 
 def test_types_are_as_declared_and_the_future_is_not_among_what_may_be_seen(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
-    observed, truth = gather_surroundings(folder, [0, 1], nearest=2)
+    observed, truth = gather_nearest(folder, [0, 1], nearest=2)
     kinds = {own.name: getattr(observed, own.name).dtype.name for own in fields(observed)}
     assert kinds == {
         "history": "float32", "history_mask": "bool", "vehicle_mask": "bool", "size_m": "float32", "lanes": "float32",
@@ -163,7 +163,7 @@ def test_of_two_equally_far_the_smaller_id_comes_first_and_the_ego_before_all(tm
         *stand(1, 16.0, 5.0),  # 6 m away
     ]
     folder = open_rows(tmp_path, rows, storage=storage)
-    observed, _ = gather_surroundings(folder, [number_of(folder, 7)], nearest=4)
+    observed, _ = gather_nearest(folder, [number_of(folder, 7)], nearest=4)
     places = observed.history[0, :, -1].astype(float).round(3).tolist()
     assert places == [[0, 0], [0, 0], [3, 4], [-5, 0], [0, -5]]
     # Sizes tell who is who: 4 m and a tenth of the id; every fifth has none.
@@ -174,13 +174,13 @@ def test_distance_counts_across_the_road_as_along_it_and_not_in_steps(tmp_path):
     # In steps of int16 (0.1 m along, 1 mm across) vehicle 3 would be 2000 away, vehicle 2 only 50.
     rows = [*stand(1, 0.0, 5.0), *stand(2, 5.0, 5.0), *stand(3, 0.0, 7.0)]
     folder = open_rows(tmp_path, rows, storage="int16-decimetres")
-    observed, _ = gather_surroundings(folder, [number_of(folder, 1)], nearest=1)
+    observed, _ = gather_nearest(folder, [number_of(folder, 1)], nearest=1)
     np.testing.assert_allclose(observed.history[0, 1, -1], [0, 2], atol=1e-6)
 
 
 def test_one_vehicle_alone_is_padded_with_zeros(tmp_path):
     folder = open_rows(tmp_path, stand(TOP, 10.0, 5.0))
-    observed, truth = gather_surroundings(folder, [0], nearest=3)
+    observed, truth = gather_nearest(folder, [0], nearest=3)
     assert observed.vehicle_mask.tolist() == [[True, False, False, False]]
     assert not observed.history[0, 1:].any()
     assert not observed.history_mask[0, 1:].any()
@@ -193,7 +193,7 @@ def test_who_comes_and_goes_is_seen_though_it_is_no_sample(tmp_path):
     # Vehicle 2 is there at the ego's tick alone: no sample (no history, no future), and in the way all the same.
     rows = [*stand(1, 0.0, 5.0), (2, 2, 4.0, 5.0, 1)]
     folder = open_rows(tmp_path, rows)
-    observed, truth = gather_surroundings(folder, [number_of(folder, 1)], nearest=2)
+    observed, truth = gather_nearest(folder, [number_of(folder, 1)], nearest=2)
     assert observed.vehicle_mask.tolist() == [[True, True, False]]
     assert observed.history[0, 1].tolist() == [[4, 0]] * H
     assert observed.history_mask[0, 1].tolist() == [False, False, True]
@@ -214,7 +214,7 @@ def test_the_same_is_seen_whatever_the_others_do_later(tmp_path, markings):
     for name, rows in (("gone", now), ("there", [*now, *later])):
         folder = open_rows(tmp_path / name, rows, markings=markings)
         first = np.flatnonzero(folder.run_vehicle_id[folder.runs_of(folder.sample_row)] == 1)[0]
-        seen.append(gather_surroundings(folder, [first], nearest=2)[0])
+        seen.append(gather_nearest(folder, [first], nearest=2)[0])
     for own in ("history", "history_mask", "vehicle_mask", "size_m", *(["lanes"] if markings else [])):
         np.testing.assert_array_equal(getattr(seen[0], own), getattr(seen[1], own))
     right = [scene.lanes[0, 2, 2] for scene in seen]
@@ -233,7 +233,7 @@ def test_the_same_is_seen_whatever_the_others_do_later(tmp_path, markings):
 )
 def test_lanes_around_the_ego(tmp_path, lane, markings, expected):
     folder = open_rows(tmp_path, stand(1, 0.0, 5.0, lane=lane), markings=markings)
-    observed, _ = gather_surroundings(folder, [0], nearest=0)
+    observed, _ = gather_nearest(folder, [0], nearest=0)
     np.testing.assert_allclose(observed.lanes[0], expected, atol=1e-5)
 
 
@@ -248,7 +248,7 @@ def test_int16_says_the_same_within_its_steps(tmp_path_factory, seed):
     )
     every = np.arange(len(exact.sample_row))
     # All vehicles of a scene are read, so that rounding may swap two of them but leave out none.
-    one, other = (gather_surroundings(opened, every, nearest=9) for opened in (exact, coarse))
+    one, other = (gather_nearest(opened, every, nearest=9) for opened in (exact, coarse))
     np.testing.assert_array_equal(one[0].vehicle_mask, other[0].vehicle_mask)
     np.testing.assert_allclose(one[0].lanes, other[0].lanes, atol=1e-3)
     for which, name in ((0, "history"), (1, "future")):
@@ -261,25 +261,25 @@ def test_int16_says_the_same_within_its_steps(tmp_path_factory, seed):
 def test_numbers_that_are_none_are_refused(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
     with pytest.raises(IndexError, match="samples are numbered 0 to"):
-        gather_surroundings(folder, [-1], nearest=2)
-    with pytest.raises(ValueError, match="cannot look at the -1 nearest: expected 0 or more"):
-        gather_surroundings(folder, [0], nearest=-1)
+        gather_nearest(folder, [-1], nearest=2)
+    with pytest.raises(ValueError, match="cannot gather the -1 nearest vehicles: expected 0 or more"):
+        gather_nearest(folder, [0], nearest=-1)
 
 
 def test_a_folder_whose_scenes_lack_samples_is_refused(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
-    nobody = replace(folder, scene_sample=np.full_like(folder.scene_sample, -1))
+    nobody = replace(folder, arrays={**folder.arrays, "scene_sample": np.full_like(folder.scene_sample, -1)})
     with pytest.raises(
         TensorError, match=r"`scene_sample`: expected each of [0-9]+ samples in one scene, got 0 vehicles"
     ):
-        gather_surroundings(nobody, [0], nearest=2)
+        gather_nearest(nobody, [0], nearest=2)
 
 
 def test_a_protocol_of_another_clock_gives_its_own_shapes(tmp_path):
     quick = Protocol(name="quick", rate_hz=10, history_s=0.4, horizon_s=0.3, min_future_s=0.1)
     tables = tables_of([*stand(1, 0.0, 5.0, ticks=range(8))], protocol=quick)
     folder = TensorFolder.open(write(tmp_path, tables, split_row("a", "train"), protocol=quick))
-    observed, truth = gather_surroundings(folder, np.arange(len(folder.sample_row)), nearest=1)
+    observed, truth = gather_nearest(folder, np.arange(len(folder.sample_row)), nearest=1)
     assert observed.history.shape[1:] == (2, 5, 2)
     assert truth.future.shape[1:] == (2, 3, 2)
     assert len(observed.history) == 3  # ticks 4 to 6 of 0 to 7

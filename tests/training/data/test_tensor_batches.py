@@ -1,7 +1,5 @@
 """Batches equal those of a literal per-sample loop over the tables, value for value."""
 
-import itertools
-
 import numpy as np
 import polars as pl
 import pytest
@@ -12,7 +10,6 @@ from tensor_tables import CLOCK, drive, sample_everything, split_row, write
 
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
-from tracklake.training.data.draws import draw_numbers
 from tracklake.training.data.tensor_folder import TensorFolder
 
 
@@ -129,35 +126,13 @@ def test_the_last_batch_is_what_is_left(tmp_path):
     clock = one_vehicle(range(12))
     folder = open_one(tmp_path, clock, sample_of(*((7, tick) for tick in range(2, 11))), neighbor_of())
     assert [len(batch) for batch in folder.batches("eval", 4)] == [4, 4, 1]
-    assert [len(batch) for batch in folder.batches("eval", 4, shuffle_seed=1, shuffle_block=3)] == [4, 4, 1]
+    assert [len(batch) for batch in folder.batches("eval", 4, shuffle_seed=1)] == [4, 4, 1]
 
 
-@given(
-    parts=st.lists(st.integers(0, 2), max_size=60),
-    size=st.integers(1, 9),
-    seed=st.none() | st.integers(0, 5),
-    block=st.none() | st.integers(1, 70),
-)
-def test_every_number_of_a_part_is_drawn_once(parts, size, seed, block):
-    drawn = list(draw_numbers(np.array(parts, dtype=np.uint8), 1, size, shuffle_seed=seed, shuffle_block=block))
-    wanted = [number for number, part in enumerate(parts) if part == 1]
-    assert [len(batch) for batch in drawn] == [len(wanted[i : i + size]) for i in range(0, len(wanted), size)]
-    numbers = list(itertools.chain.from_iterable(batch.tolist() for batch in drawn))
-    assert sorted(numbers) == wanted
-    if seed is None:
-        assert numbers == wanted
-
-
-def test_a_shuffle_by_blocks_stays_inside_them_and_follows_its_seed():
-    parts = np.zeros(100, dtype=np.uint8)
-    draw = {
-        seed: np.concatenate(list(draw_numbers(parts, 0, 10, shuffle_seed=seed, shuffle_block=20))) for seed in (1, 2)
-    }
-    assert all(len(set(numbers // 20)) == 1 for numbers in draw[1].reshape(5, 20))
-    assert draw[1].tolist() != sorted(draw[1])
-    assert draw[1].tolist() != draw[2].tolist()
+def test_batches_of_no_samples_are_refused(tmp_path):
+    folder = open_one(tmp_path, one_vehicle(range(5)), sample_of((7, 2)), neighbor_of())
     with pytest.raises(ValueError, match="at least 1, got 0"):
-        draw_numbers(parts, 0, 0)
+        next(folder.batches("eval", 0))
 
 
 def test_numbers_that_are_no_sample_are_refused(tmp_path):

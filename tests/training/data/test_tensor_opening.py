@@ -9,7 +9,7 @@ from tensor_loop import UNDIVIDED, random_tables
 from tensor_tables import TINY, drive, sample_everything, split_row, write
 
 from tracklake.schemas.columns import PARTS
-from tracklake.schemas.tensors import ARRAYS, ARRAYS_FILE, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
+from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
 from tracklake.training.data.checks import KINDS
 from tracklake.training.data.tensor_folder import TensorError, TensorFolder
 
@@ -29,21 +29,24 @@ def drop_key(folder):
     file.write_text(json.dumps(index))
 
 
-def change_header(name, **changes):
-    def change(folder):
-        file = folder / ARRAYS_FILE
-        whole = file.read_bytes()
-        length = int.from_bytes(whole[:8], "little")
-        header = json.loads(whole[8 : 8 + length])
-        if changes:
-            header[name] |= changes
-        else:
-            del header[name]
-        text = json.dumps(header).encode()
-        text += b" " * (-len(text) % 8)
-        file.write_bytes(len(text).to_bytes(8, "little") + text + whole[8 + length :])
+def change_file(name, change):
+    """Rewrite an array's file."""
 
-    return change
+    def damage(folder):
+        file = folder / f"{name}.npy"
+        file.write_bytes(change(file.read_bytes()))
+
+    return damage
+
+
+def store_otherwise(name, change):
+    """Store other values under an array's name."""
+
+    def damage(folder):
+        file = folder / f"{name}.npy"
+        np.save(file, change(np.load(file)))
+
+    return damage
 
 
 def change_subset(**changes):
@@ -59,26 +62,11 @@ def change_subset(**changes):
 def set_value(name, position, value):
     """Overwrite one value of an array."""
 
-    def change(folder):
-        file = folder / ARRAYS_FILE
-        whole = bytearray(file.read_bytes())
-        length = int.from_bytes(whole[:8], "little")
-        entry = json.loads(whole[8 : 8 + length])[name]
-        start, end = (8 + length + offset for offset in entry["data_offsets"])
-        values = np.frombuffer(whole[start:end], {"I64": "<i8", "I32": "<i4", "U8": "u1"}[entry["dtype"]]).copy()
+    def change(values):
         values[position] = value
-        whole[start:end] = values.tobytes()
-        file.write_bytes(whole)
+        return values
 
-    return change
-
-
-def resize(change):
-    def damage(folder):
-        file = folder / ARRAYS_FILE
-        file.write_bytes(change(file.read_bytes()))
-
-    return damage
+    return store_otherwise(name, change)
 
 
 def test_the_protocol_is_read_as_it_was_written(tmp_path):
@@ -93,27 +81,21 @@ def test_the_protocol_is_read_as_it_was_written(tmp_path):
     [
         (lambda folder: (folder / INDEX_FILE).unlink(), r"no tensors here \(no index.json\); run `tracklake tensors`"),
         (lambda folder: (folder / INDEX_FILE).write_text("{"), "index.json: not readable as JSON"),
-        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 3 of tensors, got list"),
-        (change_index(version=1), "expected version 3 of tensors, got 1; run `tracklake tensors` again"),
+        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 4 of tensors, got list"),
+        (change_index(version=1), "expected version 4 of tensors, got 1; run `tracklake tensors` again"),
         (drop_key, "index.json: lacks blocks, subsets: width_m; run"),
         (change_index(protocol={"name": "x"}), "expected a protocol of drop_error_findings, .*, got name"),
         (change_index(storage="float16"), "expected storage float32 or .*, got 'float16'"),
         (change_index(max_error_m=[0.2, 0.0]), "rounding error along the road of at most 0.001 m for float32, got 0.2"),
-        (lambda folder: (folder / ARRAYS_FILE).unlink(), "arrays.safetensors: cannot be read"),
-        (resize(lambda whole: whole[:0]), r"not a whole safetensors file \(0 bytes\)"),
-        (resize(lambda whole: b"PAR1" + whole[4:]), "not a whole safetensors file"),
-        (resize(lambda whole: whole[:-1]), "cut short: array `scene_part` ends at byte [0-9,]+, the file at [0-9,]+"),
-        (resize(lambda whole: whole + b"\0"), "expected [0-9,]+ bytes, got [0-9,]+; run"),
-        (resize(lambda whole: whole[:8] + b"x" + whole[9:]), "cannot be read"),
-        (change_header("lane"), "array `lane`: expected I16 of shape .*, got nothing of shape None"),
-        (change_header("lane", dtype="I32"), "array `lane`: expected I16 of shape .*, got I32 of shape"),
-        (change_header("neighbor_offset", shape=[1]), r"array `neighbor_offset`: expected I64 of shape .*\[1\]"),
-        (change_header("lane", data_offsets=[1, 3]), "array `lane` cannot stand at bytes 1 to 3"),
-        (change_header("lane", data_offsets="x"), "`lane`: expected its two `data_offsets` in bytes, got 'x'; run"),
-        (change_header("lane", data_offsets=[0]), r"`lane`: expected its two `data_offsets` in bytes, got \[0\]"),
-        (change_header("lane", data_offsets=None), "`lane`: expected its two `data_offsets` in bytes, got None"),
-        (change_header("lane", data_offsets=[-4, 0]), r"two `data_offsets` in bytes, got \[-4, 0\]"),
-        (change_header("lane", data_offsets=[0, True]), r"two `data_offsets` in bytes, got \[0, True\]"),
+        (lambda folder: (folder / "lane.npy").unlink(), "lane.npy: cannot be read"),
+        (change_file("lane", lambda whole: whole[:0]), "lane.npy: cannot be read"),
+        (change_file("lane", lambda whole: b"PAR1" + whole[4:]), "lane.npy: cannot be read"),
+        (change_file("lane", lambda whole: whole[:-1]), "lane.npy: cannot be read .*greater than file size"),
+        (change_file("lane", lambda whole: whole + b"\0"), "lane.npy: expected [0-9,]+ bytes, got [0-9,]+; run"),
+        (change_file("lane", lambda whole: whole[:20] + b"x" + whole[21:]), "lane.npy: cannot be read"),
+        (store_otherwise("lane", lambda lane: lane.astype(np.int32)), "lane.npy: expected int16 of .*, got int32 of"),
+        (store_otherwise("neighbor_offset", lambda own: own[:1]), r"neighbor_offset.npy: expected int64 .*\(1,\)"),
+        (store_otherwise("lane", lambda lane: lane.astype(object)), "lane.npy: cannot be read"),
         (change_index(sizes={}), "index.json: lacks sizes: R, sizes: S, sizes: C, sizes: N, sizes: K; run"),
         (change_index(sizes=None), "index.json: `sizes`: expected counts by name, got None; run"),
         (change_index(sizes={"N": -1}), r"`sizes`: expected counts by name, got \{'N': -1\}"),
@@ -189,27 +171,18 @@ def test_a_protocol_that_was_tampered_with_is_refused(tmp_path):
         TensorFolder.open(tmp_path)
 
 
-def test_the_file_is_laid_out_as_safetensors_says(tmp_path):
-    """Read by the format's description alone: arrays without holes, in the declared types, holding what is mapped."""
+def test_any_reader_of_numpys_format_reads_the_arrays(tmp_path):
     draw = np.random.default_rng(0)
     clock = drive(draw, vehicles=5, ticks=20)
     tables = [("a", clock, *sample_everything(draw, clock, dataset="highd", subset="a"))]
-    whole = (write(tmp_path, tables, split_row("a", "train")) / ARRAYS_FILE).read_bytes()
-    length = int.from_bytes(whole[:8], "little")
-    header, values = json.loads(whole[8 : 8 + length]), whole[8 + length :]
-    assert length % 8 == 0
-    assert header.pop("__metadata__") == {"format": "np"}
-    kinds = {"F32": "<f4", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "<i1", "U8": "<u1"}
-    folder, end = TensorFolder.open(tmp_path), 0
-    assert list(header) == [array.name for array in ARRAYS]
-    for name, entry in header.items():
-        start, last = entry["data_offsets"]
-        assert start == end, "a hole"
-        end = last
-        read = np.frombuffer(values[start:last], kinds[entry["dtype"]]).reshape(entry["shape"])
-        np.testing.assert_array_equal(getattr(folder, name), read)
-        assert getattr(folder, name).flags.aligned
-    assert end == len(values)
+    folder = TensorFolder.open(write(tmp_path, tables, split_row("a", "train")))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([INDEX_FILE, *(array.file for array in ARRAYS)])
+    for array in ARRAYS:
+        read = np.load(tmp_path / array.file, allow_pickle=False)
+        mapped = getattr(folder, array.name)
+        assert read.dtype == mapped.dtype
+        np.testing.assert_array_equal(mapped, read)
+        assert mapped.flags.aligned
     assert len(folder.lane) == clock.height
     np.testing.assert_array_equal(folder.position_m, clock.select("x_m", "y_m").to_numpy().astype(np.float32))
 

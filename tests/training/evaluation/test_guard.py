@@ -279,13 +279,13 @@ def test_honest_models_pass_and_the_folder_is_as_it_was(stored, reads, part):
 
     before = {array.name: getattr(stored, array.name) for array in ARRAYS}
     copies = {name: values.copy() for name, values in before.items()}
-    window = stored.histories
+    scenes = stored.scene_of_sample
     refuse_future(AllThatIsGiven(), stored, part, name="honest", reads=reads)
     assert all(getattr(stored, name) is values for name, values in before.items())
     assert all(
         np.array_equal(copies[name], values, equal_nan=values.dtype.kind == "f") for name, values in before.items()
     )
-    assert stored.histories is window
+    assert stored.scene_of_sample is scenes
     if reads == "grid":
         refuse_future(ConstantVelocity(stored.protocol), stored, part, name="honest")
 

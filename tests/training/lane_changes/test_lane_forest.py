@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,
@@ -335,7 +335,7 @@ def test_a_folder_is_learned_from(folder):
     drawn = sum(fitted.facts["drawn_by_stratum"].values())
     assert fitted.facts["examples"] == 3 * drawn
     judged = label_samples(folder, "eval", replace(FEW, start_s=3.0))
-    scene, _ = gather_surroundings(folder, judged.sample, nearest=10)
+    scene, _ = gather_nearest(folder, judged.sample, nearest=10)
     decided = decide_classes(fitted.predict(scene))
     examples = gather_examples(folder, judged)
     np.testing.assert_array_equal(decided, decide_classes(fitted.predict_proba(examples.feature)))

@@ -92,7 +92,11 @@ def test_equals_a_slow_restatement(heads, hidden, residual, protocol):
         horizon_ticks=protocol.horizon_ticks,
         residual=residual,
     )
-    said, looks, predicted = network.predict_scene(observed), network.look(observed), network.predict(observed)
+    said, looks, predicted = (
+        network.predict_scene(observed),
+        network.read_attention(observed),
+        network.predict(observed),
+    )
     for scene, (there, means, covariances, weights_by_part) in enumerate(slow):
         close(said.mean_m[scene, there], means)
         close(said.covariance_m2[scene, there], covariances)
@@ -113,7 +117,7 @@ def test_the_order_of_vehicles_does_not_matter(seed, vehicles, order_seed):
     said, again = network.predict_scene(observed), network.predict_scene(reorder(observed, order))
     close(again.mean_m, said.mean_m[:, order])
     close(again.covariance_m2, said.covariance_m2[:, order])
-    looks, shuffled = network.look(observed), network.look(reorder(observed, order))
+    looks, shuffled = network.read_attention(observed), network.read_attention(reorder(observed, order))
     close(shuffled.vehicles, looks.vehicles[:, :, order][..., order])
     close(shuffled.lanes, looks.lanes[:, :, order])
     close(shuffled.decoder, looks.decoder[:, :, order][..., order])
@@ -140,7 +144,7 @@ def test_vehicles_that_are_not_there_change_nothing(seed, vehicles, rows, fillin
     absent = ~padded.vehicle_mask
     assert (again.mean_m[absent] == 0).all()
     assert (again.covariance_m2[absent] == np.eye(2)).all()
-    assert (network.look(padded).vehicles[:, :, vehicles:] == 0).all()
+    assert (network.read_attention(padded).vehicles[:, :, vehicles:] == 0).all()
 
     longer = ((0, 0), (0, rows), (0, 0))
     known = change(
@@ -176,7 +180,11 @@ def test_ticks_and_lanes_that_are_unknown_change_nothing(seed, filling, protocol
 def test_any_number_of_vehicles_is_predicted(scenes, vehicles):
     observed, truth = wander(vehicles, scenes, vehicles)
     network = build(8)
-    said, all_of_them, looks = network.predict(observed), network.predict_scene(observed), network.look(observed)
+    said, all_of_them, looks = (
+        network.predict(observed),
+        network.predict_scene(observed),
+        network.read_attention(observed),
+    )
     assert said.position_m.shape == (scenes, F, 2)
     assert said.position_m.dtype == np.float32
     assert (said.lateral, said.longitudinal) == (None, None)
@@ -213,7 +221,7 @@ def test_attention_goes_to_what_is_there_and_sums_to_one(seed, vehicles, heads):
     lanes = observed.lanes.copy()
     lanes[0] = 0
     observed = change(observed, lanes=lanes)
-    looks = build(heads).look(observed)
+    looks = build(heads).read_attention(observed)
     there, exists = observed.vehicle_mask, lanes[..., 2] > 0
     for weights, keys in ((looks.vehicles, there), (looks.decoder, there), (looks.lanes, exists)):
         assert (weights >= 0).all()
@@ -319,7 +327,7 @@ def test_training_on_a_few_scenes_reduces_the_loss_and_repeats(name):
 def test_predicting_leaves_training_as_it_was():
     observed, _ = wander(2, 2, 3)
     network = build().train()
-    for ask in (network.predict, network.predict_scene, network.look):
+    for ask in (network.predict, network.predict_scene, network.read_attention):
         ask(observed)
         assert network.training
     assert np.array_equal(network.predict(observed).position_m, network.predict(observed).position_m)

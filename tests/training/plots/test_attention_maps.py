@@ -34,7 +34,7 @@ class Weights:
 class KnownAttention:
     """Weights that are known: in head h vehicle v gives u (h + 1) (u + 1) parts, the lanes 1, 2, 3 parts."""
 
-    def look(self, observed):
+    def read_attention(self, observed):
         there, exists = observed.vehicle_mask, observed.lanes[..., 2] > 0
         scenes, vehicles = there.shape
         parts = np.zeros((scenes, HEADS, vehicles, vehicles), np.float32)

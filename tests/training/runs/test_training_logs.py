@@ -8,11 +8,11 @@ import pytest
 import torch
 from tiny_network import read_log, register, write_tiny
 
-import tracklake.training.runs.feeding
+import tracklake.training.runs.loader
 import tracklake.training.train
-from tracklake.training.data.nearest_vehicles import gather_surroundings
+from tracklake.training.data.nearest_vehicles import gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.runs.feeding import make_resident_reader
+from tracklake.training.runs.loader import make_device_reader
 from tracklake.training.train import TrainConfig, train
 
 
@@ -24,10 +24,10 @@ def tensors(tmp_path_factory):
 def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
     losses = []
-    real = tracklake.training.train.TrainingState.take_step
+    real = tracklake.training.train.TrainingState.count_step
     monkeypatch.setattr(
         tracklake.training.train.TrainingState,
-        "take_step",
+        "count_step",
         lambda self, loss, samples: (losses.append((loss, samples)), real(self, loss, samples)),
     )
     train("forgetful", tensors, tmp_path / "run", TrainConfig(log_steps=3))
@@ -50,13 +50,13 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
 
 def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
-    real = tracklake.training.runs.feeding.read_samples
+    real = tracklake.training.runs.loader.read_samples
 
     def read_slowly(*given):
         time.sleep(0.02)
         return real(*given)
 
-    monkeypatch.setattr(tracklake.training.runs.feeding, "read_samples", read_slowly)
+    monkeypatch.setattr(tracklake.training.runs.loader, "read_samples", read_slowly)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
     assert 0 < metrics["samples_per_s"] < 32 / 0.02
@@ -76,21 +76,21 @@ def test_an_epoch_with_two_losses_is_told_by_its_last(tensors, tmp_path, monkeyp
     assert told == pytest.approx([sum(loss[:4]) / 4, (loss[6] + loss[7]) / 2, loss[8]])
 
 
-def test_a_resident_reader_reads_the_same(tensors):
+def test_a_device_reader_reads_the_same(tensors):
     folder = TensorFolder.open(tensors)
     samples = folder.samples_of("train")[[5, 0, 7]]
-    observed, truth = make_resident_reader(folder, "grid", torch.device("cpu"))(samples)
+    observed, truth = make_device_reader(folder, "grid", torch.device("cpu"))(samples)
     batch = folder.gather(samples)
     for got in (observed, truth):
         for own in fields(got):
             np.testing.assert_array_equal(getattr(got, own.name).numpy(), getattr(batch, own.name), err_msg=own.name)
 
 
-def test_a_resident_reader_of_scenes_reads_the_same(tensors):
+def test_a_device_reader_of_scenes_reads_the_same(tensors):
     folder = TensorFolder.open(tensors)
     samples = folder.samples_of("train")[[5, 0, 7]]
-    observed, truth = make_resident_reader(folder, "scene", torch.device("cpu"))(samples)
-    wanted, came = gather_surroundings(folder, samples, nearest=10)
+    observed, truth = make_device_reader(folder, "scene", torch.device("cpu"))(samples)
+    wanted, came = gather_nearest(folder, samples, nearest=10)
     for got, want in ((observed, wanted), (truth, came)):
         for own in fields(got):
             np.testing.assert_array_equal(getattr(got, own.name).numpy(), getattr(want, own.name), err_msg=own.name)

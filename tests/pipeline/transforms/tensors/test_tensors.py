@@ -14,7 +14,7 @@ from tracklake.schemas.findings import FINDINGS
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.schemas.splits import SPLITS
-from tracklake.schemas.tensors import INDEX_KEYS, SUBSET_KEYS
+from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, SUBSET_KEYS
 
 P = Protocol(name="p", rate_hz=2, history_s=0.5, horizon_s=1.0, min_future_s=0.5)  # 2 positions of history, 2 of future
 TOP = 2**31 - 1
@@ -279,6 +279,6 @@ def test_arrays_of_another_kind_are_not_written(tmp_path):
             write_tensors(tmp_path, [(FACTS, replace(tensors, arrays=arrays))], WHOLE, P, storage="float32")
 
 
-def test_nothing_but_the_two_files_is_left(tmp_path):
+def test_nothing_but_the_arrays_and_the_index_is_left(tmp_path):
     write_tensors(tmp_path, [(FACTS, build_tensors())], WHOLE, P, storage="float32")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["arrays.safetensors", "index.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["index.json", *(array.file for array in ARRAYS)])
