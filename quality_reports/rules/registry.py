@@ -8,8 +8,8 @@ import pandera.polars as pa
 import polars as pl
 from pandera.errors import SchemaErrors
 
-from tracklake.quality_reports.rules.consistency import CONSISTENCY_RULES
-from tracklake.quality_reports.rules.plausibility import PLAUSIBILITY_RULES
+from tracklake.quality_reports.rules.motion import MOTION_RULES
+from tracklake.quality_reports.rules.place import PLACE_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
 from tracklake.schemas.errors import UsageError
 
@@ -28,7 +28,7 @@ __all__ = [
     "select_broken",
 ]
 
-RULES: tuple[Rule, ...] = (*PLAUSIBILITY_RULES, *CONSISTENCY_RULES)
+RULES: tuple[Rule, ...] = (*MOTION_RULES, *PLACE_RULES)
 """Rules in use, in the order of the report."""
 
 

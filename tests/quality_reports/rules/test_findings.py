@@ -116,10 +116,10 @@ def test_runs_end_at_gaps_at_sound_entries_and_at_another_vehicle():
 def test_each_rule_fires_where_injected_and_nowhere_else():
     sound = (20.0, 0.1, 30.0)
     defects = {
-        "negative_headway": (20.0, 0.1, -1.0),
         "high_acceleration": (20.0, 3.5, 30.0),
         "low_constant_speed": (1.0, 0.0, 30.0),
         "backward": (-2.0, 0.1, 30.0),
+        "negative_headway": (20.0, 0.1, -1.0),
     }
     assert list(defects) == [rule.name for rule in RECORDED]
     places = {10 * number: name for number, name in enumerate(defects, start=1)}

@@ -1,72 +1,54 @@
-"""Rules about recorded values that disagree with each other, with positions, lanes or the vehicle's class."""
+"""Rules about where a vehicle is: among the others, in its lane, and how large it is."""
 
 import polars as pl
 
-from tracklake.quality_reports.rules.rule import DESIGN, PUNZO, Case, Limits, Rule, Threshold, recorded
+from tracklake.quality_reports.rules.rule import COIFMAN, DESIGN, Case, Limits, Rule, Threshold, recorded
 
-
-def differ(first: pl.Expr, second: pl.Expr) -> pl.Expr:
-    """Return abs(first - second), rounded to 1e-4.
-
-    What differs by the threshold in the source's decimals must not exceed it by the last bit of a Float32.
-    """
-    return (first.cast(pl.Float64) - second.cast(pl.Float64)).abs().round(4)
-
-
-speed_difference = differ(pl.col("speed_mps"), pl.col("speed_10hz_mps"))
-
-SPEED_MISMATCH = Rule(
-    name="speed_mismatch",
-    severity="warning",
-    unit="m/s",
-    thresholds=(Threshold("speed_mismatch_mps", 1.0, "m/s"),),
-    meaning="the recorded speed differs by more than the threshold from the one recomputed from the positions 0.1 s "
-    "before and after. Track ends and entries beside frame gaps have no such positions and are not compared",
-    source=f"{DESIGN}; internal consistency: {PUNZO}",
-    breaks=lambda limits: speed_difference > limits["speed_mismatch_mps"],
-    value=speed_difference,
-    extreme="max",
-    compared="rounded to 0.1 mm/s",
-    case=Case({"speed_mps": (20.01, 20.02, 20.0), "speed_10hz_mps": (19.01, 19.01, None)}, breaks=(1,)),
+NEGATIVE_HEADWAY = Rule(
+    name="negative_headway",
+    severity="error",
+    unit="m",
+    thresholds=(Threshold("negative_headway_m", 0.0, "m"),),
+    meaning="the bumper-to-bumper gap to the leader, from positions, is below the threshold: two vehicles overlap",
+    source=f"{DESIGN}; found in NGSIM by {COIFMAN}",
+    breaks=lambda limits: pl.col("gap_m") < limits["negative_headway_m"],
+    value=pl.col("gap_m"),
+    extreme="min",
+    compared="to 1 mm, as ingestion rounds it",
+    case=Case({"gap_m": (0.0, -0.001, None)}, breaks=(1,)),
 )
 
-HIGH_JERK = Rule(
-    name="high_jerk",
-    severity="warning",
-    unit="m/s3",
-    thresholds=(Threshold("high_jerk_mps3", 15.0, "m/s3"),),
-    meaning="the recorded acceleration has changed by more than the threshold times 0.1 s, either way, within the "
-    "0.1 s that end at the entry; at 25 Hz the acceleration 0.1 s before is the mean of those 2 and 3 frames before",
-    source=f"{DESIGN}; the limit of 15 m/s³: {PUNZO}",
-    breaks=lambda limits: pl.col("jerk_mps3").abs() > limits["high_jerk_mps3"],
-    value=pl.col("jerk_mps3").abs(),
-    extreme="max",
-    compared="rounded to 1 mm/s³",
-    case=Case(
-        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "accel_mps2": (0.0, -1.5, 0.0, -1.51)},
-        breaks=(3,),
-        frame_rate_hz=10.0,
-    ),
+NEGATIVE_HEADWAY_RECORDED = Rule(
+    name="negative_headway_recorded",
+    severity="error",
+    unit="m",
+    thresholds=(Threshold("negative_headway_recorded_m", 0.0, "m"),),
+    meaning="the recorded headway less the leader's length is below the threshold, whatever the positions say: how the "
+    "published counts were made. Headways recorded from bumper to bumper (those that are nearer to gap_m as they "
+    "stand, in the subset's median) count without taking the length off again",
+    source=f"{DESIGN}; the published counts of NGSIM's negative headways",
+    breaks=lambda limits: pl.col("recorded_gap_m") < limits["negative_headway_recorded_m"],
+    value=pl.col("recorded_gap_m"),
+    extreme="min",
+    compared="rounded to 1 mm",
+    case=Case({"leader_id": (None, 1, 1), "headway_recorded_m": (None, 4.0, 3.999)}, breaks=(2,)),
 )
 
-JERK_FLICKER = Rule(
-    name="jerk_flicker",
-    severity="info",
-    unit="changes",
-    thresholds=(Threshold("jerk_flicker_changes", 1.0, "changes"),),
-    meaning="of the ten jerks, 0.1 s apart, of the second that ends at the entry, the sign changes more often than the "
-    "threshold. A jerk of zero has no sign and is passed over: +, 0, - is one change, +, 0, + none. Behind a track's "
-    "beginning or a frame gap the second is as long as there are entries",
-    source=f"{DESIGN}; drivers reverse jerk at most once in a second: {PUNZO}",
-    breaks=lambda limits: pl.col("jerk_reversals") > limits["jerk_flicker_changes"],
-    value=pl.col("jerk_reversals"),
+OVERLAP = Rule(
+    name="overlap",
+    severity="error",
+    unit="m",
+    thresholds=(Threshold("overlap_m", 0.0, "m"),),
+    meaning="the vehicle's box lies deeper than the threshold in that of any other of the subset in the same frame, in "
+    "whatever lane; the entries of both break the rule. Depth is the least distance that one of them would have to "
+    "move, along or across the road, to be clear of the other, to 1 mm; touching is not overlapping. Vehicles of "
+    "unknown size are not compared",
+    source=f"{DESIGN}; overlapping vehicles in NGSIM: {COIFMAN}",
+    breaks=lambda limits: pl.col("overlap_m") > limits["overlap_m"],
+    value=pl.col("overlap_m"),
     extreme="max",
-    compared="whole numbers; changes of acceleration of less than 0.05 mm/s² are none",
-    case=Case(
-        {"vehicle_id": (1,) * 5, "frame": (1, 2, 3, 4, 5), "accel_mps2": (0.0, 0.1, 0.1, 0.0, 0.1)},
-        breaks=(4,),  # up, level, down, up
-        frame_rate_hz=10.0,
-    ),
+    compared="rounded to 1 mm",
+    case=Case({"x_m": (10.0, 14.0, 110.0, 113.999)}, breaks=(2, 3)),
 )
 
 LANE_FLICKER = Rule(
@@ -212,14 +194,14 @@ OUTSIDE_LANE = Rule(
     case=Case({"y_m": (0.0, 3.75, 3.751)}, breaks=(2,), lane_markings_m=(0.0, 3.75)),
 )
 
-CONSISTENCY_RULES = (
-    SPEED_MISMATCH,
-    HIGH_JERK,
-    JERK_FLICKER,
+PLACE_RULES = (
+    NEGATIVE_HEADWAY,
+    NEGATIVE_HEADWAY_RECORDED,
+    OVERLAP,
     LANE_FLICKER,
     LEADER_MISMATCH,
     HEADWAY_MISMATCH,
     IMPLAUSIBLE_SIZE,
     OUTSIDE_LANE,
 )
-"""Rules of this module, in the order of the report."""
+"""Rules about the position and size of a vehicle, in the order of the report."""
