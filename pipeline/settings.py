@@ -12,11 +12,11 @@ from tracklake.schemas.protocols import CSP, PROTOCOLS, Protocol
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
 
 PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split")
-"""Settings that take the place of a protocol's own values."""
+"""Names of the settings that replace a protocol's own values."""
 
 
 class Settings(BaseSettings):
-    """What a user may set; every value is part of the fingerprint of what it influences."""
+    """All settings of the pipeline; each is part of the fingerprints of the tables that it influences."""
 
     model_config = SettingsConfigDict(
         env_prefix="TRACKLAKE_", env_nested_delimiter="__", toml_file="tracklake.toml", extra="forbid", frozen=True
@@ -27,19 +27,19 @@ class Settings(BaseSettings):
     runner: Literal["threads", "dask"] = Field(
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"
     )
-    dask_address: str | None = Field(None, description="of a Dask scheduler; none: a cluster on this machine")
+    dask_address: str | None = Field(None, description="address of a Dask scheduler; none: a cluster on this machine")
     thresholds: dict[str, float] = Field(
-        default_factory=dict, description="of rules, by threshold name, such as high_acceleration_mps2"
+        default_factory=dict, description="thresholds of the rules by name, such as high_acceleration_mps2"
     )
     max_backward_share: float = Field(
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"
     )
     on_ramp_lanes: dict[str, list[int]] = Field(
-        default_factory=dict, description="by site: lanes that are on-ramps, where the source does not know"
+        default_factory=dict, description="lanes that are on-ramps by site, where the source does not state them"
     )
     protocol: str = Field(CSP.name, description="name of the protocol")
     min_future_s: float | None = Field(
-        None, gt=0, description="track that a sample needs after it, up to the horizon; none: the protocol's"
+        None, gt=0, description="future track that a sample needs, s, up to the horizon; none: the protocol's"
     )
     drop_error_findings: bool | None = Field(
         None,
@@ -51,11 +51,11 @@ class Settings(BaseSettings):
     )
     validation_part: bool = Field(
         False,
-        description="10 % of a split are a validation part, taken from what trains (70 / 10 / 20 instead of 80 / 20 %)",
+        description="10 % of a split are a validation part, taken from the training part (70 / 10 / 20, not 80 / 20 %)",
     )
-    split: SplitName | None = Field(None, description="the split that tensors are made of; none: the protocol's")
+    split: SplitName | None = Field(None, description="split that tensors are made of; none: the protocol's")
     splits: list[SplitName] = Field(
-        list(SPLIT_NAMES), description="the splits that are made; those that are not trained on stand beside it"
+        list(SPLIT_NAMES), description="splits that are made; tensors are made of one of them"
     )
     tensor_positions: Literal["float32", "int16-decimetres", "int16-centimetres"] = Field(
         "float32", description="how tensors store positions; int16 halves them and rounds along the road"
@@ -75,20 +75,20 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags win over the environment, the environment over the file."""
+        """Order the sources: flags override the environment, which overrides the file."""
         del dotenv_settings, file_secret_settings
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
     @field_validator("protocol")
     @classmethod
-    def _is_known(cls, name: str) -> str:
+    def _check_protocol(cls, name: str) -> str:
         if name not in PROTOCOLS:
             raise ValueError(f"expected one of {', '.join(PROTOCOLS)}")
         return name
 
     @field_validator("min_future_s")
     @classmethod
-    def _ends(cls, seconds: float | None, others: ValidationInfo) -> float | None:
+    def _check_min_future(cls, seconds: float | None, others: ValidationInfo) -> float | None:
         protocol = PROTOCOLS.get(others.data.get("protocol", ""))
         if seconds is not None and protocol is not None and seconds > protocol.horizon_s:
             raise ValueError(f"expected {protocol.horizon_s:g} or less, the horizon of the protocol {protocol.name}")
@@ -96,7 +96,7 @@ class Settings(BaseSettings):
 
     @field_validator("splits")
     @classmethod
-    def _trains(cls, names: list[SplitName], others: ValidationInfo) -> list[SplitName]:
+    def _check_splits(cls, names: list[SplitName], others: ValidationInfo) -> list[SplitName]:
         protocol = PROTOCOLS.get(others.data.get("protocol", ""))
         trains = others.data.get("split") or (protocol.split if protocol is not None else None)
         if trains not in (None, *names):
@@ -105,26 +105,26 @@ class Settings(BaseSettings):
 
     @field_validator("split_purge_s")
     @classmethod
-    def _lasts(cls, purge_s: float, others: ValidationInfo) -> float:
+    def _check_purge(cls, purge_s: float, others: ValidationInfo) -> float:
         protocol = PROTOCOLS.get(others.data.get("protocol", ""))
         if protocol is not None and purge_s < protocol.history_s + protocol.horizon_s:
             raise ValueError(f"expected {protocol.history_s + protocol.horizon_s:g} or more, history and future")
         return purge_s
 
     def get_protocol(self) -> Protocol:
-        """The protocol with the settings that change it."""
+        """Return the protocol with the settings that change it."""
         changes: dict[str, Any] = {name: getattr(self, name) for name in PROTOCOL_SETTINGS}
         return replace(
             PROTOCOLS[self.protocol], **{name: value for name, value in changes.items() if value is not None}
         )
 
     def get_split_recipe(self) -> SplitRecipe:
-        """That of the split that tensors are made of."""
+        """Return the recipe of the split that tensors are made of."""
         trains = self.get_protocol().split
         return next(recipe for recipe in self.get_split_recipes() if recipe.name == trains)
 
     def get_split_recipes(self) -> list[SplitRecipe]:
-        """The splits to make, each with every parameter, in the order of SPLIT_NAMES."""
+        """Return the recipes of all splits to make, in the order of SPLIT_NAMES."""
         protocol = self.get_protocol()
         return [
             SplitRecipe(

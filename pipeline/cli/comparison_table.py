@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.tables import cut_text, print_table
 from tracklake.pipeline.lake import Manifest, connect, load
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
@@ -17,20 +18,23 @@ from tracklake.quality_reports.pages.lake_differences import COUNTED, Side, comp
 from tracklake.schemas.files import write_file
 
 COMPARISON = "compare.html"
-SHOWN_ROWS = 20
-"""Of each table for people; the page and --json have all."""
-SHOWN_CHARACTERS = 40
-"""Of one value in them."""
+MAX_ROWS = 20
+"""Rows printed of each table; the page and --json have all."""
+
+MAX_CELL_CHARS = 40
+"""Longest cell printed in a table, in characters."""
 
 MADE_WITH = (
     "tracklake", "schema_version", "stage_version", "source_version", "thresholds", "max_backward_share",
     "on_ramp_lanes", "protocol", "validation_part", "seed", "model",
 )  # fmt: skip
-"""Of what the lake remembers its tables were built from: settings and versions, not inputs."""
+"""Settings and versions, without inputs, among the facts that the manifest keeps of each build."""
+
 SETTINGS_IN_DIGESTS = ("protocol", "min_future_s", "drop_error_findings", "nearest")
-"""Settings that the tables remember as a digest only; the report names them."""
+"""Settings of which the manifest keeps a digest only; the report names them."""
+
 LIBRARIES = ("python", "versions")
-"""Of the report's provenance."""
+"""Keys of the versions in the report's provenance."""
 
 TABLES_SHOWN = {
     "subsets": ("subset",),
@@ -42,16 +46,16 @@ TABLES_SHOWN = {
     "split_balance": ("part", "dataset"),
     "evaluation": ("model", "part", "seconds"),
 }
-"""What identifies a row for people."""
+"""Columns that identify a row of each compared table."""
 
 
 def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]:
     """Compare a lake with another, write reports/compare.html, and print what changed.
 
     Args:
-        terminal: for the tables.
-        root: the lake now; the page goes into its reports.
-        other: the lake then.
+        terminal: terminal of the command.
+        root: folder of the lake now, in whose reports the page is written.
+        other: folder of the lake then.
 
     Returns:
         What `quality_reports.pages.lake_differences.compare` returns as `comparison`, and the page as
@@ -62,24 +66,24 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
         LakeError: a live file is missing or unreadable.
     """
     compared_at = datetime.now(tz=UTC).isoformat(timespec="seconds")
-    # That one of them has no report says nothing about what is in the lakes.
+    # A missing report is no difference between the lakes' data.
     reported = all((lake / REPORTS / DOCUMENT).exists() for lake in (root, other))
     with (
-        _side(terminal, other, reported=reported) as then,
-        _side(terminal, root, reported=reported, compared=compared_at) as now,
+        _open_side(terminal, other, reported=reported) as then,
+        _open_side(terminal, root, reported=reported, compared=compared_at) as now,
     ):
         compared = compare(then, now)
     page = root / REPORTS / COMPARISON
     page.parent.mkdir(exist_ok=True)
     write_file(page, render_comparison(compared, report=PAGE).encode())
-    terminal.say(f"\nnow:  {root.resolve()}\nthen: {other.resolve()}\n")
+    terminal.print_line(f"\nnow:  {root.resolve()}\nthen: {other.resolve()}\n")
     show_comparison(terminal, compared)
-    terminal.say(f"comparison  {page.resolve()}", style="bold green")
+    terminal.print_line(f"comparison  {page.resolve()}", style="bold green")
     return {"comparison": compared, "comparison_page": page.resolve()}
 
 
 @contextmanager
-def _side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
+def _open_side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
     manifest = load(root)
     validated = manifest.of_stage("validate")
     with connect(root) as connection:
@@ -87,13 +91,13 @@ def _side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> It
             connection=connection,
             facts={"lake": root.resolve().name, "lake_id": manifest.lake_id, **facts},
             rules=list(dict.fromkeys(name for entry in validated for name in entry.built_from["rules"])),
-            made_with=_made_with(manifest) | ({"report": _cited(root)} if reported else {}),
-            scores=collect_scores(root, manifest, lambda told: terminal.complain(told, label="note")),
+            made_with=_list_made_with(manifest) | ({"report": _read_provenance(root)} if reported else {}),
+            scores=collect_scores(root, manifest, lambda message: terminal.print_problem(message, label="note")),
         )
 
 
-def _made_with(manifest: Manifest) -> dict[str, Any]:
-    """Settings and versions by stage, as the tables remember them."""
+def _list_made_with(manifest: Manifest) -> dict[str, Any]:
+    """Collect settings and versions by stage from the manifest."""
     found: dict[str, dict[str, list[Any]]] = {}
     for entry in sorted(manifest.commits.values(), key=lambda entry: entry.key):
         if entry.stage in ("pages", "report"):
@@ -111,8 +115,8 @@ def _made_with(manifest: Manifest) -> dict[str, Any]:
     }
 
 
-def _cited(root: Path) -> dict[str, Any]:
-    """What the report was written with."""
+def _read_provenance(root: Path) -> dict[str, Any]:
+    """Read the settings and versions that the report was written with."""
     provenance = json.loads((root / REPORTS / DOCUMENT).read_text(encoding="utf-8"))["provenance"]
     settings = {name: provenance["settings"].get(name) for name in SETTINGS_IN_DIGESTS}
     return settings | {name: provenance[name] for name in LIBRARIES}
@@ -121,67 +125,57 @@ def _cited(root: Path) -> dict[str, Any]:
 def show_comparison(terminal: Terminal, compared: dict[str, Any]) -> None:
     """Print what differs between two lakes, the first rows of each kind."""
     if compared["equal"]:
-        terminal.say("nothing differs: figures, findings, source files, settings, versions and scores are the same")
+        terminal.print_line(
+            "nothing differs: figures, findings, source files, settings, versions and scores are the same"
+        )
         return
-    shown = _Tables(terminal)
-    shown.show("figures", ("figure",), [row for row in compared["headline"] if row["then"] != row["now"]])
-    shown.show("made with", ("name",), [{**row, "difference": None} for row in compared["made_with"]])
+    _show_changes(terminal, "figures", ("figure",), [row for row in compared["headline"] if row["then"] != row["now"]])
+    _show_changes(terminal, "made with", ("name",), [{**row, "difference": None} for row in compared["made_with"]])
     for name, column in (("subsets", "subset"), ("rules", "rule"), ("files", "file")):
         for side in ("then", "now"):
             rows = compared[name][f"only_{side}"]
             only = [format_value(row[column] if isinstance(row, dict) else row) for row in rows]
             if only:
-                rest = f" and {len(only) - SHOWN_ROWS} more" if len(only) > SHOWN_ROWS else ""
-                terminal.say(f"{name} only {side}: {', '.join(only[:SHOWN_ROWS])}{rest}\n")
+                rest = f" and {len(only) - MAX_ROWS} more" if len(only) > MAX_ROWS else ""
+                terminal.print_line(f"{name} only {side}: {', '.join(only[:MAX_ROWS])}{rest}\n")
     for row in compared["files"]["renamed"]:
         then, now = (format_value(row[side]) for side in ("then", "now"))
-        terminal.say(f"renamed: {then} is {now} now, with the same bytes\n")
-    shown.show_counts("findings per rule, of the subsets of both", ("rule",), compared["rules"]["totals"])
-    shown.show_counts("findings per rule and subset", ("rule", "subset"), compared["rules"]["changed"])
+        terminal.print_line(f"renamed: {then} is {now} now, with the same bytes\n")
+    _show_counts(terminal, "findings per rule, of the subsets of both", ("rule",), compared["rules"]["totals"])
+    _show_counts(terminal, "findings per rule and subset", ("rule", "subset"), compared["rules"]["changed"])
     for name, key in TABLES_SHOWN.items():
-        shown.show(name.replace("_", " "), (*key, "figure"), compared[name]["changed"])
+        _show_changes(terminal, name.replace("_", " "), (*key, "figure"), compared[name]["changed"])
 
 
-class _Tables:
-    """Prints tables of changes."""
-
-    def __init__(self, terminal: Terminal) -> None:
-        self._terminal = terminal
-
-    def show(self, title: str, key: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
-        """Rows of {key, then, now, difference}."""
-        cells = [[*(format_value(row[name]) for name in key), *_pair(row)] for row in rows]
-        self._print(title, key, ("then", "now", "difference"), cells)
-
-    def show_counts(self, title: str, key: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
-        """Rows of {key, findings, vehicles, entries} of which anything differs."""
-        different = [row for row in rows if any(row[name]["then"] != row[name]["now"] for name in COUNTED)]
-        cells = [
-            [*(format_value(row[name]) for name in key), *(cell for name in COUNTED for cell in _pair(row[name]))]
-            for row in different
-        ]
-        self._print(title, key, [heading for name in COUNTED for heading in (f"{name} then", "now", "+-")], cells)
-
-    def _print(self, title: str, key: Sequence[str], numbers: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        if not rows:
-            return
-        cells = [(*key, *numbers), *([_cut(cell) for cell in row] for row in rows[:SHOWN_ROWS])]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        self._terminal.say(title, style="bold")
-        for row in cells:
-            shown = [
-                cell.ljust(width) if number < len(key) else cell.rjust(width)
-                for number, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ]
-            self._terminal.say("  " + "  ".join(shown).rstrip())
-        if len(rows) > SHOWN_ROWS:
-            self._terminal.say(f"  the first {SHOWN_ROWS} of {len(rows):,}; the page and --json have all", style="dim")
-        self._terminal.say("")
+def _show_changes(terminal: Terminal, title: str, key: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Print rows of {key, then, now, difference}."""
+    cells = [[*(format_value(row[name]) for name in key), *_format_change(row)] for row in rows]
+    _show_table(terminal, title, key, ("then", "now", "difference"), cells)
 
 
-def _cut(text: str) -> str:
-    return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 1] + "…"
+def _show_counts(terminal: Terminal, title: str, key: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Print rows of {key, findings, vehicles, entries} in which any count differs."""
+    different = [row for row in rows if any(row[name]["then"] != row[name]["now"] for name in COUNTED)]
+    cells = [
+        [*(format_value(row[name]) for name in key), *(cell for name in COUNTED for cell in _format_change(row[name]))]
+        for row in different
+    ]
+    numbers = [heading for name in COUNTED for heading in (f"{name} then", "now", "+-")]
+    _show_table(terminal, title, key, numbers, cells)
 
 
-def _pair(change: dict[str, Any]) -> tuple[str, str, str]:
+def _show_table(
+    terminal: Terminal, title: str, key: Sequence[str], numbers: Sequence[str], rows: Sequence[Sequence[str]]
+) -> None:
+    if not rows:
+        return
+    cells = [[cut_text(cell, MAX_CELL_CHARS) for cell in row] for row in rows[:MAX_ROWS]]
+    right = [False] * len(key) + [True] * len(numbers)
+    print_table(terminal, [*key, *numbers], cells, title=title, right=right, indent=2)
+    if len(rows) > MAX_ROWS:
+        terminal.print_line(f"  the first {MAX_ROWS} of {len(rows):,}; the page and --json have all", style="dim")
+    terminal.print_line("")
+
+
+def _format_change(change: dict[str, Any]) -> tuple[str, str, str]:
     return format_value(change["then"]), format_value(change["now"]), format_difference(change)

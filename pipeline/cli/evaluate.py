@@ -1,31 +1,42 @@
-"""`tracklake evaluate`: runs and models scored on one part, written as a table, and published figures beside them.
-
-Like the other commands, it imports heavy libraries where they are used.
-"""
+"""`tracklake evaluate`: runs and models scored on one part, written as a table, beside published figures."""
 
 from collections.abc import Iterable
 from enum import StrEnum
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import polars as pl
 import typer
 
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption
-from tracklake.pipeline.cli.session import command, read_settings
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.training.evaluation.evaluate import Evaluation
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
+from tracklake.pipeline.cli.score_tables import show_evaluations
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake.files import MODELS
+from tracklake.pipeline.stages.score import BASELINE, finished_runs
+from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import MissingExtraError, explain_file_errors
+from tracklake.schemas.evaluations import EVALUATIONS
+from tracklake.schemas.files import write_file
+from tracklake.training.evaluation.evaluate import Evaluation
+from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
+from tracklake.training.evaluation.published import published_rows
+from tracklake.training.models.inputs import NEAREST
+from tracklake.training.models.prediction import NotFiniteError
+from tracklake.training.runs.run_folder import StaleRunError
 
 FOLDER = "evaluations"
-"""Of the lake: one file per protocol."""
+"""Folder of the lake with one table of scores per protocol."""
+
 FORMATS = (".csv", ".json", ".parquet")
+"""Endings of the files that --out can name."""
 
 
 class By(StrEnum):
-    """What scores can be shown by, besides over everything."""
+    """Groups by which scores can be shown, besides all samples together."""
 
     MANEUVER = "maneuver"
     FINDINGS = "findings"
@@ -39,45 +50,32 @@ def evaluate(
     part: Annotated[str, typer.Option("--part", help="train, val or eval.")] = "eval",
     protocol: ProtocolOption = None,
     by: Annotated[
-        list[By] | None, typer.Option("--by", help="Also show the errors so; repeatable. `vehicle`: averaged so.")
+        list[By] | None,
+        typer.Option("--by", help="Also show the errors by this; repeatable. `vehicle`: average over vehicles."),
     ] = None,
     published: Annotated[
-        bool, typer.Option("--published/--no-published", help="Put published figures beside, marked as such.")
+        bool, typer.Option("--published/--no-published", help="Show published figures, too, marked as such.")
     ] = True,
     nearest: Annotated[
-        int | None, typer.Option("--nearest", min=0, help="Vehicles around that models of scenes are shown.")
+        int | None, typer.Option("--nearest", min=0, help="Most neighbors that models of scenes are given.")
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Write the table to this .csv, .json or .parquet instead of into the lake."),
     ] = None,
     every_tick: Annotated[
-        bool, typer.Option("--every-tick", help="Score at every tick, not at the protocol's seconds alone.")
+        bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
     ] = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Errors at each horizon of runs and models, with what is behind them, and published figures beside.
+    """Score runs and models at each horizon, beside published figures.
 
-    The whole table goes to LAKE/evaluations/<protocol>.csv; where RUNS are named, or another part, another number of
-    vehicles around, --every-tick or --no-published is asked for, to --out only.
+    The whole table goes to LAKE/evaluations/<protocol>.csv. Where RUNS, another part, --nearest, --every-tick or
+    --no-published are given, it goes to --out only.
     """
     with command(quiet=quiet, json=json) as terminal:
-        import polars as pl
-
-        from tracklake.pipeline.cli.score_tables import show_evaluations
-        from tracklake.pipeline.lake import load
-        from tracklake.pipeline.lake.files import MODELS
-        from tracklake.pipeline.stages.score import BASELINE, finished_runs
-        from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.schemas.columns import PARTS
-        from tracklake.schemas.errors import explain_file_errors
-        from tracklake.schemas.evaluations import EVALUATIONS
-        from tracklake.training.evaluation.published import published_rows
-        from tracklake.training.models.inputs import NEAREST
-
-        if part not in PARTS:
-            raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
+        require_choice("--part", part, PARTS)
         if out is not None and out.suffix not in FORMATS:
             raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
         settings = read_settings(lake=lake, protocol=protocol)
@@ -88,7 +86,7 @@ def evaluate(
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
         if target is not None:
             with explain_file_errors(target.parent):
-                target.parent.mkdir(parents=True, exist_ok=True)  # now: what takes long would be lost afterwards
+                target.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
         names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
@@ -102,16 +100,18 @@ def evaluate(
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])
         if target is not None:
-            _write(target, table)
-            terminal.say(f"table {target}: {table.height:,} rows", style="dim")
+            _write_table(target, table)
+            terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")
         elif not runs:
-            terminal.say("note: the lake keeps the table of the options' defaults; --out writes this one", style="dim")
+            terminal.print_line(
+                "note: the lake keeps the table of the options' defaults; --out writes this one", style="dim"
+            )
         rows = table.to_dicts()
-        terminal.give({"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target})
+        terminal.print_json({"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target})
 
 
 def _evaluate_all(
-    terminal: "Terminal",
+    terminal: Terminal,
     names: Iterable[str],
     tensors: Path,
     models: Path,
@@ -120,32 +120,23 @@ def _evaluate_all(
     *,
     every_tick: bool,
     strict: bool,
-) -> list["Evaluation"]:
-    """Score one after the other; runs that do not fit, or not any more, are passed by, unless asked for by name."""
-    from tracklake.schemas.errors import MissingExtraError
-    from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
-    from tracklake.training.models.prediction import NotFiniteError
-    from tracklake.training.runs.run_folder import StaleRunError
-
+) -> list[Evaluation]:
+    """Score runs and models; a run that does not fit the tensors is skipped, or refused with `strict`."""
     found = []
     for name in names:
         try:
             found.append(
                 evaluate_model(name, tensors, models, part, nearest=nearest, with_latency=True, every_tick=every_tick)
             )
-        except (StaleRunError, NotFiniteError, MissingExtraError) as unfit:
+        except (StaleRunError, NotFiniteError, MissingExtraError) as error:
             if strict:
                 raise
-            terminal.complain(str(unfit), label="passed by")
+            terminal.print_problem(str(error), label="skipped")
     return found
 
 
-def _write(target: Path, table: "pl.DataFrame") -> None:
-    """Write the table whole or not at all, in the form that the file's name says."""
-    from io import BytesIO
-
-    from tracklake.schemas.files import write_file
-
+def _write_table(target: Path, table: pl.DataFrame) -> None:
+    """Write the table in the format of the file's ending."""
     content = BytesIO()
     if target.suffix == ".csv":
         table.write_csv(content)

@@ -1,31 +1,35 @@
-"""`tracklake export ...`: the lake in other projects' formats. Heavy libraries are imported inside the commands."""
+"""`tracklake export ...`: the lake in other projects' formats."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption
-from tracklake.pipeline.cli.session import command, read_settings
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
+from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.export.csp.export import export_csp
+from tracklake.pipeline.export.csp.result import CspExport, CspOptions
+from tracklake.pipeline.export.windows.export import export_windows
+from tracklake.pipeline.export.windows.result import Format
+from tracklake.pipeline.settings import Settings
+from tracklake.schemas.columns import DATASETS
 
-if TYPE_CHECKING:
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.pipeline.export.csp.result import CspExport
-    from tracklake.pipeline.export.windows.result import Format
-    from tracklake.pipeline.settings import Settings
-
-app = typer.Typer(help="Write the lake's data in other projects' formats.", no_args_is_help=True)
+export = typer.Typer(
+    help="Write the lake's data in other projects' formats.", no_args_is_help=True, add_completion=False
+)
 
 
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace such files in DIR.")]
 
 
-@app.callback()
+@export.callback()
 def _export() -> None:
     """Write the lake's data in other projects' formats."""
 
 
-@app.command()
+@export.command()
 def csp(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for TrainSet.mat, ValSet.mat, TestSet.mat.")
@@ -42,19 +46,14 @@ def csp(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """The files that conv-social-pooling's preprocess_data.m writes, value for value unless --clean is given."""
+    """Write the files of conv-social-pooling's preprocess_data.m, value for value unless --clean is given."""
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.export.csp.export import export_csp
-        from tracklake.pipeline.export.csp.result import CspOptions
-        from tracklake.schemas.columns import DATASETS
-
-        if dataset not in (None, *DATASETS):
-            raise typer.BadParameter(f"--dataset is {' or '.join(DATASETS)}; got {dataset!r}")
+        require_choice("--dataset", dataset, DATASETS)
         options = CspOptions(clean=clean, full_future=full_future, dataset=dataset)
-        with terminal.working():
-            export = export_csp(read_settings(lake=lake), out, options, force=force)
-        _show(terminal, export)
-        terminal.give(export.to_dict())
+        with terminal.show_stages():
+            written = export_csp(read_settings(lake=lake), out, options, force=force)
+        _show_csp_export(terminal, written)
+        terminal.print_json(written.to_dict())
 
 
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the files and their README.md.")]
@@ -63,7 +62,7 @@ AbsoluteOption = Annotated[
 ]
 
 
-@app.command()
+@export.command()
 def windows(
     out: OutOption,
     lake: LakeOption = None,
@@ -73,12 +72,12 @@ def windows(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Plain Parquet: a row per sample with its history, future and neighbors; a file per part, and a data card."""
+    """Write Parquet: a row per sample with its history, future and neighbors; a file per part, and a data card."""
     with command(quiet=quiet, json=json) as terminal:
         _write_windows(terminal, read_settings(lake=lake, protocol=protocol), out, "parquet", absolute, force)
 
 
-@app.command()
+@export.command()
 def npz(
     out: OutOption,
     lake: LakeOption = None,
@@ -88,46 +87,40 @@ def npz(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """NumPy arrays of the samples with their histories, futures and neighbors; a file per part, and a data card."""
+    """Write NumPy arrays of samples, their histories, futures and neighbors; a file per part, and a data card."""
     with command(quiet=quiet, json=json) as terminal:
         _write_windows(terminal, read_settings(lake=lake, protocol=protocol), out, "npz", absolute, force)
 
 
 def _write_windows(
-    terminal: "Terminal", settings: "Settings", out: Path, file_format: "Format", absolute: bool, force: bool
+    terminal: Terminal, settings: Settings, out: Path, file_format: Format, absolute: bool, force: bool
 ) -> None:
-    """Write them and say how many there are."""
-    from tracklake.pipeline.export.windows.export import export_windows
-
-    with terminal.working():
-        export = export_windows(settings, out, file_format, absolute=absolute, force=force)
-    for part, samples in export.samples.items():
-        terminal.say(f"{part}.{file_format}: {samples:,} samples, {export.neighbors[part]:,} neighbors")
-    for note in export.notes:
-        terminal.say(f"licence of {note}", style="dim")
-    terminal.say(f"in {export.out}; what they hold: README.md", style="bold green")
-    terminal.give(export.to_dict())
+    """Write the windows and print how many there are."""
+    with terminal.show_stages():
+        written = export_windows(settings, out, file_format, absolute=absolute, force=force)
+    for part, samples in written.samples.items():
+        terminal.print_line(f"{part}.{file_format}: {samples:,} samples, {written.neighbors[part]:,} neighbors")
+    for note in written.notes:
+        terminal.print_line(f"licence of {note}", style="dim")
+    terminal.print_line(f"in {written.out}; what they hold: README.md", style="bold green")
+    terminal.print_json(written.to_dict())
 
 
-def _show(terminal: "Terminal", export: "CspExport") -> None:
+def _show_csp_export(terminal: Terminal, written: CspExport) -> None:
     """Print a line per file, and what was dropped by reason."""
-    from rich.table import Table
-
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for heading in ("file", "samples", "tracks with samples", "tracks", "entries"):
-        table.add_column(heading, justify="left" if heading == "file" else "right")
-    for file in export.files:
-        table.add_row(
-            file.name, *(f"{count:,}" for count in (file.samples, file.sampled_tracks, file.tracks, file.entries))
+    rows = [
+        [file.name, *(f"{count:,}" for count in (file.samples, file.sampled_tracks, file.tracks, file.entries))]
+        for file in written.files
+    ]
+    print_table(terminal, ["file", "samples", "tracks with samples", "tracks", "entries"], rows)
+    counts = [f"{reason} {count:,}" for reason, count in written.count_drops().items()]
+    terminal.print_line(f"entries that are no samples: {', '.join(counts) or 'none'}")
+    if written.options.clean:
+        terminal.print_line(
+            f"neighbors that shared a cell: {written.collisions:,}, of which {written.crowded_out:,} found no free cell"
         )
-    if terminal.talks:
-        terminal.out.print(table)
-    counts = [f"{reason} {count:,}" for reason, count in export.count_drops().items()]
-    terminal.say(f"entries that are no samples: {', '.join(counts) or 'none'}")
-    if export.options.clean:
-        terminal.say(f"neighbors that shared a cell: {export.collisions:,}, of them nowhere {export.crowded_out:,}")
     else:
-        terminal.say(f"neighbors overwritten in their cell: {export.overwritten:,}")
-    for note in export.notes:
-        terminal.say(f"note: {note}", style="dim")
-    terminal.say(f"in {export.out}; what they hold: DATA_CARD.md", style="bold green")
+        terminal.print_line(f"neighbors overwritten in their cell: {written.overwritten:,}")
+    for note in written.notes:
+        terminal.print_line(f"note: {note}", style="dim")
+    terminal.print_line(f"in {written.out}; what they hold: DATA_CARD.md", style="bold green")

@@ -1,38 +1,32 @@
-"""The generated sample of the commands: written, found again, and kept out of lakes of real recordings.
-
-Like the commands, it imports heavy libraries where they are used.
-"""
+"""The generated sample: written, found again, and kept out of lakes of other recordings."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import typer
-
-if TYPE_CHECKING:
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.pipeline.ingest.discovery import Discovery
-    from tracklake.pipeline.synthetic import SampleSummary
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import require_choice
+from tracklake.pipeline.ingest.discovery import Discovery
+from tracklake.pipeline.lake import LakeError, LakeMissingError, load
+from tracklake.pipeline.stages.stage import INGEST
+from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SampleSummary, write_sample
+from tracklake.schemas.errors import explain_file_errors
 
 SAMPLE = "sample"
-"""Its folder's name, beside the lake."""
+"""Name of the generated sample's folder, beside the lake."""
 
 
-def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: "Terminal") -> Path:
-    """The generated sample beside the lake, made where it is not there or asked for otherwise."""
+def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: Terminal) -> Path:
+    """Return the folder of the generated sample, generated first where it is missing or options ask for another."""
     out = lake.parent / SAMPLE
     if minutes is None and seed is None and (out / "truth.parquet").exists():
-        terminal.say(f"the generated sample in {out}", style="dim")
+        terminal.print_line(f"the generated sample in {out}", style="dim")
         return out
     summary = write_generated(out, minutes, seed, terminal)
-    terminal.say(f"generated {summary.rows:,} rows of {summary.recordings} recordings in {out}", style="dim")
+    terminal.print_line(f"generated {summary.rows:,} rows of {summary.recordings} recordings in {out}", style="dim")
     return out
 
 
-def refuse_mixing(lake: Path, discovery: "Discovery") -> None:
-    """Keep simulated recordings out of a lake of real ones, which they might even replace."""
-    from tracklake.pipeline.lake import LakeError, LakeMissingError, load
-    from tracklake.pipeline.stages.stage import INGEST
-
+def refuse_mixing(lake: Path, discovery: Discovery) -> None:
+    """Refuse to add generated recordings to a lake of others, which they might replace."""
     try:
         entries = load(lake).of_stage(INGEST)
     except LakeMissingError:
@@ -48,19 +42,16 @@ def refuse_mixing(lake: Path, discovery: "Discovery") -> None:
 
 
 def write_generated(
-    out: Path, minutes: float | None, seed: int | None, terminal: "Terminal", formats: list[str] | None = None
-) -> "SampleSummary":
+    out: Path, minutes: float | None, seed: int | None, terminal: Terminal, formats: list[str] | None = None
+) -> SampleSummary:
     """Write the generated sample into a folder."""
-    from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, write_sample
-    from tracklake.schemas.errors import explain_file_errors
-
-    if unknown := [name for name in formats or () if name not in ALL_FORMATS]:
-        raise typer.BadParameter(f"--format is one of {', '.join(ALL_FORMATS)}; got {', '.join(unknown)}")
+    for name in formats or ():
+        require_choice("--format", name, ALL_FORMATS)
     with explain_file_errors(out):
         return write_sample(
             out,
             formats=tuple(formats) if formats else DEFAULT_FORMATS,
             minutes=DEFAULT_MINUTES if minutes is None else minutes,
             seed=1 if seed is None else seed,
-            progress=lambda text: terminal.say(text, style="dim"),
+            progress=lambda text: terminal.print_line(text, style="dim"),
         )

@@ -1,35 +1,50 @@
-"""`tracklake lane-forest`: lane changes foretold by a random forest, and the cells in which vehicles will be.
+"""`tracklake lane-forest`: lane changes predicted by a random forest, and the grid cells of vehicles ahead."""
 
-Like the other commands, it imports heavy libraries where they are used.
-"""
-
+import json as json_format
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from tracklake.pipeline.cli.command import REFUSED, command, read_settings
+from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
-from tracklake.pipeline.cli.session import REFUSED, command, read_settings
-from tracklake.schemas.errors import TracklakeError, UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.training.data.tensor_folder import TensorFolder
-    from tracklake.training.lane_changes import LaneForest, LaneForestSettings
-    from tracklake.training.lane_changes.grid import CellScore, GridScores
-    from tracklake.training.lane_changes.learning_curve import LearningPoint
-    from tracklake.training.models import Predictor, Reads
+from tracklake.pipeline.cli.tables import format_number, print_table
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake.files import MODELS as RUNS
+from tracklake.pipeline.stages.score import finished_runs
+from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
+from tracklake.schemas.files import write_file
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
+from tracklake.training.lane_changes import (
+    ForestError,
+    LaneForest,
+    LaneForestSettings,
+    evaluate_grid,
+    fit_lane_forest,
+    learn_curve,
+)
+from tracklake.training.lane_changes.examples import ALL
+from tracklake.training.lane_changes.grid import CellScore, GridScores
+from tracklake.training.lane_changes.learning_curve import SIZES, LearningPoint
+from tracklake.training.models import MODELS, Predictor, Reads
+from tracklake.training.runs.forecasters import open_forecaster
 
 FOLDER = "lane-forest"
-"""Of the lake's models."""
+"""Folder of the forest, among the lake's runs."""
+
 FOREST, SCORES = "forest.skops", "lane_forest.json"
-"""The scores are not called as those of a run: they are of cells, and the report's are of places."""
+"""Names of the files; the scores are of grid cells, so that their file is named otherwise than a run's."""
+
 MODELS_BESIDE = ("constant-velocity", "ctrv")
-"""They need no training."""
+"""Models scored beside the forest; they need no training."""
+
 OPTIONS_OF_THEIR_OWN = ("examples", "augmentation")
-"""Settings of a forest that `--set` does not take."""
+"""Settings of a forest that have options of their own and are no names for `--set`."""
 
 
 def lane_forest(
@@ -39,21 +54,24 @@ def lane_forest(
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Of the draw, the shifts and the trees (default: 0).")
+        int | None, typer.Option("--seed", min=0, help="Seed of the draw, the shifts and the trees (default: 0).")
     ] = None,
     examples: Annotated[
-        int | None, typer.Option("--examples", min=4, help="Drawn from the training part at most (default: 10000).")
+        int | None,
+        typer.Option("--examples", min=4, help="Most examples drawn from the training part (default: 10000)."),
     ] = None,
     augment: Annotated[
         bool | None,
-        typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples (default: do)."),
+        typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples (default: add)."),
     ] = None,
     settings_given: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Of the forest; repeatable (start_s=3, trees=200, leaf=5)."),
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="A setting of the forest; repeatable (start_s=3, trees=200, leaf=5)."
+        ),
     ] = None,
     use: Annotated[
-        bool, typer.Option("--use", help="Score the stored forest, beside the runs there are now; fit none.")
+        bool, typer.Option("--use", help="Score the stored forest beside the lake's runs; fit none.")
     ] = False,
     learning_curve: Annotated[
         bool, typer.Option("--learning-curve", help="Also fit fewer examples, with and without augmentation.")
@@ -61,73 +79,64 @@ def lane_forest(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Fit a forest that foretells lane changes; score it, and the grid cells that models and trained runs predict.
+    """Fit a forest that predicts lane changes; score it, and the grid cells that models predict.
 
     Made for the protocol grid-2021; it works with any.
     """
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.lake import load
-        from tracklake.pipeline.lake.files import MODELS
-        from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.schemas.errors import TracklakeError, explain_file_errors
-        from tracklake.training.data.tensor_folder import TensorFolder
-        from tracklake.training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
-
         if use and (seed, examples, augment, settings_given) != (None,) * 4:
             raise typer.BadParameter("--use scores a forest as it is: give no --seed, --examples, --augment or --set")
-        asked = _read_settings(examples, augment, settings_given or [])
+        forest_settings = _read_forest_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
-        out = settings.lake / MODELS / FOLDER
+        out = settings.lake / RUNS / FOLDER
         if use:
             forest = _open_forest(out / FOREST, folder)
-            asked = LaneForestSettings.read(forest.facts["settings"])
+            forest_settings = LaneForestSettings.read(forest.facts["settings"])
         else:
-            forest = fit_lane_forest(folder, seed or 0, asked)
+            forest = fit_lane_forest(folder, seed or 0, forest_settings)
             with explain_file_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
                 (out / SCORES).unlink(missing_ok=True)  # of another forest
                 forest.save(out / FOREST)
-        passed_by: dict[str, str] = {}
+        skipped: dict[str, str] = {}
 
-        def pass_by(name: str, why: str) -> None:
-            passed_by[name] = why
-            terminal.complain(f"{name}: {why}", label="passed by")
+        def skip(name: str, why: str) -> None:
+            skipped[name] = why
+            terminal.print_problem(f"{name}: {why}", label="skipped")
 
-        predictors, reads = _find_predictors(settings.lake / MODELS, folder, runs or [], pass_by)
-        scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=pass_by)
+        predictors, reads = _find_predictors(settings.lake / RUNS, folder, runs or [], skip)
+        scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=skip)
         record = {
             "forest": forest.facts,
             "features": list(forest.names),
             **scores.to_dict(),
             "learning_curve": [],
-            "passed_by": passed_by,
+            "passed_by": skipped,
         }
-        _write(out / SCORES, record)
-        _show(terminal, folder, scores, forest)
+        _write_scores(out / SCORES, record)
+        _show_scores(terminal, folder, scores, forest)
         no_curve = ""
         if learning_curve:
             try:
-                curve = learn_curve(folder, settings=asked)
+                curve = learn_curve(folder, settings=forest_settings)
             except TracklakeError as impossible:
                 no_curve = str(impossible)
             else:
                 record["learning_curve"] = [point.to_dict() for point in curve]
-                _write(out / SCORES, record)
+                _write_scores(out / SCORES, record)
                 _show_curve(terminal, curve)
-        terminal.say(f"forest {out / FOREST}; coefficients of all features and scores by stratum: {out / SCORES}")
-        terminal.give({"lake": settings.lake, "path": out, **record})
+        terminal.print_line(
+            f"forest {out / FOREST}; coefficients of all features and scores by stratum: {out / SCORES}"
+        )
+        terminal.print_json({"lake": settings.lake, "path": out, **record})
         if no_curve:
-            terminal.complain(f"{no_curve}. Everything else is done", label="no learning curve")
+            terminal.print_problem(f"{no_curve}. Everything else is done", label="no learning curve")
             raise typer.Exit(REFUSED)
 
 
-def _read_settings(examples: int | None, augment: bool | None, pairs: list[str]) -> "LaneForestSettings":
-    """What was said of the forest; the rest is as it is by itself."""
-    from dataclasses import asdict
-
-    from tracklake.training.lane_changes import LaneForestSettings
-
+def _read_forest_settings(examples: int | None, augment: bool | None, pairs: list[str]) -> LaneForestSettings:
+    """Make the forest's settings of the given options and the defaults."""
     known = {name: value for name, value in asdict(LaneForestSettings()).items() if name not in OPTIONS_OF_THEIR_OWN}
     given = read_pairs(pairs, known, "the forest")
     if examples is not None:
@@ -140,10 +149,8 @@ def _read_settings(examples: int | None, augment: bool | None, pairs: list[str])
         raise UsageError(f"--set {wrong}") from None
 
 
-def _open_forest(file: Path, folder: "TensorFolder") -> "LaneForest":
-    """A stored forest, for tensors of the protocol that it was fitted for."""
-    from tracklake.training.lane_changes import ForestError, LaneForest
-
+def _open_forest(file: Path, folder: TensorFolder) -> LaneForest:
+    """Load a stored forest; one that was fitted for another protocol is refused."""
     forest = LaneForest.load(file)
     if forest.facts["protocol"] != folder.index["protocol"]:
         raise ForestError(
@@ -153,26 +160,19 @@ def _open_forest(file: Path, folder: "TensorFolder") -> "LaneForest":
     return forest
 
 
-def _write(file: Path, record: dict[str, Any]) -> None:
-    import json
+def _write_scores(file: Path, record: dict[str, Any]) -> None:
 
-    from tracklake.schemas.files import write_file
-
-    write_file(file, json.dumps(record, indent=1, allow_nan=False).encode())
+    write_file(file, json_format.dumps(record, indent=1, allow_nan=False).encode())
 
 
 def _find_predictors(
-    models: Path, folder: "TensorFolder", runs: list[str], pass_by: "Callable[[str, str], None]"
-) -> tuple[dict[str, "Predictor"], dict[str, "Reads"]]:
-    """Models that need no training, and the lake's runs that were trained on these tensors, with what each reads.
+    models: Path, folder: TensorFolder, runs: list[str], skip: Callable[[str, str], None]
+) -> tuple[dict[str, Predictor], dict[str, Reads]]:
+    """Open models that need no training, and the lake's runs that fit these tensors, with what each reads.
 
-    What cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is passed by, unless it
-    was asked for by name.
+    A run that cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is skipped, unless
+    the user named it.
     """
-    from tracklake.pipeline.stages.score import finished_runs
-    from tracklake.training.models import MODELS
-    from tracklake.training.runs.forecasters import open_forecaster
-
     predictors: dict[str, Predictor] = {name: MODELS[name].build(folder.protocol) for name in MODELS_BESIDE}
     reads = {name: MODELS[name].reads for name in MODELS_BESIDE}
     for name in runs or [file.parent.name for file in finished_runs(models.parent)]:
@@ -183,45 +183,44 @@ def _find_predictors(
         except TracklakeError as refused:
             if runs:
                 raise
-            pass_by(name, str(refused))
+            skip(name, str(refused))
             continue
         predictors[name], reads[name] = own.predictor, own.reads
     return predictors, reads
 
 
-def _show(terminal: "Terminal", folder: "TensorFolder", scores: "GridScores", forest: "LaneForest") -> None:
-    """Print cell accuracies by horizon, those of the last by stratum, and what the forest says of maneuvers."""
+def _show_scores(terminal: Terminal, folder: TensorFolder, scores: GridScores, forest: LaneForest) -> None:
+    """Print cell accuracies by horizon, those of the last horizon by stratum, and the maneuvers' accuracies."""
     protocol = folder.protocol
-    terminal.say(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
+    terminal.print_line(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
     _show_cells(terminal, scores.cells, protocol.name)
     rows = [
-        [own.stratum, f"{own.n:,}", *map(_percent, (own.accuracy, *own.recall.values(), own.majority))]
+        [own.stratum, f"{own.n:,}", *map(_format_percent, (own.accuracy, *own.recall.values(), own.majority))]
         for own in scores.maneuvers
     ]
     recalls = [f"of {name} %" for name in scores.maneuvers[0].recall]
     _show_table(terminal, "maneuver right", ["n", "all %", *recalls, "always the commonest %"], rows)
     _show_left_out(terminal, protocol.horizon_s, forest.facts["settings"]["start_s"], scores)
-    terminal.say(f"features, the strongest first: {', '.join(forest.names)}", style="dim")
+    terminal.print_line(f"features, the strongest first: {', '.join(forest.names)}", style="dim")
 
 
-def _show_left_out(terminal: "Terminal", horizon_s: float, start_s: float, scores: "GridScores") -> None:
-    """How many samples are not scored, and why."""
-    told = {
+def _show_left_out(terminal: Terminal, horizon_s: float, start_s: float, scores: GridScores) -> None:
+    """Print how many samples are not scored, and why."""
+    reasons = {
         "no lane": "no lane now",
         "future unknown": f"not recorded for {horizon_s:g} s",
         "maneuver unknown": f"recorded for {horizon_s:g} s but not for the {start_s:g} s in which a change would begin "
         "(left out of the cells, too, whose strata are by maneuver)",
         "speed unknown": "of unknown speed",
     }
-    why = "; ".join(f"{count:,} {told[reason]}" for reason, count in scores.left_out_by_reason.items() if count)
-    terminal.say(f"{scores.left_out:,} samples are not scored{': ' * bool(why)}{why}", style="dim")
+    why = "; ".join(f"{count:,} {reasons[reason]}" for reason, count in scores.left_out_by_reason.items() if count)
+    terminal.print_line(f"{scores.left_out:,} samples are not scored{': ' * bool(why)}{why}", style="dim")
 
 
-def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
-    from tracklake.training.lane_changes.learning_curve import SIZES
+def _show_curve(terminal: Terminal, curve: list[LearningPoint]) -> None:
 
     points = [
-        [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_percent, figures)]
+        [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_format_percent, figures)]
         for own in curve
         for figures in [(own.accuracy, own.balanced, own.lane)]
     ]
@@ -229,62 +228,52 @@ def _show_curve(terminal: "Terminal", curve: "list[LearningPoint]") -> None:
     _show_table(terminal, "learning curve, examples drawn", headings, points)
     last = max((own.drawn for own in curve), default=0)
     if last < max(SIZES):
-        terminal.say(f"it ends at {last:,} examples, with which the smallest stratum is used up", style="dim")
+        terminal.print_line(f"it ends at {last:,} examples, with which the smallest stratum is used up", style="dim")
 
 
-def _show_cells(terminal: "Terminal", cells: "list[CellScore]", protocol: str) -> None:
-    from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-    from tracklake.training.lane_changes.examples import ALL
+def _show_cells(terminal: Terminal, cells: list[CellScore], protocol: str) -> None:
 
     horizons = sorted({own.seconds for own in cells})
     strata = list(dict.fromkeys(own.stratum for own in cells))
     by_key = {(own.model, own.column, own.seconds, own.stratum): own for own in cells}
     lines = list(dict.fromkeys((own.model, own.column) for own in cells))
     if not lines:
-        terminal.say("no score: the evaluation part has no sample whose maneuver is known to the end")
+        terminal.print_line("no score: the evaluation part has no sample whose maneuver is known to the end")
         return
     first = lines[0]
     rows: list[list[Any]] = [
-        [_name(*line), *(_percent(by_key[*line, ahead, ALL].cell) for ahead in horizons)] for line in lines
+        [_name_line(*line), *(_format_percent(by_key[*line, ahead, ALL].cell) for ahead in horizons)] for line in lines
     ]
     for title, figure in (("always the commonest cell", "majority"), ("true place outside of the nine", "outside")):
-        rows.append([title, *(_percent(getattr(by_key[*first, ahead, ALL], figure)) for ahead in horizons)])
+        rows.append([title, *(_format_percent(getattr(by_key[*first, ahead, ALL], figure)) for ahead in horizons)])
     rows.append(["n", *(f"{by_key[*first, ahead, ALL].n:,}" for ahead in horizons)])
     if protocol == "grid-2021":
         for model, shares in CELL_ACCURACY.items():
             known = dict(zip(CELL_ACCURACY_S, shares, strict=True))
-            rows.append([f"{model}, published", *(_percent(known.get(ahead)) for ahead in horizons)])
+            rows.append([f"{model}, published", *(_format_percent(known.get(ahead)) for ahead in horizons)])
     _show_table(terminal, "right cell, %", [f"{ahead:g} s" for ahead in horizons], rows)
     last = horizons[-1]
-    rows = [[_name(*line), *(_percent(by_key[*line, last, name].cell) for name in strata)] for line in lines]
+    rows = [
+        [_name_line(*line), *(_format_percent(by_key[*line, last, name].cell) for name in strata)] for line in lines
+    ]
     rows.append(["n", *(f"{by_key[*first, last, name].n:,}" for name in strata)])
     _show_table(terminal, f"right cell at {last:g} s, %", strata, rows)
     rows = [
-        [_name(*line), _percent(own.row), _percent(own.lane), _percent(own.cell_clipped)]
+        [_name_line(*line), _format_percent(own.row), _format_percent(own.lane), _format_percent(own.cell_clipped)]
         for line in lines
         for own in [by_key[*line, last, ALL]]
     ]
     _show_table(terminal, f"at {last:g} s, %", ["right row", "right column", "cell, outer ones endless"], rows)
 
 
-def _name(model: str, column: str) -> str:
+def _name_line(model: str, column: str) -> str:
     return model if column == "place" else f"{model} + {column}"
 
 
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.2f}"
+def _format_percent(share: float | None) -> str:
+    return format_number(share, scale=100)
 
 
-def _show_table(terminal: "Terminal", title: str, headings: list[str], rows: "Iterable[list[Any]]") -> None:
-    """The first column is of names, the others of figures."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", box=None, header_style="bold", padding=(0, 2, 0, 0))
-    table.add_column("")
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*(escape(str(value)) for value in row))
-    if terminal.talks:
-        terminal.out.print(table)
+def _show_table(terminal: Terminal, title: str, headings: list[str], rows: list[list[Any]]) -> None:
+    """Print names in the first column and figures in the others."""
+    print_table(terminal, ["", *headings], [list(map(str, row)) for row in rows], title=title)

@@ -14,19 +14,39 @@ WorkersOption = Annotated[
     int | None, typer.Option("--workers", min=1, help="Recordings worked on at once (or TRACKLAKE_WORKERS).")
 ]
 ProtocolOption = Annotated[
-    str | None, typer.Option("--protocol", help="Whose samples, split and tensors (docs/protocols.md) [default: csp].")
+    str | None,
+    typer.Option("--protocol", help="Protocol of samples, split and tensors (docs/protocols.md) [default: csp]."),
 ]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
+DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim or highd.")]
+ReplaceOption = Annotated[
+    bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
+]
+PruneOption = Annotated[
+    bool, typer.Option("--prune", help="Remove recordings whose files were in SOURCE, a folder, and are missing now.")
+]
+RebuildOption = Annotated[
+    bool,
+    typer.Option("--rebuild", help="Recreate the lake in its place, also one of another schema version; redo all."),
+]
+MinutesOption = Annotated[float | None, typer.Option("--minutes", help="Length of the generated recordings.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of the generated sample: same seed, same bytes.")]
+
+
+def require_choice(option: str, value: str | None, choices: tuple[str, ...]) -> None:
+    """Refuse a value that is given and is none of an option's choices."""
+    if value is not None and value not in choices:
+        raise typer.BadParameter(f"{option} is one of {', '.join(choices)}; got {value!r}")
 
 
 def read_pairs(pairs: list[str], known: Mapping[str, Any], owner: str) -> dict[str, Any]:
-    """NAME=VALUE pairs of `--set`, each value of the kind that its default is of.
+    """Read NAME=VALUE pairs of `--set`, each value in the type of its default.
 
     Args:
-        pairs: as given.
-        known: what can be set, with its defaults; None: of any kind.
-        owner: whose settings these are.
+        pairs: arguments as given.
+        known: settings with their defaults; a default of None allows every type.
+        owner: model or method that has these settings, for messages.
     """
     read: dict[str, Any] = {}
     for pair in pairs:

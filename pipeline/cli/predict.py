@@ -1,32 +1,42 @@
-"""`tracklake predict`: samples drawn with what came and what models say, on the road with its lanes.
-
-Like the other commands, it imports heavy libraries where they are used.
-"""
+"""`tracklake predict`: samples drawn on the road with their truth and the models' predictions."""
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption
-from tracklake.pipeline.cli.session import command, read_settings
-
-if TYPE_CHECKING:
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.training.data.tensor_folder import TensorFolder
-    from tracklake.training.plots.picture import Picture
-    from tracklake.training.runs.forecasters import Forecaster
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake.files import MODELS
+from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import MissingExtraError, explain_file_errors
+from tracklake.schemas.files import write_file
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.plots.attention_drawing import export_attention
+from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
+from tracklake.training.plots.picture import Picture, take_picture
+from tracklake.training.plots.picture_drawing import draw_picture
+from tracklake.training.plots.picture_rows import list_errors
+from tracklake.training.plots.sample_choice import MOST_SEARCHED, find_sample, pick_samples
+from tracklake.training.runs.forecasters import Forecaster, open_forecaster
+from tracklake.training.runs.run_folder import StaleRunError
 
 FOLDER = "predictions"
-"""Of the lake."""
+"""Folder of the lake with the drawings."""
+
 SUFFIXES = (".svg", ".png")
 MOST_MODELS = 4
+"""Most models in one drawing."""
+
 BASELINE = "constant-velocity"
 
 
 class Pick(StrEnum):
-    """Kinds of samples."""
+    """Kinds of samples that can be picked."""
 
     LANE_CHANGE = "lane-change"
     LANE_KEEP = "lane-keep"
@@ -60,13 +70,14 @@ def predict(
         ),
     ] = None,
     part: Annotated[str, typer.Option("--part", help="With --pick: train, val or eval.")] = "eval",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: of the draw.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: seed of the draw.")] = 0,
     count: Annotated[int, typer.Option("--count", min=1, max=100, help="With --pick: how many samples.")] = 1,
     all_vehicles: Annotated[
-        bool, typer.Option("--all-vehicles", help="Predict every sample of the moment; a model of scenes: everyone.")
+        bool,
+        typer.Option("--all-vehicles", help="Predict every sample of the scene; a model of scenes: every vehicle."),
     ] = False,
     attention: Annotated[
-        bool, typer.Option("--attention", help="Also draw what a model with attention looks at, per head.")
+        bool, typer.Option("--attention", help="Also draw the attention weights of a model, per head.")
     ] = False,
     out: Annotated[
         Path | None,
@@ -75,44 +86,40 @@ def predict(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Draw samples: history, neighbors, truth, predictions and their uncertainty, on the road with its lanes."""
+    """Draw samples on the road: history, neighbors, truth, predictions and their uncertainty."""
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.lake import load
-        from tracklake.pipeline.lake.files import MODELS
-        from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.schemas.errors import explain_file_errors
-        from tracklake.schemas.files import write_file
-        from tracklake.training.data.tensor_folder import TensorFolder
-        from tracklake.training.plots.picture_drawing import draw_picture
-
-        _check(models or [], sample, vehicle, time, pick, part, count, out)
+        _check_options(models or [], sample, vehicle, time, pick, part, count, out)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         folder = TensorFolder.open(tensor_folder(root, load(root), settings))
-        samples = _find(folder, sample, vehicle, time)
-        parts = _parts_of(folder, samples) if samples else frozenset({part})
-        asked = _open_all(terminal, models or [], folder, root / MODELS, parts, alone=all_vehicles)
+        samples = _find_samples(folder, sample, vehicle, time)
+        parts = _list_parts(folder, samples) if samples else frozenset({part})
+        forecasters = _open_forecasters(terminal, models or [], folder, root / MODELS, parts, alone=all_vehicles)
         if attention:
-            _refuse_inattentive(asked)
+            _require_attention(forecasters)
         if not samples:
-            judge = asked[-1] if models else next((own for own in asked if own.name != BASELINE), asked[0])
-            samples = _pick(terminal, folder, pick or Pick.RANDOM, part, count, seed, judge)
+            judge = (
+                forecasters[-1]
+                if models
+                else next((own for own in forecasters if own.name != BASELINE), forecasters[0])
+            )
+            samples = _pick_samples(terminal, folder, pick or Pick.RANDOM, part, count, seed, judge)
         drawn: list[dict[str, Any]] = []
         for number in samples:
-            picture = _ask(folder, number, asked, all_vehicles=all_vehicles)
+            picture = _predict_sample(folder, number, forecasters, all_vehicles=all_vehicles)
             file = _name_file(out, root / FOLDER, picture, all_vehicles=all_vehicles)
             with explain_file_errors(file.parent):
                 file.parent.mkdir(parents=True, exist_ok=True)
             write_file(file, draw_picture(picture).render(file.suffix))
-            _tell(terminal, picture, file)
+            _show_errors(terminal, picture, file)
             drawn.append({"file": file, **picture.to_dict()})
-        maps = _draw_attention(folder, asked, samples, file.parent) if attention else []
+        maps = _draw_attention(folder, forecasters, samples, file.parent) if attention else []
         for map_file in maps:
-            terminal.say(f"  {map_file}", style="bold green")
-        terminal.give({"pictures": drawn, "attention": maps})
+            terminal.print_line(f"  {map_file}", style="bold green")
+        terminal.print_json({"pictures": drawn, "attention": maps})
 
 
-def _check(
+def _check_options(
     models: list[str],
     sample: int | None,
     vehicle: str | None,
@@ -123,10 +130,7 @@ def _check(
     out: Path | None,
 ) -> None:
     """Refuse options that contradict each other, before anything is opened."""
-    from tracklake.schemas.columns import PARTS
-
-    if part not in PARTS:
-        raise typer.BadParameter(f"--part is one of {', '.join(PARTS)}; got {part!r}")
+    require_choice("--part", part, PARTS)
     if len(dict.fromkeys(models)) > MOST_MODELS:
         raise typer.BadParameter(f"a drawing holds {MOST_MODELS} models at most; got {', '.join(models)}")
     given = [
@@ -146,10 +150,8 @@ def _check(
         raise typer.BadParameter(f"--out is a folder where --count is more than 1; got {out}")
 
 
-def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
-    """The sample that was named, if one was."""
-    from tracklake.training.plots.sample_choice import find_sample
-
+def _find_samples(folder: TensorFolder, sample: int | None, vehicle: str | None, time: float | None) -> list[int]:
+    """Return the sample that was named, if one was."""
     if sample is not None:
         last = len(folder.sample_row) - 1
         if not 0 <= sample <= last:
@@ -160,85 +162,75 @@ def _find(folder: "TensorFolder", sample: int | None, vehicle: str | None, time:
     return []
 
 
-def _parts_of(folder: "TensorFolder", samples: list[int]) -> frozenset[str]:
-    from tracklake.schemas.columns import PARTS
+def _list_parts(folder: TensorFolder, samples: list[int]) -> frozenset[str]:
 
     return frozenset(PARTS[folder.sample_part[number]] for number in samples)
 
 
-def _open_all(
-    terminal: "Terminal", names: list[str], folder: "TensorFolder", models: Path, parts: frozenset[str], *, alone: bool
-) -> list["Forecaster"]:
-    """The models named, or the newest runs that fit the tensors; constant velocity first, where there is room.
+def _open_forecasters(
+    terminal: Terminal, names: list[str], folder: TensorFolder, models: Path, parts: frozenset[str], *, alone: bool
+) -> list[Forecaster]:
+    """Open the models named, or the newest runs that fit the tensors; constant velocity first, where there is room.
 
     Args:
-        terminal: told what is passed by.
-        names: those named.
-        folder: the tensors.
-        models: the folder of the runs.
-        parts: that they are asked about.
-        alone: no constant velocity beside others.
+        terminal: terminal of the command, for the runs that are skipped.
+        names: runs and models named by the user.
+        folder: tensors to predict.
+        models: folder of the runs.
+        parts: parts of the split that are predicted.
+        alone: whether constant velocity is left out beside others.
     """
-    from tracklake.schemas.errors import MissingExtraError
-    from tracklake.training.runs.forecasters import open_forecaster
-    from tracklake.training.runs.run_folder import StaleRunError
-
     found = [open_forecaster(name, folder, models, parts) for name in dict.fromkeys(names)]
     if not names:
         finished = sorted(models.glob("[!.]*/metrics.json"), key=lambda file: file.stat().st_mtime, reverse=True)
         runs = [file.parent.name for file in finished if file.parent.name != BASELINE]
         for name in runs:
             if len(found) == (1 if alone else MOST_MODELS - 1):
-                terminal.say(
+                terminal.print_line(
                     f"note: {len(runs)} runs in the lake, of which the newest are drawn; name others", style="dim"
                 )
                 break
             try:
                 found.append(open_forecaster(name, folder, models, parts))
-            except (StaleRunError, MissingExtraError) as unfit:
-                terminal.complain(str(unfit), label="passed by")
+            except (StaleRunError, MissingExtraError) as error:
+                terminal.print_problem(str(error), label="skipped")
     named = {own.name for own in found}
     if BASELINE not in named and len(found) < MOST_MODELS and not (alone and found):
         found.insert(0, open_forecaster(BASELINE, folder, models, parts))
     return found
 
 
-def _pick(
-    terminal: "Terminal",
-    folder: "TensorFolder",
+def _pick_samples(
+    terminal: Terminal,
+    folder: TensorFolder,
     pick: Pick,
     part: str,
     count: int,
     seed: int,
-    judge: "Forecaster",
+    judge: Forecaster,
 ) -> list[int]:
-    """Samples of a kind."""
-    from tracklake.training.plots.sample_choice import MOST_SEARCHED, pick_samples
-
+    """Pick samples of a kind."""
     found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
         many = len(folder.samples_of(part))
         among = f"{MOST_SEARCHED:,} drawn of {many:,}" if many > MOST_SEARCHED else f"{many:,}"
-        terminal.say(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
+        terminal.print_line(f"the worst of {judge.name} among {among} samples of {part}", style="dim")
     if len(found) < count:
-        terminal.say(f"note: there are only {len(found)} such samples", style="dim")
+        terminal.print_line(f"note: there are only {len(found)} such samples", style="dim")
     return [int(number) for number in found]
 
 
-def _ask(folder: "TensorFolder", sample: int, asked: list["Forecaster"], *, all_vehicles: bool) -> "Picture":
-    """Let models predict, then look up what came."""
-    from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
-    from tracklake.training.plots.picture import take_picture
-
+def _predict_sample(folder: TensorFolder, sample: int, forecasters: list[Forecaster], *, all_vehicles: bool) -> Picture:
+    """Predict with the models, then add the truth."""
     if all_vehicles:
-        return take_picture(folder, sample, forecast_scene(folder, sample, asked))
+        return take_picture(folder, sample, forecast_scene(folder, sample, forecasters))
     run = folder.runs_of(folder.sample_row[[sample]])
     own = int(folder.run_vehicle_id[run[0]])
-    return take_picture(folder, sample, {own: forecast_samples(folder, [sample], asked)[sample]})
+    return take_picture(folder, sample, {own: forecast_samples(folder, [sample], forecasters)[sample]})
 
 
-def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_vehicles: bool) -> Path:
-    """Where a drawing goes: to the file named, or into a folder under a name that says what it shows."""
+def _name_file(out: Path | None, predictions: Path, picture: Picture, *, all_vehicles: bool) -> Path:
+    """Return the path of a drawing: the file named, or in a folder a name that says what it shows."""
     if out is not None and out.suffix.lower() in SUFFIXES and not out.is_dir():
         return out
     whose = f"{picture.own.vehicle_id}{'-and-all' if all_vehicles else ''}"
@@ -246,33 +238,33 @@ def _name_file(out: Path | None, predictions: Path, picture: "Picture", *, all_v
     return (predictions if out is None else out) / f"{name}.svg"
 
 
-def _tell(terminal: "Terminal", picture: "Picture", file: Path) -> None:
-    """Where the drawing is, and how far each model is from the truth at its end."""
-    from tracklake.training.plots.picture_rows import list_errors
-
+def _show_errors(terminal: Terminal, picture: Picture, file: Path) -> None:
+    """Print where the drawing is, and how far each model is from the truth at its end."""
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
     off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
     seconds = max((row["seconds"] for row in last.values()), default=0.0)
-    terminal.say(f"vehicle {picture.own.vehicle_id} of {picture.subset} at {picture.time_s:.1f} s ({picture.part})")
-    terminal.say(f"  off after {seconds:g} s: {off}", style="dim")
-    terminal.say(f"  {file}", style="bold green")
+    terminal.print_line(
+        f"vehicle {picture.own.vehicle_id} of {picture.subset} at {picture.time_s:.1f} s ({picture.part})"
+    )
+    terminal.print_line(f"  off after {seconds:g} s: {off}", style="dim")
+    terminal.print_line(f"  {file}", style="bold green")
 
 
-def _refuse_inattentive(asked: list["Forecaster"]) -> None:
-    """Refuse to draw what nobody looks at, before anything is drawn."""
-    if all(own.reads != "scene" for own in asked):
+def _require_attention(forecasters: list[Forecaster]) -> None:
+    """Refuse --attention where no model has any, before anything is drawn."""
+    if all(own.reads != "scene" for own in forecasters):
         raise typer.BadParameter(
             "--attention needs a run of a model with attention, for instance attention-h4; got "
-            f"{', '.join(own.name for own in asked)}"
+            f"{', '.join(own.name for own in forecasters)}"
         )
 
 
-def _draw_attention(folder: "TensorFolder", asked: list["Forecaster"], samples: list[int], target: Path) -> list[Path]:
-    """Attention maps of every model that has any, in a folder of its name."""
-    from tracklake.training.plots.attention_drawing import export_attention
-
+def _draw_attention(
+    folder: TensorFolder, forecasters: list[Forecaster], samples: list[int], target: Path
+) -> list[Path]:
+    """Write the attention maps of every model with attention, in a folder of its name."""
     found = []
-    for own in asked:
+    for own in forecasters:
         if own.reads == "scene":
             network: Any = own.predictor  # a network with attention
             found += export_attention(folder, network, samples, target / own.name)

@@ -1,30 +1,42 @@
-"""`tracklake split`: the stage, or with --plan the allocation that highD's metadata alone allow to plan.
-
-Like the other commands, it imports heavy libraries where they are used.
-"""
+"""`tracklake split`: the stage, or with --plan the split that highD's metadata alone allow to plan."""
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import polars as pl
 import typer
 
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
-from tracklake.pipeline.cli.session import REFUSED, carry_out, command, conclude, read_settings
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from tracklake.pipeline.cli.console import Terminal
-    from tracklake.pipeline.settings import Settings
-    from tracklake.pipeline.transforms.splits.tables import Allocation
+from tracklake.pipeline.cli.command import REFUSED, command, read_settings
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import (
+    JsonOption,
+    LakeOption,
+    ProtocolOption,
+    QuietOption,
+    WorkersOption,
+    require_choice,
+)
+from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.ingest.discovery import recognise
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources import SourceError
+from tracklake.pipeline.sources.highd_plan import announce_subsets
+from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
+from tracklake.pipeline.transforms.splits.tables import Allocation
+from tracklake.schemas.errors import explain_file_errors
 
 FORMATS = ("table", "csv", "json")
+
 ESTIMATED = (
     "weights are numFrames of tracksMeta, all entries of a vehicle: which of them are samples is known only to a lake, "
     "and so is which subsets validation excludes (--exclude leaves some out)"
 )
+"""Note beside a planned split: what its weights are."""
+
 SHOWN = ("dataset", "subset", "site", "direction", "vehicles", "weight", "flow", "part")
+"""Columns of a planned split."""
 
 
 def split(
@@ -47,39 +59,31 @@ def split(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Divide the subsets into train and eval, or plan from metadata how they would be divided."""
+    """Divide the subsets into train and eval."""
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers, protocol=protocol)
         if plan is None:
             if exclude or out is not None or format != "table":
                 raise typer.BadParameter("--exclude, --format and --out go with --plan FOLDER")
-            conclude(terminal, settings, carry_out(terminal, settings, ("split",)), headline=False)
+            report_result(terminal, settings, run_steps(terminal, settings, ("split",)), headline=False)
             return
-        if format not in FORMATS:
-            raise typer.BadParameter(f"--format is one of {', '.join(FORMATS)}; got {format!r}")
+        require_choice("--format", format, FORMATS)
         if out is not None and format == "table":
             raise typer.BadParameter("--format table goes to the terminal only: with --out, choose csv or json")
-        _plan(terminal, settings, plan, exclude or [], format, out)
+        _plan_split(terminal, settings, plan, exclude or [], format, out)
 
 
-def _plan(
-    terminal: "Terminal", settings: "Settings", folder: Path, exclude: list[str], form: str, out: Path | None
+def _plan_split(
+    terminal: Terminal, settings: Settings, folder: Path, exclude: list[str], form: str, out: Path | None
 ) -> None:
-    """Print the allocation, and what it rests on; nothing is written into a lake."""
-    import polars as pl
-
-    from tracklake.pipeline.ingest.discovery import recognise
-    from tracklake.pipeline.sources import SourceError
-    from tracklake.pipeline.sources.highd_plan import announce_subsets
-    from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
-
+    """Print how the recordings of a folder would be split; nothing is written into a lake."""
     try:
         announced = announce_subsets(recognise(folder, "highd"))
-    except SourceError as nothing:
-        named = str(nothing).startswith(f"{folder}:")
-        raise SourceError(str(nothing) if named else f"{folder}: {nothing}") from None
+    except SourceError as error:
+        named = str(error).startswith(f"{folder}:")
+        raise SourceError(str(error) if named else f"{folder}: {error}") from None
     for message in announced.refusals:
-        terminal.complain(message, label="refused")
+        terminal.print_problem(message, label="refused")
     unknown = sorted(set(exclude) - set(announced.subsets["subset"]))
     if unknown:
         known = announced.subsets["subset"].to_list()
@@ -95,51 +99,42 @@ def _plan(
     )
     parts = subsets.join(allocation.splits.select("dataset", "subset", "part"), on=["dataset", "subset"])
     parts = parts.select(SHOWN).sort("dataset", "subset")
-    _show(terminal, parts, allocation, form, out)
+    _show_plan(terminal, parts, allocation, form, out)
     record: dict[str, Any] = {
         "splits": parts.to_dicts(),
         "balance": allocation.balance.to_dicts(),
         "notes": [ESTIMATED],
         "refused": list(announced.refusals),
     }
-    terminal.give(record)
+    terminal.print_json(record)
     if announced.refusals:
         raise typer.Exit(REFUSED)
 
 
-def _show(terminal: "Terminal", parts: "pl.DataFrame", allocation: "Allocation", form: str, out: Path | None) -> None:
-    """The table in the form that was asked for; beneath it, for people, how the parts compare."""
+def _show_plan(terminal: Terminal, parts: pl.DataFrame, allocation: Allocation, form: str, out: Path | None) -> None:
+    """Print or write the table, and print how the parts compare."""
     if form != "table" and not (terminal.as_json and out is None):
         text = parts.write_csv() if form == "csv" else parts.write_json() + "\n"
         if out is None:
             sys.stdout.write(text)
             return
-        from tracklake.schemas.errors import explain_file_errors
 
         with explain_file_errors(out):
             out.write_text(text, encoding="utf-8")
-        terminal.say(f"{parts.height:,} subsets in {out}")
-    elif terminal.talks:
-        _print_rows(terminal, parts)
+        terminal.print_line(f"{parts.height:,} subsets in {out}")
+    else:
+        rows = [
+            [f"{value:.4f}" if isinstance(value, float) else str(value) for value in row] for row in parts.iter_rows()
+        ]
+        print_table(terminal, parts.columns, rows, right=[dtype.is_numeric() for dtype in parts.dtypes])
     for row in allocation.balance.reverse().iter_rows(named=True):
         if row["flow_mean"] is None:
-            terminal.say(f"{row['part']}: nothing")
+            terminal.print_line(f"{row['part']}: nothing")
             continue
-        terminal.say(
+        terminal.print_line(
             f"{row['part']}: {row['subsets']} subsets, {row['vehicle_share']:.2%} of the vehicles, flow "
             f"{row['flow_mean']:.5f} +- {row['flow_std']:.5f} veh/lane/s"
         )
     for reason in allocation.relaxations.values():
-        terminal.say(f"note: relaxed: {reason}", style="dim")
-    terminal.say(f"note: {ESTIMATED}", style="dim")
-
-
-def _print_rows(terminal: "Terminal", parts: "pl.DataFrame") -> None:
-    from rich.table import Table
-
-    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for name, dtype in parts.schema.items():
-        table.add_column(name, justify="right" if dtype.is_numeric() else "left")
-    for row in parts.iter_rows():
-        table.add_row(*(f"{value:.4f}" if isinstance(value, float) else str(value) for value in row))
-    terminal.out.print(table)
+        terminal.print_line(f"note: relaxed: {reason}", style="dim")
+    terminal.print_line(f"note: {ESTIMATED}", style="dim")

@@ -1,20 +1,31 @@
-"""`tracklake train`: a model trained on the lake's split, and gone on with where it was interrupted.
-
-Like the other commands, it imports heavy libraries where they are used.
-"""
+"""`tracklake train`: a model trained on the lake's split, or a training resumed where it was interrupted."""
 
 import re
 import shlex
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
-from tracklake.pipeline.cli.session import command, failure, read_settings
-
-if TYPE_CHECKING:
-    from tracklake.training.models import Model
-    from tracklake.training.runs.config import TrainConfig
+from tracklake.pipeline.cli.command import command, read_settings, report_failure
+from tracklake.pipeline.cli.console import Terminal, find_command
+from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST
+from tracklake.pipeline.cli.options import (
+    JsonOption,
+    LakeOption,
+    ProtocolOption,
+    QuietOption,
+    read_pairs,
+    require_choice,
+)
+from tracklake.pipeline.cli.tables import format_number, print_table
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake.files import MODELS as RUNS
+from tracklake.pipeline.stages.tensors import tensor_folder
+from tracklake.schemas.errors import explain_file_errors
+from tracklake.training.models import MODELS, Model
+from tracklake.training.runs.config import RECIPE_SETTINGS, TrainConfig
+from tracklake.training.train import TrainingInterruptedError
+from tracklake.training.train import train as train_model
 
 
 def train(
@@ -24,12 +35,15 @@ def train(
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0.1, help="How long to train; default: the model's own epochs.")
     ] = None,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="Of all its phases together.")] = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="Epochs of all its phases together.")] = None,
     steps: Annotated[
-        int | None, typer.Option("--steps", min=1, help="Of the optimiser, of all phases together.")
+        int | None, typer.Option("--steps", min=1, help="Steps of the optimiser, of all phases together.")
     ] = None,
     samples_per_epoch: Annotated[
-        int | None, typer.Option("--samples-per-epoch", min=1, help="At most, drawn anew each epoch (default: 200000).")
+        int | None,
+        typer.Option(
+            "--samples-per-epoch", min=1, help="Most samples of an epoch, drawn again each epoch (default: 200000)."
+        ),
     ] = None,
     patience: Annotated[
         int | None,
@@ -38,34 +52,29 @@ def train(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Of weights, batches and dropout (default: 0).")
+        int | None, typer.Option("--seed", min=0, help="Seed of weights, batches and dropout (default: 0).")
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Of the model or its recipe; repeatable (batch_size=64)."),
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="A setting of the model or its recipe; repeatable (batch_size=64)."
+        ),
     ] = None,
     resume: Annotated[
         bool | None,
-        typer.Option("--resume/--anew", help="Go on with an interrupted training, as it was begun; or lose it."),
+        typer.Option("--resume/--anew", help="Continue an interrupted training with its own settings; or discard it."),
     ] = None,
     device: Annotated[str | None, typer.Option("--device", help="cpu or cuda (default: cpu).")] = None,
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Of torch (default: 1).")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of torch (default: 1).")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the run; default: the model's.")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
     """Train a model on the split's training part and evaluate it once on the evaluation part."""
     with command(quiet=quiet, json=json) as terminal:
-        from tracklake.pipeline.cli.console import command_here, show_scores
-        from tracklake.pipeline.lake import load
-        from tracklake.pipeline.lake.files import MODELS
-        from tracklake.pipeline.stages.tensors import tensor_folder
-        from tracklake.training.models import MODELS as MODELS_KNOWN
-
-        if model not in MODELS_KNOWN:
-            raise typer.BadParameter(f"MODEL is one of {', '.join(MODELS_KNOWN)}; got {model!r}")
+        require_choice("MODEL", model, tuple(MODELS))
         run_name = _check_name(model if name is None else name)
-        entry = MODELS_KNOWN[model]
+        entry = MODELS[model]
         if not entry.learns:
             raise typer.BadParameter(f"{model} does not learn; `tracklake evaluate {model}` scores it")
         given = {
@@ -82,35 +91,34 @@ def train(
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
-        out = found.lake / MODELS / run_name
-        from tracklake.training.train import TrainingInterruptedError
-        from tracklake.training.train import train as train_model
+        out = found.lake / RUNS / run_name
 
         try:
-            with terminal.measuring(f"train {model}") as tell:
-                metrics = train_model(model, tensors, out, config, tell, resume=resume)
+            with explain_file_errors(out), terminal.show_training(f"train {model}") as show:
+                metrics = train_model(model, tensors, out, config, show, resume=resume)
         except TrainingInterruptedError as stopped:
-            again = [command_here(), "train", model, "--resume", *(["--name", name] if name is not None else [])]
+            again = [find_command(), "train", model, "--resume", *(["--name", name] if name is not None else [])]
             again += ["--lake", str(lake)] if lake is not None else []
             again += ["--protocol", protocol] if protocol is not None else []
-            raise failure(terminal, f"{stopped}\nTo go on: {shlex.join(again)}") from None
+            raise report_failure(terminal, f"{stopped}\nTo go on: {shlex.join(again)}") from None
         if metrics["evaluation"] is not None:
-            show_scores(terminal, [metrics["evaluation"]])
+            _show_scores(terminal, metrics["evaluation"])
         else:
-            terminal.say("note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim")
-        terminal.say(
+            terminal.print_line(
+                "note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim"
+            )
+        terminal.print_line(
             f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
             f"reading them took {metrics['data_share']:.1%} of it"
         )
-        terminal.say(f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report")
-        terminal.give(metrics)
+        terminal.print_line(
+            f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report"
+        )
+        terminal.print_json(metrics)
 
 
 def _check_name(name: str) -> str:
-    """A run's name, which is a folder's."""
-    from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST
-    from tracklake.training.models import MODELS
-
+    """Refuse a name that is no run's: a path, the forest's folder, or a model that does not learn."""
     if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
         raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {name!r}")
     if name == FOREST:
@@ -120,10 +128,8 @@ def _check_name(name: str) -> str:
     return name
 
 
-def _read_settings_of_model(entry: "Model", settings: list[str]) -> dict[str, Any]:
-    """NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
-    from tracklake.training.runs.config import RECIPE_SETTINGS
-
+def _read_settings_of_model(entry: Model, settings: list[str]) -> dict[str, Any]:
+    """Read NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
     recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS}
     known = {**recipe, **entry.parameters}
     read = read_pairs(settings, known, entry.name)
@@ -132,10 +138,23 @@ def _read_settings_of_model(entry: "Model", settings: list[str]) -> dict[str, An
     return {**config, **({"parameters": parameters} if parameters else {})}
 
 
-def _make_config(given: dict[str, Any], *, resume: bool | None) -> "TrainConfig | None":
-    """What was said about the training; None where nothing was and a training is gone on with as it was begun."""
-    from tracklake.training.runs.config import TrainConfig
-
+def _make_config(given: dict[str, Any], *, resume: bool | None) -> TrainConfig | None:
+    """Make the config of the given options; None to resume a training with its own settings."""
     if resume and not given:
         return None
     return TrainConfig(**given)
+
+
+def _show_scores(terminal: Terminal, evaluation: dict[str, Any]) -> None:
+    """Print the errors at each horizon, with the number of samples behind them."""
+    title = (
+        f"{evaluation['model']} on {evaluation['part']} of {evaluation['split']} "
+        f"({evaluation['samples']:,} samples, protocol {evaluation['protocol']})"
+    )
+    figures = ("rmse_m", "rmse_longitudinal_m", "rmse_lateral_m", "mae_m")
+    rows = [
+        [f"{row['seconds']:g} s", *(format_number(row[name]) for name in figures), f"{row['n']:,}"]
+        for row in evaluation["horizons"]
+    ]
+    headings = ["horizon", "RMSE m", "longitudinal m", "lateral m", "MAE m", "n"]
+    print_table(terminal, headings, rows, title=title, right=[True] * len(headings))

@@ -1,10 +1,9 @@
 """Settings and protocols: what nobody sets is the protocol's, and what cannot go together is refused."""
 
 import pytest
-from typer.main import get_command
 from typer.testing import CliRunner
 
-from tracklake.pipeline.cli.app import app
+from tracklake.pipeline.cli.app import app, load_command
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas.protocols import PROTOCOLS
 
@@ -68,7 +67,7 @@ def test_splits_are_made_with_the_protocols_clock_and_share():
 
 @pytest.mark.parametrize("command", ["run", "samples", "split", "tensors", "train", "evaluate", "report"])
 def test_commands_take_a_protocol(command):
-    options = {name for parameter in get_command(app).commands[command].params for name in parameter.opts}
+    options = {name for parameter in load_command(command).params for name in parameter.opts}
     assert "--protocol" in options
 
 

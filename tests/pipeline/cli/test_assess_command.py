@@ -9,6 +9,7 @@ from stage_runs import find_outstanding, run_stage
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli import app as cli
+from tracklake.pipeline.cli import repair as repair_command
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.lake import connect, open_for_writing
@@ -69,7 +70,7 @@ def test_the_windows_cover_what_is_cut_off_the_samples_whole_tracks(lake):
 def test_repair_assess_says_what_the_lake_and_the_report_hold(command, lake):
     """The whole run assessed already, so that there is nothing to do but to say it."""
     with connect(lake.root) as connection:
-        starts, covered, vain = connection.sql(
+        starts, covered, excess = connection.sql(
             """
             SELECT sum(starts)::BIGINT, sum(frames_covered / frame_rate_hz) / sum(frames_missing / frame_rate_hz),
                    sum(frames_excess / frame_rate_hz) / sum(frames_missing / frame_rate_hz)
@@ -80,9 +81,9 @@ def test_repair_assess_says_what_the_lake_and_the_report_hold(command, lake):
     assert done.code == 0, done.err
     up_to_date, ours, others = done.out.splitlines()
     assert up_to_date == "nothing to do: the lake is up to date"
-    assert f"cover {covered:.2%} of the time truly missing, and {vain:.2%} of it is excluded in vain" in ours
+    assert f"cover {covered:.2%} of the time truly missing, and exclude another {excess:.2%} without need" in ours
     assert f"({starts:,} cut tracks" in ours
-    named = [part.strip(" 0123456789.%/") for part in others.removeprefix("beside it: ").split(",")]
+    named = [part.strip(" 0123456789.%/") for part in others.removeprefix("other estimators: ").split(",")]
     assert named == [name.replace("_", " ") for name in ESTIMATORS[1:]]
     quality = json.loads((lake.root / "reports" / "quality.json").read_text())
     overall = [row for row in quality["starts"]["assessed"]["subsets"] if row["dataset"] is None]
@@ -96,12 +97,12 @@ def test_repair_assess_says_what_the_lake_and_the_report_hold(command, lake):
 def test_repair_assesses_where_asked(monkeypatch, flags, steps):
     asked = []
 
-    def carry_out(_terminal, _settings, given):
+    def run_steps(_terminal, _settings, given):
         asked.append(given)
         return RunResult()
 
-    monkeypatch.setattr(cli, "carry_out", carry_out)
-    monkeypatch.setattr(cli, "conclude", lambda *_, headline, assess: asked.append((headline, assess)))
+    monkeypatch.setattr(repair_command, "run_steps", run_steps)
+    monkeypatch.setattr(repair_command, "report_result", lambda *_, headline, assess: asked.append((headline, assess)))
     assert CliRunner().invoke(cli.app, ["repair", *flags]).exit_code == 0
     assert asked == [steps, (False, bool(flags))]
     assert ALL_STEPS.index("assess") == ALL_STEPS.index("repair") + 1

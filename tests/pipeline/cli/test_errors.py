@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from tracklake.pipeline import lake as lake_package
+from tracklake.pipeline.cli import report
 from tracklake.schemas.errors import FileAccessError, MissingExtraError, TracklakeError, UsageError, describe_error
 
 
@@ -19,7 +19,7 @@ def break_load(monkeypatch):
         def fail(_root):
             raise error
 
-        monkeypatch.setattr(lake_package, "load", fail)
+        monkeypatch.setattr(report, "load", fail)
 
     return choose
 

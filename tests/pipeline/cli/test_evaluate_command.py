@@ -4,13 +4,13 @@ import itertools
 import json
 import re
 from io import StringIO
-from types import SimpleNamespace
 
 import polars as pl
 import pytest
 from rich.console import Console
 
-from tracklake.pipeline.cli.score_tables import _Lines
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.tables import print_table
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.training.models.constant_velocity import ConstantVelocity
@@ -107,13 +107,12 @@ def test_every_tick_is_in_the_table_and_the_scored_seconds_on_the_terminal(comma
 
 @pytest.mark.parametrize("width", [80, 200])
 def test_names_and_figures_are_never_cut_off(width):
-    out = Console(width=width, file=StringIO(), soft_wrap=True)
+    terminal = Terminal()
+    terminal.out = out = Console(width=width, file=StringIO(), soft_wrap=True)
     figures = [f"{number}.25" for number in range(10, 18)]
     names = ["cs-lstm-of-the-first-try", "cs-lstm-of-the-second-try"]
-    lines = _Lines("at 5 s", ["longitudinal RMSE, m", "lateral RMSE, m", *["ADE, m"] * 4, "lateral %", "ms a moment"])
-    for name in names:
-        lines.add(name, figures)
-    lines.print(SimpleNamespace(talks=True, out=out))
+    headings = ["longitudinal RMSE, m", "lateral RMSE, m", *["ADE, m"] * 4, "lateral %", "ms a moment"]
+    print_table(terminal, ["", *headings], [[name, *figures] for name in names], title="at 5 s", fold=True)
     printed = out.file.getvalue()
     assert max(map(len, printed.splitlines())) <= width
     first = printed[printed.index("cs-lstm") :].splitlines()

@@ -86,7 +86,7 @@ def kept(done, copied):
 
 
 def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
-    """A run of constant velocity is scored as constant velocity itself; what cannot be opened is passed by."""
+    """A run of constant velocity is scored as constant velocity itself; what cannot be opened is skipped."""
     scored, forest = json.loads((kept / "lane_forest.json").read_text()), (kept / "forest.skops").read_bytes()
     [index] = (copied / "tensors").glob("*/*/index.json")
     folder = TensorFolder.open(index.parent)
@@ -128,7 +128,7 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     assert told["passed_by"].keys() == reasons.keys()
     for name, reason in reasons.items():
         assert reason in told["passed_by"][name]
-        assert f"passed by: {name}: " in finished.err
+        assert f"skipped: {name}: " in finished.err
     assert written["passed_by"] == told["passed_by"]
 
 

@@ -84,7 +84,7 @@ def test_without_names_the_newest_runs_that_fit_are_drawn(predict, tensors, tmp_
     [picture] = json.loads(out)["pictures"]
     models = [one["model"] for one in picture["vehicles"][0]["predictions"]]
     assert models == ["constant-velocity", "new", "middle", "old"]
-    assert "passed by:" in err
+    assert "skipped:" in err
     assert "trained for the protocol tiny (another)" in err
     code, out, _ = predict("--sample", 0, "--all-vehicles")
     assert "off after 2 s: new 4.00 m" in out

@@ -51,7 +51,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         yield tell
 
     with monkeypatch.context() as patch:
-        patch.setattr("tracklake.pipeline.cli.console.Terminal.measuring", interrupting)
+        patch.setattr("tracklake.pipeline.cli.console.Terminal.show_training", interrupting)
         stopped = command.here(*steps)
     assert stopped.code == 1
     assert "interrupted; the training stands in" in stopped.err

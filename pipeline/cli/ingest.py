@@ -1,0 +1,37 @@
+"""`tracklake ingest`: raw files to tables."""
+
+from typing import Annotated, Any
+
+import typer
+
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.options import (
+    DatasetOption,
+    JsonOption,
+    LakeOption,
+    PruneOption,
+    QuietOption,
+    RebuildOption,
+    ReplaceOption,
+    WorkersOption,
+)
+from tracklake.pipeline.cli.session import report_result, run_steps
+
+
+def ingest(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help="A raw file, or a folder of any mix of them.")],
+    lake: LakeOption = None,
+    dataset: DatasetOption = None,
+    workers: WorkersOption = None,
+    replace: ReplaceOption = False,
+    prune: PruneOption = False,
+    rebuild: RebuildOption = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Read raw files into tracks, vehicles and subsets (the format is detected)."""
+    with command(quiet=quiet, json=json) as terminal:
+        settings = read_settings(lake=lake, workers=workers)
+        flags: dict[str, Any] = {"replace": replace, "prune": prune, "rebuild": rebuild}
+        outcome = run_steps(terminal, settings, ("ingest",), source, dataset, **flags)
+        report_result(terminal, settings, outcome, headline=False)

@@ -1,0 +1,37 @@
+"""`tracklake remove`: recordings leave the lake."""
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
+from tracklake.pipeline.ingest.removal import remove_recordings
+
+
+def remove(
+    recordings: Annotated[list[str], typer.Argument(metavar="RECORDING...", help="For instance 03, or highd/03.")],
+    lake: LakeOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Take recordings out of the lake, with all that was made of them; raw files stay."""
+    with command(quiet=quiet, json=json) as terminal:
+        root = read_settings(lake=lake).lake
+        removed, outdated = remove_recordings(root, recordings)
+        for recording in removed:
+            terminal.print_line(
+                f"removed {recording.name}: {', '.join(recording.subsets)}; {recording.entries:,} rows of tracks"
+            )
+            if recording.files:
+                terminal.print_line(
+                    f"note: {recording.files[0]} is still there, and ingesting it brings {recording.name} back"
+                )
+        if outdated:
+            terminal.print_line(
+                f"note: {', '.join(outdated)} were made of it and are removed, too; `tracklake run` makes them again"
+            )
+        terminal.print_json(
+            {"lake": root, "removed": [asdict(recording) for recording in removed], "outdated": outdated}
+        )

@@ -1,0 +1,29 @@
+"""`tracklake report`: the quality report, and the comparison with another lake."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
+from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.lake import load
+
+
+def report(
+    lake: LakeOption = None,
+    compare: Annotated[
+        Path | None, typer.Option("--compare", metavar="OTHER_LAKE", help="Also show what differs from this lake.")
+    ] = None,
+    protocol: ProtocolOption = None,
+    workers: WorkersOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write the quality report."""
+    with command(quiet=quiet, json=json) as terminal:
+        if compare is not None:
+            load(compare)  # raises where there is no lake, before any work is done
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
+        report_result(terminal, settings, run_steps(terminal, settings, ("report",)), compare=compare)

@@ -1,0 +1,54 @@
+"""`tracklake run`: the whole pipeline."""
+
+from typing import Annotated
+
+import typer
+
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.generated_sample import provide_sample, refuse_mixing
+from tracklake.pipeline.cli.options import (
+    DatasetOption,
+    JsonOption,
+    LakeOption,
+    MinutesOption,
+    ProtocolOption,
+    PruneOption,
+    QuietOption,
+    RebuildOption,
+    ReplaceOption,
+    SeedOption,
+    WorkersOption,
+)
+from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.orchestration.run_plan import ALL_STEPS
+
+
+def run(
+    source: Annotated[
+        str | None, typer.Argument(metavar="[SOURCE]", help="A raw file or a folder of them; none: a generated sample.")
+    ] = None,
+    lake: LakeOption = None,
+    dataset: DatasetOption = None,
+    protocol: ProtocolOption = None,
+    workers: WorkersOption = None,
+    replace: ReplaceOption = False,
+    prune: PruneOption = False,
+    rebuild: RebuildOption = False,
+    minutes: MinutesOption = None,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Run the whole pipeline: raw files to tables, checks, samples, split, tensors, first score and report."""
+    with command(quiet=quiet, json=json) as terminal:
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
+        check = refuse_mixing if source is None else None
+        if source is None:
+            if prune or rebuild:
+                raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
+            source = str(provide_sample(settings.lake, minutes, seed, terminal))
+        elif minutes is not None or seed is not None:
+            raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
+        flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
+        outcome = run_steps(terminal, settings, ALL_STEPS, source, dataset, **flags, check=check)
+        report_result(terminal, settings, outcome)

@@ -1,0 +1,33 @@
+"""`tracklake sample`: recordings generated with SUMO."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tracklake.pipeline.cli.command import command
+from tracklake.pipeline.cli.console import find_command
+from tracklake.pipeline.cli.generated_sample import write_generated
+from tracklake.pipeline.cli.options import JsonOption, MinutesOption, QuietOption, SeedOption
+
+
+def sample(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
+    format: Annotated[
+        list[str] | None, typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata; repeatable.")
+    ] = None,
+    minutes: MinutesOption = None,
+    seed: SeedOption = None,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
+    with command(quiet=quiet, json=json) as terminal:
+        summary = write_generated(out, minutes, seed, terminal, formats=format)
+        terminal.print_line(
+            f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)"
+        )
+        terminal.print_line(f"Try next:\n  {find_command()} run {out}")
+        terminal.print_json(
+            {"out": out, "rows": summary.rows, "recordings": summary.recordings, "seconds": summary.seconds}
+        )

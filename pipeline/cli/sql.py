@@ -1,0 +1,144 @@
+"""`tracklake sql`: a query's result, for people or for programs."""
+
+import errno
+import sys
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Annotated, cast
+
+import polars as pl
+import typer
+
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.options import LakeOption, require_choice
+from tracklake.pipeline.cli.tables import cut_text, print_table
+from tracklake.pipeline.lake import LakeResult, connect, query_errors
+from tracklake.pipeline.lake import query as run_query
+from tracklake.pipeline.lake.macros import MACROS
+from tracklake.schemas import TABLES
+from tracklake.schemas.errors import FileAccessError, TracklakeError
+
+if TYPE_CHECKING:
+    from io import IOBase
+
+FORMATS = ("table", "csv", "json", "parquet")
+
+MAX_ROWS = 40
+"""Rows of a result printed as a table; csv, json and parquet hold all."""
+
+MAX_CELL_CHARS = 120
+"""Longest cell printed in a terminal table, in characters."""
+
+NUMERIC = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UBIGINT", "UINTEGER", "FLOAT", "DOUBLE", "DECIMAL")
+"""Beginnings of the names of DuckDB's types whose columns are aligned to the right."""
+
+
+def sql(
+    query: Annotated[str | None, typer.Argument(help="One SELECT; `-` reads it from standard input.")] = None,
+    lake: LakeOption = None,
+    format: Annotated[str, typer.Option("--format", help="table, csv, json or parquet.")] = "table",
+    out: Annotated[Path | None, typer.Option("--out", help="Write the result to this file.")] = None,
+    names: Annotated[bool, typer.Option("--list", help="List the tables and macros, and what they are.")] = False,
+) -> None:
+    """Query the tables with SQL, read-only, from anywhere."""
+    with command() as terminal:
+        require_choice("--format", format, FORMATS)
+        if names:
+            show_names(terminal)
+            return
+        if query is None:
+            raise typer.BadParameter("give one SELECT, `-` to read it from standard input, or --list")
+        with connect(read_settings(lake=lake).lake) as connection:
+            relation = run_query(connection, sys.stdin.read() if query == "-" else query)
+            with query_errors():  # DuckDB computes while the result is fetched
+                write_result(relation, format, out, terminal)
+
+
+def write_result(relation: LakeResult, form: str, out: Path | None, terminal: Terminal) -> None:
+    """Write a result to a file, or to standard output.
+
+    Args:
+        relation: result of `pipeline.lake.query`.
+        form: table (the first rows, aligned), csv (with header), json (an array of objects) or parquet.
+        out: file to write; none: standard output.
+        terminal: terminal of the command, for a table or the number of rows written.
+
+    Raises:
+        TracklakeError: Parquet, which is no text, would go to a terminal.
+        FileAccessError: the file cannot be written.
+    """
+    if form == "table" and out is None:
+        _show_rows(relation, terminal)
+        return
+    if form == "parquet" and out is None and sys.stdout.isatty():
+        raise TracklakeError("Parquet is no text: give --out FILE, or redirect standard output to a file")
+    try:
+        frame = _flatten(relation).pl() if form == "csv" else relation.pl()
+        _write(frame, form, out or sys.stdout.buffer)
+    except OSError as error:
+        # Polars raises the system's error without its number.
+        if f"(os error {errno.EPIPE})" in str(error):
+            raise BrokenPipeError from error
+        raise FileAccessError(f"{out or 'standard output'}: {error}") from error
+    if out is None:
+        sys.stdout.buffer.flush()
+    else:
+        terminal.print_line(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+
+
+def _show_rows(relation: LakeResult, terminal: Terminal) -> None:
+    """Print a query's first rows as a table with every column, and on stderr how many rows there are."""
+    rows = relation.limit(MAX_ROWS + 1).fetchall()
+    numeric = [str(kind).startswith(NUMERIC) and not str(kind).endswith("]") for kind in relation.types]
+    cells = [[_format_cell(value) for value in row] for row in rows[:MAX_ROWS]]
+    print_table(terminal, list(relation.columns), cells, right=numeric)
+    if len(rows) > MAX_ROWS:
+        rest = f"the first {MAX_ROWS} of {relation.count():,} rows; --format csv, json or parquet gives all"
+        terminal.err.print(f"[dim]{rest}[/]")
+    else:
+        terminal.err.print(f"[dim]{len(rows)} {'row' if len(rows) == 1 else 'rows'}[/]")
+
+
+def _format_cell(value: object) -> str:
+    if value is None:
+        return "null"
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if "\n" in text else cut_text(text, MAX_CELL_CHARS)  # a query plan has many lines
+
+
+def show_names(terminal: Terminal) -> None:
+    """Print every table and macro with its meaning; they are the same in all lakes."""
+    for title, meanings in (
+        ("Tables (columns: DESCRIBE tracks)", {table.name: _take_first_sentence(table.meaning) for table in TABLES}),
+        ("Macros (call: FROM track('01-upper', 5))", {macro.signature: macro.meaning for macro in MACROS}),
+    ):
+        terminal.print_line(title, style="bold")
+        width = max(map(len, meanings)) + 2
+        for name, meaning in meanings.items():
+            terminal.print_line(f"  {name:<{width}}{meaning}")
+
+
+def _take_first_sentence(text: str) -> str:
+    return text.split(". ")[0].removesuffix(".") + "."
+
+
+def _write(frame: pl.DataFrame, form: str, target: Path | IO[bytes]) -> None:
+    if form == "csv":
+        frame.write_csv(target)
+    elif form == "json":
+        # Any binary file will do, though Polars declares it otherwise than for the other forms.
+        frame.write_json(cast("Path | IOBase", target))
+    elif form == "parquet":
+        frame.write_parquet(target)
+    else:
+        raise TracklakeError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
+
+
+def _flatten(relation: LakeResult) -> LakeResult:
+    """Cast lists and structs to text, as CSV holds nothing else."""
+    columns = []
+    for name, kind in zip(relation.columns, relation.types, strict=True):
+        quoted = '"' + name.replace('"', '""') + '"'
+        nested = str(kind).endswith("]") or str(kind).startswith(("STRUCT", "MAP"))
+        columns.append(f"CAST({quoted} AS VARCHAR) AS {quoted}" if nested else quoted)
+    return relation.project(", ".join(columns))

@@ -1,0 +1,105 @@
+"""Summaries of a run in the terminal: what was done, the report's figures, the quality of estimates."""
+
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.cli.console import Terminal, find_command
+from tracklake.pipeline.lake import connect
+from tracklake.pipeline.orchestration.run_plan import RunResult
+from tracklake.quality_reports.summaries import query
+from tracklake.schemas.start_assessments import ESTIMATORS
+
+
+def show_result(terminal: Terminal, result: RunResult) -> None:
+    """Print the notes, refusals and failures of a run."""
+    for note in dict.fromkeys(result.notes):
+        terminal.print_line(f"note: {note}", style="dim")
+    if result.skipped and terminal.verbose:
+        shown = ", ".join(result.skipped[:5]) + (", ..." if len(result.skipped) > 5 else "")
+        terminal.print_line(f"note: skipped, no raw data: {shown}", style="dim")
+    for message in result.refused:
+        terminal.print_problem(message, label="refused")
+    for message in result.failed:
+        terminal.print_problem(message)
+
+
+def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
+    """Print the report's figures, its path, and two commands to try next."""
+    head = quality["headline"]
+    excluded, judged = _format_count(head["excluded_subsets"]), head["eligible_starts"]
+    late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"
+    lines = {
+        "recordings": f"{head['recordings']:,} recordings, {head['subsets']:,} subsets, {excluded} excluded",
+        "tracks": f"{head['vehicles']:,} vehicles, {head['entries']:,} entries",
+        "rows": f"{head['rows_read']:,} read, {head['rows_dropped']:,} rejected",
+        "quality": f"{_format_count(head['vehicles_with_errors'])} vehicles with errors; " + late,
+        "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_describe_balance(quality)}",
+    }
+    for score in quality["model_scores"]:
+        rmse = "  ".join(
+            f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
+        )
+        lines[f"RMSE, m ({score['model']})"] = (
+            f"{rmse}  (n = {score['rows'][0]['n']:,} at {score['rows'][0]['seconds']:g} s)"
+        )
+    width = max(map(len, lines)) + 2
+    for name, value in lines.items():
+        terminal.print_line(f"{name:<{width}}{value}")
+    terminal.print_line(f"{'report':<{width}}{report.resolve()}", style="bold green")
+    lake_option = "" if lake == Path("lake") else f" --lake {lake}"
+    protocol = quality["provenance"]["protocol"]["name"]
+    protocol_option = "" if protocol == "csp" else f" --protocol {protocol}"
+    terminal.print_line("\nTry next:")
+    command = find_command()
+    terminal.print_line(
+        f'  {command} sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{lake_option}'
+    )
+    terminal.print_line(
+        f"  {command} train lstm{lake_option}{protocol_option}"
+        if head["samples"]
+        else f'  {command} sql "FROM subsets"{lake_option}'
+    )
+
+
+def _format_count(count: int | None) -> str:
+    return "no" if count is None else f"{count:,}"
+
+
+def _describe_balance(quality: dict[str, Any]) -> str:
+    others = {row["split"] for row in quality["splits"]["recipes"] if not row["trains"]}
+    parts = [
+        f"{row['dataset']} {row['part']} {row['vehicle_share']:.1%}"
+        for row in quality["splits"]["balance"]
+        if row["vehicle_share"] is not None and row["split"] not in others
+    ]
+    return f"; split by vehicles: {', '.join(parts)}" if parts else ""
+
+
+def show_assessment(terminal: Terminal, root: Path) -> list[dict[str, Any]]:
+    """Print coverage and excess of the estimated windows, beside those of other estimators.
+
+    Args:
+        terminal: terminal of the command.
+        root: folder of the lake.
+
+    Returns:
+        Rows of assessed_subsets.sql over the whole lake, one per estimator; none where no track could be cut.
+    """
+    with connect(root) as connection:
+        rows = query(connection, "assessed_subsets", {"estimators": list(ESTIMATORS)})
+    overall = [row for row in rows if row["dataset"] is None]
+    if not overall:
+        terminal.print_line(
+            "no estimate could be measured: no vehicle is fully tracked as far as 20 m beyond the cut-off"
+        )
+        return []
+    ours, *others = overall
+    terminal.print_line(
+        f"the windows cover {ours['coverage']:.2%} of the time truly missing, and exclude another {ours['excess']:.2%} "
+        f"without need ({ours['starts']:,} cut tracks, {ours['missing_s']:,.1f} s)"
+    )
+    others_text = (
+        f"{row['estimator'].replace('_', ' ')} {row['coverage']:.2%} / {row['excess']:.2%}" for row in others
+    )
+    terminal.print_line(f"other estimators: {', '.join(others_text)}")
+    return overall
