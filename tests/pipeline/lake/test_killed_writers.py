@@ -13,7 +13,7 @@ from small_lake import Nursery, check_lake, find_files, write_round
 from tracklake.pipeline.lake import load
 
 STRIDE = 9
-"""Every so manieth step of a session is died at; 1 is thorough and takes half a minute."""
+"""Steps of a session from one death to the next; 1 is thorough and takes half a minute."""
 
 
 @pytest.fixture
@@ -61,11 +61,12 @@ def test_deaths_at_random_moments(root: Path, nursery: Nursery):
     began = time.perf_counter()
     write_round(root, 1)
     session_s = time.perf_counter() - began
+    longest_s = max(min(4 * session_s, 0.4), 2 * session_s)  # on a busy machine, too, some sessions come to their end
     chance = random.Random(20)
     broken_off = 0
     for kill in range(20):
         child = nursery.ask(f"loop {1_000 * (kill + 1)}")
-        time.sleep(chance.uniform(0.0, min(4 * session_s, 0.4)))
+        time.sleep(chance.uniform(0.0, longest_s))
         os.kill(child, signal.SIGKILL)
         wait_until_gone(child)
         broken_off += bool((root / ".lock").read_bytes())
