@@ -122,7 +122,7 @@ def build_subset_tensors(
     _check_order(clock, where)
     if max(protocol.history_ticks, protocol.horizon_ticks) > MOST_TICKS:
         raise ValueError(f"protocol {protocol.name}: tensors hold at most {MOST_TICKS} ticks of history and of future")
-    rates = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
+    rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     kept = _keep_entries(clock, blocks, left_out, rates, where)
     x_m, y_m, speed_mps = (clock[name].to_numpy()[kept.is_kept] for name in ("x_m", "y_m", "speed_mps"))
     stored = store_positions(x_m, y_m, storage=storage, where=where)

@@ -212,7 +212,7 @@ def test_lanes_flicker_where_declared_and_nobody_is_beside():
     assert damage(only(lane_flickers=2), tracks=full)[1].defects == []
 
 
-def test_too_short_tracks_are_passed_by():
+def test_too_short_tracks_are_skipped():
     tracks = platoon().filter(pl.col("frame") <= 4)
     _, done = damage(Plan(backward_share=0.5), tracks=tracks)
     assert {defect.name for defect in done.defects} <= {"acceleration_spike"}

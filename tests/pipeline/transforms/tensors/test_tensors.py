@@ -173,7 +173,7 @@ def test_blocks_by_vehicle_keep_neighbors_of_other_parts_away():
     assert arrays["neighbor_offset"].tolist() == [0, 0, 0]
 
 
-def test_samples_of_other_protocols_are_passed_by():
+def test_samples_of_other_protocols_are_skipped():
     sampled = pl.concat([SAMPLED, samples((3, 1), protocol="q")])
     around = pl.concat([neighbors((3, 1, 5, TOP)), neighbors((3, 1, 5, TOP), protocol="q")])
     arrays = build(sampled=sampled, around=around)
