@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, write_up
+from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, tabulate_allocation
 from tracklake.pipeline.transforms.splits.comparisons import divide_by_id, divide_by_recording
 from tracklake.pipeline.transforms.splits.tables import Allocation
 from tracklake.pipeline.transforms.splits.time_blocks import (
@@ -104,7 +104,9 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     left_out = find_left_out(seen, allocation.splits)
     # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
-    written = write_up(recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation)
+    written = tabulate_allocation(
+        recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation
+    )
     return SplitResult(written, left_out, units.select("dataset", "subset", "block", "flow"))
 
 

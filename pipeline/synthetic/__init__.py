@@ -1,6 +1,5 @@
-"""A sample to try everything on: simulated recordings in the raw formats, with noise, known defects and the truth."""
+"""The generator of sample recordings: simulated traffic in the raw formats, with noise, known defects and the truth."""
 
-import os
 import shutil
 import time
 from collections.abc import Callable
@@ -9,27 +8,29 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.build import README_FILE, TRUTH_FILE, build
+from tracklake.pipeline.synthetic.build import README_FILE, TRUTH_FILE, build_sample
 from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
 from tracklake.pipeline.synthetic.sumo import SumoError
 from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
 from tracklake.schemas.errors import UsageError
+from tracklake.schemas.files import name_unfinished
 
 ALL_FORMATS = FORMATS
 DEFAULT_MINUTES = 1.0
+"""Length of the recordings in minutes, unless set."""
 
 __all__ = ["ALL_FORMATS", "DEFAULT_FORMATS", "DEFAULT_MINUTES", "SampleSummary", "SumoError", "write_sample"]
 
 
 @dataclass(frozen=True)
 class SampleSummary:
-    """What was written.
+    """The result of writing a sample.
 
     Args:
-        files: all of them, in the sample's folder.
-        rows: data lines in the files of tracks, damaged ones included.
-        recordings: continuous recordings; a highD recording has two subsets.
-        seconds: how long it took.
+        files: paths of all files.
+        rows: number of data lines in the files of tracks, damaged ones included.
+        recordings: number of continuous recordings; a highD recording has two subsets.
+        seconds: duration of the generation.
     """
 
     files: tuple[Path, ...]
@@ -48,17 +49,17 @@ def write_sample(
 ) -> SampleSummary:
     """Write a sample: raw files, `truth.parquet` and a README.
 
-    The folder appears whole or not at all: everything is written aside and renamed.
+    The folder appears whole or not at all: the files are written to a hidden folder, which is renamed.
 
     Args:
-        out: the folder; absent, empty, or holding nothing but an earlier sample, which is replaced.
+        out: folder of the sample: missing, empty, or holding only an earlier sample, which is replaced.
         formats: some of `ALL_FORMATS`.
-        minutes: length of the recordings, each of which is 0.4 to 1.9 times that.
-        seed: same seed, formats and minutes, same bytes.
-        progress: is told about each step.
+        minutes: unit of the recordings' length, which is 0.4 to 1.9 times that.
+        seed: seed of all random numbers; the same seed, formats and minutes give the same bytes.
+        progress: function that is called with a description of each step.
 
     Raises:
-        UsageError: an argument makes no sense, or `out` holds something else.
+        UsageError: an argument is invalid, or `out` holds other files.
         SumoError: SUMO is not installed, or failed.
     """
     unknown = [name for name in formats if name not in ALL_FORMATS]
@@ -72,13 +73,10 @@ def write_sample(
     _require_replaceable(out)
     began = time.perf_counter()
     out.parent.mkdir(parents=True, exist_ok=True)
-    aside = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    old = out.with_name(f".{out.name}.{os.getpid()}.old")
-    for leftover in (aside, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    aside, old = name_unfinished(out), name_unfinished(out)
     aside.mkdir()
     try:
-        built = build(aside, formats, minutes, seed, progress or (lambda _: None))
+        built = build_sample(aside, formats, minutes, seed, progress or (lambda _: None))
         _require_replaceable(out)
         if out.exists():
             out.rename(old)
@@ -95,11 +93,11 @@ def write_sample(
 
 
 def _require_replaceable(out: Path) -> None:
-    """Raise unless writing to `out` destroys nothing but an earlier sample."""
+    """Refuse a folder that holds anything but an earlier sample."""
     if not out.exists():
         return
     if not out.is_dir():
-        raise UsageError(f"{out} is a file; expected a folder that is absent or empty. Name another one with --out.")
+        raise UsageError(f"{out} is a file; expected a missing or empty folder. Name another one with --out.")
     present = {path.name for path in out.iterdir()}
     if not present:
         return

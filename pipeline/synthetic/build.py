@@ -1,4 +1,4 @@
-"""From scenarios to files: simulate, add noise, inject defects, write, read back, tell the truth."""
+"""Steps of making a sample: simulate, add noise, inject defects, write files, read them back, list the truth."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +27,7 @@ from tracklake.pipeline.synthetic.scenarios import (
 from tracklake.pipeline.synthetic.sumo import find_sumo, simulate
 
 AT_ONCE = 2
-"""Simulations running at the same time; each is a process of one thread."""
+"""Simulations that run at the same time; each is a process with one thread."""
 
 BOM = b"\xef\xbb\xbf"
 TRUTH_FILE = "truth.parquet"
@@ -46,7 +46,7 @@ noise and known defects were added. `tracklake sample` wrote them (seed {seed}, 
 
 @dataclass(frozen=True)
 class _Run:
-    """One carriageway to simulate; `index` keeps its random numbers apart from all others'."""
+    """One carriageway to simulate; `index` is part of its random seed."""
 
     index: int
     road: Road
@@ -56,7 +56,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Job:
-    """Where a subset comes from and goes to."""
+    """The origin and the file of one subset."""
 
     dataset: str
     recording: str
@@ -67,23 +67,17 @@ class _Job:
 
 @dataclass(frozen=True)
 class Built:
-    """What was written: file names and the number of data lines in the files of tracks."""
+    """The names of the written files, and the number of data lines in files of tracks and of recordings."""
 
     files: tuple[str, ...]
     rows: int
     recordings: int
 
 
-def build(folder: Path, formats: tuple[str, ...], minutes: float, seed: int, progress: Callable[[str], None]) -> Built:
-    """Write a whole sample into an empty folder.
-
-    Args:
-        folder: exists and is empty.
-        formats: which to write.
-        minutes: length of a recording of share 1.
-        seed: same seed, same bytes.
-        progress: is told about each step.
-    """
+def build_sample(
+    folder: Path, formats: tuple[str, ...], minutes: float, seed: int, progress: Callable[[str], None]
+) -> Built:
+    """Write a whole sample into an empty folder; the arguments are those of `write_sample`."""
     home = find_sumo()
     recordings = HIGHD if "highd" in formats else ()
     groups: list[tuple[str, str, tuple[NgsimScenario, ...]]] = [
@@ -95,7 +89,7 @@ def build(folder: Path, formats: tuple[str, ...], minutes: float, seed: int, pro
         )
         if kind in formats
     ]
-    jobs = _jobs(recordings, groups, minutes)
+    jobs = _list_jobs(recordings, groups, minutes)
     progress(f"simulating {len(jobs)} carriageways")
     clean = _simulate_all(home, jobs, seed, progress)
     found = truth.Found()
@@ -108,10 +102,10 @@ def build(folder: Path, formats: tuple[str, ...], minutes: float, seed: int, pro
     for kind, file, scenarios in groups:
         progress(f"writing {file}")
         rows += _write_ngsim(folder, kind, file, scenarios, [job for job in jobs if job.file == file], clean, seed)
-        names = {ngsim.global_time_base(each.start_time): ngsim.recording_name(each.start_time) for each in scenarios}
+        names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
         truth.read_ngsim(folder / file, names, found)
     progress("writing the truth")
-    truth.truth_table(rows + truth.rows_of(found)).write_parquet(folder / TRUTH_FILE)
+    truth.build_truth(rows + truth.list_counts(found)).write_parquet(folder / TRUTH_FILE)
     (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes), encoding="utf-8")
     return Built(
         files=tuple(sorted(path.name for path in folder.iterdir())),
@@ -120,7 +114,7 @@ def build(folder: Path, formats: tuple[str, ...], minutes: float, seed: int, pro
     )
 
 
-def _jobs(
+def _list_jobs(
     recordings: tuple[HighdScenario, ...], groups: list[tuple[str, str, tuple[NgsimScenario, ...]]], minutes: float
 ) -> list[_Job]:
     jobs = []
@@ -135,24 +129,24 @@ def _jobs(
     for _, file, scenarios in groups:
         for each in scenarios:
             frames = max(1, round(each.share * minutes * 60 * FREEWAY.rate_hz))
-            name = ngsim.recording_name(each.start_time)
+            name = ngsim.name_recording(each.start_time)
             run = _Run(order[each.start_time], FREEWAY, each.traffic, frames)
             jobs.append(_Job("ngsim", name, name, file, run))
     return jobs
 
 
 def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[str], None]) -> dict[str, pl.DataFrame]:
-    def one(job: _Job, folder: Path) -> pl.DataFrame:
-        place = folder / job.subset
-        place.mkdir()
+    def simulate_job(job: _Job, folder: Path) -> pl.DataFrame:
+        own_folder = folder / job.subset
+        own_folder.mkdir()
         # SUMO's seed is a non-negative 32-bit number.
         own_seed = int(np.random.default_rng([seed, job.run.index, 0]).integers(2**31))
-        return simulate(home, place, job.run.road, job.run.traffic, frames=job.run.frames, seed=own_seed)
+        return simulate(home, own_folder, job.run.road, job.run.traffic, frames=job.run.frames, seed=own_seed)
 
     with TemporaryDirectory(prefix="tracklake-sample-") as folder, ThreadPoolExecutor(AT_ONCE) as pool:
-        # The congested ones take longest and go first.
+        # Congested traffic takes longest and starts first.
         slowest = sorted(jobs, key=lambda job: job.run.traffic.bottleneck_mps is None)
-        waiting = {job.subset: pool.submit(one, job, Path(folder)) for job in slowest}
+        waiting = {job.subset: pool.submit(simulate_job, job, Path(folder)) for job in slowest}
         tracks = {}
         for done, (subset, future) in enumerate(waiting.items(), start=1):
             tracks[subset] = future.result()
@@ -160,7 +154,7 @@ def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[s
     return tracks
 
 
-def _first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
+def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
     firsts = tracks.group_by("vehicle", maintain_order=True).agg(
         pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"), pl.len(), pl.col("x").first()
     )
@@ -174,13 +168,13 @@ def _first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
     ]  # fmt: skip
 
 
-def _spoil(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, list[dict[str, object]]]:
-    """Noise and defects; returns the damaged tracks and the truth about them."""
+def _damage_tracks(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, list[dict[str, object]]]:
+    """Add noise and defects; also return the truth about them."""
     random = np.random.default_rng([seed, job.run.index, 1])
     is_ngsim = job.dataset == "ngsim"
     noisy = add_noise(tracks, job.run.road, MAST if is_ngsim else DRONE, random)
     plan: Plan = job.run.traffic.plan
-    injected = defects.inject(
+    injected = defects.inject_defects(
         noisy,
         plan,
         rate_hz=job.run.road.rate_hz,
@@ -188,7 +182,7 @@ def _spoil(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, li
         unseen_leaders=is_ngsim,
         random=random,
     )
-    told: list[dict[str, object]] = [
+    declared: list[dict[str, object]] = [
         {
             "kind": "defect", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
             "file": job.file, "vehicle_id": each.vehicle, "name": each.name, "first_frame": each.first_frame,
@@ -196,10 +190,10 @@ def _spoil(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, li
         }
         for each in injected.defects
     ]  # fmt: skip
-    return injected.tracks, _first_frames(tracks, job) + told
+    return injected.tracks, _list_first_frames(tracks, job) + declared
 
 
-def _line_truth(
+def _list_line_defects(
     found: list[damage.LineDefect], dataset: str, recording: str | None, file: str
 ) -> list[dict[str, object]]:
     return [
@@ -223,7 +217,7 @@ def _write_highd(
         .sort("frame", "side", "vehicle")
         .with_columns(number=pl.int_range(1, pl.len() + 1, dtype=pl.Int32))
     )
-    spoiled, rows = [], []
+    both_damaged, rows = [], []
     for side, job in enumerate(pair):
         ids = numbered.filter(pl.col("side") == side).select("vehicle", "number")
         tracks = (
@@ -233,16 +227,16 @@ def _write_highd(
             .drop("number")
             .sort("vehicle", "frame")
         )
-        damaged, told = _spoil(tracks, job, seed)
-        spoiled.append(damaged)
-        rows += told
-    files = highd.build_recording(scenario, spoiled[0], spoiled[1], frames=pair[0].run.frames)
+        damaged, declared = _damage_tracks(tracks, job, seed)
+        both_damaged.append(damaged)
+        rows += declared
+    files = highd.build_recording(scenario, *both_damaged, frames=pair[0].run.frames)
     text = files.tracks
     if scenario.damaged:
         random = np.random.default_rng([seed, pair[0].run.index, 2])
         dialect = damage.Dialect(header=True, separator=",", number_field=6)
-        lines, hurt = damage.damage(text.splitlines(), dialect, random)
-        rows += _line_truth(hurt, "highd", scenario.recording, pair[0].file)
+        lines, extra = damage.damage_lines(text.splitlines(), dialect, random)
+        rows += _list_line_defects(extra, "highd", scenario.recording, pair[0].file)
         text = "\n".join(lines) + "\n"
     for suffix, content in (
         ("recordingMeta", files.recording_meta),
@@ -266,21 +260,21 @@ def _write_ngsim(
     for scenario, job in zip(scenarios, jobs, strict=True):
         shift = scenario.first_vehicle_id - 1
         tracks = clean[job.subset].with_columns(pl.col("vehicle") + pl.lit(shift, pl.Int32))
-        damaged, told = _spoil(tracks, job, seed)
-        written.append(ngsim.feet_rows(damaged, scenario.start_time))
-        rows += told
+        damaged, declared = _damage_tracks(tracks, job, seed)
+        written.append(ngsim.build_rows(damaged, scenario.start_time))
+        rows += declared
     random = np.random.default_rng([seed, jobs[0].run.index, 2])
     together = pl.concat(written)
     if kind == "ngsim-text":
-        lines, dialect = ngsim.text_lines(together), damage.Dialect(header=False, separator=None, number_field=5)
+        lines, dialect = ngsim.format_text(together), damage.Dialect(header=False, separator=None, number_field=5)
     elif kind == "ngsim-csv":
-        lines, dialect = ngsim.csv_lines(together), damage.Dialect(header=True, separator=",", number_field=5)
+        lines, dialect = ngsim.format_csv(together), damage.Dialect(header=True, separator=",", number_field=5)
     else:
-        lines = ngsim.portal_lines(ngsim.shuffle_like_the_portal(together, random))
+        lines = ngsim.format_portal(ngsim.shuffle_rows(together, random))
         dialect = damage.Dialect(header=True, separator=",", number_field=5, quotes=True)
-    lines, hurt = damage.damage(lines, dialect, random)
+    lines, extra = damage.damage_lines(lines, dialect, random)
     recording = jobs[0].recording if len(jobs) == 1 else None
-    rows += _line_truth(hurt, "ngsim", recording, file)
+    rows += _list_line_defects(extra, "ngsim", recording, file)
     end, start = ("\r\n", BOM) if kind == "socrata" else ("\n", b"")
     (folder / file).write_bytes(start + (end.join(lines) + end).encode())
     return rows

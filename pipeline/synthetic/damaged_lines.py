@@ -1,7 +1,6 @@
 """Damaged lines: exact duplicates, and extra lines that no reader can use.
 
-Every malformed line is an extra one (a copy of a real line, then damaged, or no line at all), so that no vehicle
-loses an entry by it.
+Every malformed line is an extra one (a damaged copy of a real line, or an empty line), so no vehicle loses an entry.
 """
 
 from dataclasses import dataclass
@@ -9,17 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 DUPLICATES = 6
+"""Number of exact duplicates in a damaged file."""
 
 
 @dataclass(frozen=True)
 class LineDefect:
-    """One extra line.
+    """One line inserted into a file.
 
     Args:
         name: duplicate_row, truncated_line, word_in_number, wrong_field_count, empty_line, nul_byte,
             repeated_header, open_quote.
-        line: its number in the file, from 1.
-        text: of the line it was made from.
+        line: number of the line in the file, from 1.
+        text: text of the line that it was made from.
     """
 
     name: str
@@ -29,13 +29,13 @@ class LineDefect:
 
 @dataclass(frozen=True)
 class Dialect:
-    """What damage needs to know of a file.
+    """The dialect of a file that is damaged.
 
     Args:
-        header: the first line names the columns.
-        separator: between fields; None = runs of blanks.
-        number_field: place of a field that must be a number.
-        quotes: fields may be quoted, so that a line can break off inside a quote.
+        header: whether the first line names the columns.
+        separator: character between fields; None = runs of blanks.
+        number_field: index of a field that must be a number.
+        quotes: whether fields may be quoted, so that a line can end inside a quote.
     """
 
     header: bool
@@ -44,17 +44,8 @@ class Dialect:
     quotes: bool = False
 
 
-def damage(lines: list[str], dialect: Dialect, random: np.random.Generator) -> tuple[list[str], list[LineDefect]]:
-    """Insert duplicates and malformed lines at random places after the first data line.
-
-    Args:
-        lines: of a sound file, without line ends.
-        dialect: of the file.
-        random: draws the same places for the same seed.
-
-    Returns:
-        The lines of the damaged file, and what was inserted where.
-    """
+def damage_lines(lines: list[str], dialect: Dialect, random: np.random.Generator) -> tuple[list[str], list[LineDefect]]:
+    """Insert duplicates and malformed lines at random after the first data line; also return the inserted lines."""
     first = 1 if dialect.header else 0
     if len(lines) - first < 2:
         return lines, []
@@ -70,12 +61,12 @@ def damage(lines: list[str], dialect: Dialect, random: np.random.Generator) -> t
     for place, line in enumerate(lines):
         damaged.append(line)
         for kind, text in inserted.get(place, ()):
-            damaged.append(_spoil(kind, text, lines[0], dialect))
+            damaged.append(_make_line(kind, text, lines[0], dialect))
             defects.append(LineDefect(kind, len(damaged), text))
     return damaged, defects
 
 
-def _spoil(kind: str, line: str, first_line: str, dialect: Dialect) -> str:
+def _make_line(kind: str, line: str, first_line: str, dialect: Dialect) -> str:
     blank = dialect.separator is None
     fields = line.split() if blank else line.split(dialect.separator)
     glue = " " if blank else str(dialect.separator)

@@ -1,29 +1,27 @@
-"""Tracks while they are being damaged, and the list of what was done to them."""
+"""Tracks while they are being damaged, and the list of injected defects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
+from tracklake.schemas.arrays import Flags, Floats, Integers
 
 
 @dataclass(frozen=True)
 class Defect:
-    """One injected defect.
+    """One defect injected into a track.
 
     Args:
         name: late_start, overlap, backward, acceleration_spike, frozen_slow_speed, frame_gap, overlap_unseen,
             wrong_leader, wrong_headway, lane_flicker, position_jump.
-        vehicle: whose.
-        first_frame: of the damaged or missing entries.
-        last_frame: of them.
-        entries: how many.
-        value: late_start the x_m of the first entry kept; overlap and overlap_unseen the depth in m; backward the
-            lowest speed in m/s; acceleration_spike the acceleration in m/s2; frozen_slow_speed the speed in m/s;
-            wrong_headway and position_jump the error in m; lane_flicker the wrong lane.
+        vehicle: number of the vehicle.
+        first_frame: first frame of the damaged or missing entries.
+        last_frame: last frame of these entries.
+        entries: number of these entries.
+        value: x_m of the first entry kept (late_start), depth in m (overlap, overlap_unseen), lowest speed in m/s
+            (backward), acceleration in m/s2 (acceleration_spike), speed in m/s (frozen_slow_speed), error in m
+            (wrong_headway, position_jump), wrong lane (lane_flicker).
     """
 
     name: str
@@ -35,8 +33,8 @@ class Defect:
 
 
 @dataclass
-class Work:
-    """Columns being damaged, and who has been; all arrays are of shape (rows,) but begins and ends: (vehicles,)."""
+class DamagedTracks:
+    """Columns that are being damaged, (rows,) each but begins and ends (vehicles,), and the defects so far."""
 
     rate_hz: float
     random: np.random.Generator
@@ -50,27 +48,27 @@ class Work:
     leader: Integers
     begins: Integers
     ends: Integers
-    never_written: npt.NDArray[np.bool_]
-    lost_later: npt.NDArray[np.bool_]
-    leader_skipped: npt.NDArray[np.bool_]
+    never_written: Flags
+    lost_later: Flags
+    leader_skipped: Flags
     headway_error: Floats
     used: set[int] = field(default_factory=set)
     defects: list[Defect] = field(default_factory=list)
 
-    def seconds(self, least: float, most: float) -> int:
-        """A random number of frames, at least one."""
-        return max(1, round(self.random.uniform(least, most) * self.rate_hz))
+    def draw_frames(self, least_s: float, most_s: float) -> int:
+        """Draw a number of frames, at least one, from a range of seconds."""
+        return max(1, round(self.random.uniform(least_s, most_s) * self.rate_hz))
 
-    def free(self) -> list[int]:
-        """Vehicles (their places) without a defect, shuffled."""
-        return [int(place) for place in self.random.permutation(len(self.begins)) if int(place) not in self.used]
+    def draw_free_vehicles(self) -> list[int]:
+        """Draw the indices of vehicles without a defect, in random order."""
+        return [int(index) for index in self.random.permutation(len(self.begins)) if int(index) not in self.used]
 
-    def rows(self, place: int) -> slice:
-        """The rows of a vehicle."""
-        return slice(int(self.begins[place]), int(self.ends[place]))
+    def find_rows(self, index: int) -> slice:
+        """Return the rows of a vehicle."""
+        return slice(int(self.begins[index]), int(self.ends[index]))
 
-    def note(self, name: str, first: int, last: int, value: float | None = None) -> None:
-        """Declare the entries from row `first` to row `last` of one vehicle damaged."""
+    def add_defect(self, name: str, first: int, last: int, value: float | None = None) -> None:
+        """Declare that the entries from row `first` to row `last` of one vehicle are damaged."""
         self.defects.append(
             Defect(
                 name,
@@ -83,13 +81,13 @@ class Work:
         )
 
 
-Inflict = Callable[[Work, int], bool]
-"""Damages one vehicle (its place) where the defect makes sense there, and says whether it did."""
+Injector = Callable[[DamagedTracks, int], bool]
+"""Function that damages the vehicle of an index if the defect is possible there, and returns whether it did."""
 
 
-def pick_run(work: Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
-    """A random run of `wanted` rows at least `margin` rows from both ends of the track: first and last row."""
-    rows = work.rows(place)
+def draw_run(work: DamagedTracks, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
+    """Draw a run of `wanted` rows at least `margin` rows from both ends of the track: its first and last row."""
+    rows = work.find_rows(place)
     room = rows.stop - rows.start - 2 * margin - wanted
     if room < 0:
         return None

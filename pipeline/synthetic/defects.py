@@ -1,7 +1,7 @@
-"""Known defects, put into clean tracks on purpose, each written down.
+"""Injection of known defects into clean tracks.
 
-A vehicle carries one defect at most, and neither does the leader into which a vehicle is shifted; the one exception
-is that of an NGSIM overlap whose leader also misses frames, declared as both.
+A vehicle has one defect at most, and a leader that another vehicle is shifted into has none. The one exception is an
+NGSIM overlap whose leader also misses frames, declared as both.
 """
 
 from dataclasses import dataclass
@@ -9,40 +9,49 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.synthetic.damaged_tracks import Defect, Inflict, Work, pick_run
-from tracklake.pipeline.synthetic.misreadings import change_lane_and_back, jump, misread_headway, skip_leader
+from tracklake.pipeline.synthetic.damaged_tracks import DamagedTracks, Defect, Injector, draw_run
 from tracklake.pipeline.synthetic.neighbors import find_surroundings
+from tracklake.pipeline.synthetic.recording_errors import (
+    inject_jump,
+    inject_wrong_headway,
+    inject_wrong_leader,
+    make_lane_flicker_injector,
+)
 from tracklake.pipeline.synthetic.scenarios import Plan
+from tracklake.schemas.arrays import find_run_starts
 
-DEEPEST_START_M = 200.0
-SHALLOWEST_START_M = 20.0
+LATE_START_M = (20.0, 200.0)
+"""Range of positions at which late starts begin, in m."""
+
 NEAREST_LEADER_M = 20.0
-"""Vehicles overlap in recordings where they drive close; from farther away, the drift would be no tracking error."""
+"""Largest gap of a vehicle that is shifted into its leader, in m; a larger shift would be no tracking error."""
 
 DRIFT_S = 2.0
-"""How long a vehicle takes to drift into its leader, and out again."""
+"""Time in which a vehicle drifts into its leader, and out again, in s."""
 
 CLEAR_M = 0.05
+"""Least distance of a gap from 0, so that rounding in the file does not decide whether vehicles overlap, in m."""
+
 ROLLING_MPS = 1.6
-"""Only vehicles slower than this swing back; the acceleration of that stays below 3.05 m/s2."""
+"""Highest speed of vehicles that roll back, in m/s; their acceleration stays below 3.05 m/s2."""
 
 
 @dataclass(frozen=True)
 class Injected:
-    """Damaged tracks.
+    """Damaged tracks and their defects.
 
     Args:
-        tracks: as before, with the columns `lost` (Boolean): entries that are seen, so that others name them as their
-            leader, but are missing from the file; `leader_skipped` (Boolean): the leader's leader is recorded as the
-            own; `headway_error` (Float64): metres by which the recorded headway is wrong.
-        defects: all of them.
+        tracks: damaged tracks with the columns `lost` (Boolean): entries that others name as their leader but that are
+            missing from the file; `leader_skipped` (Boolean): the leader's leader is recorded as the leader;
+            `headway_error` (Float64): error of the recorded headway in m.
+        defects: all injected defects.
     """
 
     tracks: pl.DataFrame
     defects: list[Defect]
 
 
-def inject(
+def inject_defects(
     tracks: pl.DataFrame,
     plan: Plan,
     *,
@@ -54,16 +63,44 @@ def inject(
     """Damage the tracks of one subset.
 
     Args:
-        tracks: sorted by vehicle, frame, without gaps.
-        plan: how many of which.
-        rate_hz: frames per second.
-        on_ramp_lane: whose vehicles begin in mid-section by nature and so cannot start late.
-        unseen_leaders: make one overlap with a leader that misses frames (formats that record a headway to it).
-        random: draws the same vehicles for the same seed.
+        tracks: tracks sorted by vehicle, frame, without gaps.
+        plan: number of each defect.
+        rate_hz: frame rate.
+        on_ramp_lane: lane whose vehicles begin in mid-section and so cannot start late.
+        unseen_leaders: whether one overlap is with a leader that misses frames (for formats that record its headway).
+        random: generator of random numbers.
     """
+    work = _copy_tracks(tracks, rate_hz, random)
+    injectors: tuple[tuple[Injector, int], ...] = (
+        (_make_overlap_injector(unseen_leaders), plan.overlaps),
+        (_make_late_start_injector(on_ramp_lane), plan.late_starts),
+        (_inject_backward, int(plan.backward_share * len(work.begins))),
+        (_inject_frozen, plan.frozen),
+        (_inject_spike, plan.spikes),
+        (_inject_gap, plan.gaps),
+        (inject_jump, plan.jumps),
+        (inject_wrong_leader, plan.wrong_leaders),
+        (inject_wrong_headway, plan.wrong_headways),
+        (make_lane_flicker_injector(on_ramp_lane), plan.lane_flickers),
+    )
+    for injector, count in injectors:
+        _damage_vehicles(work, injector, count)
+    damaged = tracks.with_columns(
+        pl.Series("x", work.x),
+        pl.Series("speed", work.speed),
+        pl.Series("accel", work.accel),
+        pl.Series("lane", work.lane).cast(tracks.schema["lane"]),
+        pl.Series("lost", work.lost_later),
+        pl.Series("leader_skipped", work.leader_skipped),
+        pl.Series("headway_error", work.headway_error),
+    ).filter(~pl.Series(work.never_written))
+    return Injected(damaged, work.defects)
+
+
+def _copy_tracks(tracks: pl.DataFrame, rate_hz: float, random: np.random.Generator) -> DamagedTracks:
     vehicle = tracks["vehicle"].to_numpy().astype(np.int64)
-    begins = np.flatnonzero(np.diff(vehicle, prepend=-1))
-    work = Work(
+    begins = find_run_starts(vehicle)
+    return DamagedTracks(
         rate_hz=rate_hz,
         random=random,
         vehicle=vehicle,
@@ -81,45 +118,21 @@ def inject(
         leader_skipped=np.zeros(len(vehicle), bool),
         headway_error=np.zeros(len(vehicle)),
     )
-    backward = int(plan.backward_share * len(begins))
-    for each, count in (
-        (_overlap(unseen_leaders), plan.overlaps),
-        (_late_start(on_ramp_lane), plan.late_starts),
-        (_backward, backward),
-        (_frozen, plan.frozen),
-        (_spike, plan.spikes),
-        (_gap, plan.gaps),
-        (jump, plan.jumps),
-        (skip_leader, plan.wrong_leaders),
-        (misread_headway, plan.wrong_headways),
-        (change_lane_and_back(on_ramp_lane), plan.lane_flickers),
-    ):
-        _spread(work, each, count)
-    damaged = tracks.with_columns(
-        pl.Series("x", work.x),
-        pl.Series("speed", work.speed),
-        pl.Series("accel", work.accel),
-        pl.Series("lane", work.lane).cast(tracks.schema["lane"]),
-        pl.Series("lost", work.lost_later),
-        pl.Series("leader_skipped", work.leader_skipped),
-        pl.Series("headway_error", work.headway_error),
-    ).filter(~pl.Series(work.never_written))
-    return Injected(damaged, work.defects)
 
 
-def _spread(work: Work, inflict: Inflict, count: int) -> None:
-    """Damage up to `count` vehicles; those on which the defect makes no sense are passed by."""
-    for place in work.free():
+def _damage_vehicles(work: DamagedTracks, injector: Injector, count: int) -> None:
+    """Damage up to `count` vehicles; vehicles on which the defect is impossible are skipped."""
+    for place in work.draw_free_vehicles():
         if count == 0:
             return
-        if place not in work.used and inflict(work, place):
+        if place not in work.used and injector(work, place):
             work.used.add(place)
             count -= 1
 
 
-def _slowest(work: Work, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
-    """The run of `wanted` rows around the slowest row that is not near an end."""
-    rows = work.rows(place)
+def _find_slowest_run(work: DamagedTracks, place: int, wanted: int, margin: int) -> tuple[int, int] | None:
+    """Find the run of `wanted` rows from the slowest row that is not near an end."""
+    rows = work.find_rows(place)
     inner = work.speed[rows][margin : max(margin, rows.stop - rows.start - margin - wanted)]
     if not len(inner):
         return None
@@ -127,11 +140,11 @@ def _slowest(work: Work, place: int, wanted: int, margin: int) -> tuple[int, int
     return first, first + wanted - 1
 
 
-def _late_start(on_ramp_lane: int | None) -> Inflict:
-    def inflict(work: Work, place: int) -> bool:
-        """The first part of the track was never seen."""
-        rows = work.rows(place)
-        start = work.random.uniform(SHALLOWEST_START_M, DEEPEST_START_M)
+def _make_late_start_injector(on_ramp_lane: int | None) -> Injector:
+    def damage_vehicle(work: DamagedTracks, place: int) -> bool:
+        """Remove the first part of the track."""
+        rows = work.find_rows(place)
+        start = work.random.uniform(*LATE_START_M)
         first = rows.start
         if work.frame[first] <= work.rate_hz + 1 or work.lane[first] == on_ramp_lane or work.x[first] > 5:
             return False
@@ -139,19 +152,19 @@ def _late_start(on_ramp_lane: int | None) -> Inflict:
         if kept == first or rows.stop - kept < work.rate_hz:
             return False
         work.never_written[first:kept] = True
-        work.note("late_start", first, kept - 1, work.x[kept])
+        work.add_defect("late_start", first, kept - 1, work.x[kept])
         return True
 
-    return inflict
+    return damage_vehicle
 
 
-def _overlap(unseen_leaders: bool) -> Inflict:
+def _make_overlap_injector(unseen_leaders: bool) -> Injector:
     unseen = [unseen_leaders]
 
-    def inflict(work: Work, place: int) -> bool:
-        """For a while the vehicle drifts into its leader, where it is nearest to it, and back out again."""
-        ramp, deep = round(DRIFT_S * work.rate_hz), work.seconds(0.4, 1.6)
-        run = _nearest_to_leader(work, place, 2 * ramp + deep)
+    def damage_vehicle(work: DamagedTracks, place: int) -> bool:
+        """Let the vehicle drift into its leader, where it is nearest to it, and back out again."""
+        ramp, deep = round(DRIFT_S * work.rate_hz), work.draw_frames(0.4, 1.6)
+        run = _find_nearest_run(work, place, 2 * ramp + deep)
         if run is None:
             return False
         rows = slice(run[0], run[1] + 1)
@@ -164,27 +177,27 @@ def _overlap(unseen_leaders: bool) -> Inflict:
         rise = (1 - np.cos(np.pi * (np.arange(ramp) + 1) / (ramp + 1))) / 2
         share = np.concatenate([rise, np.ones(deep), rise[::-1]])
         gap = (1 - share) * (rear - work.x[rows]) - share * depth
-        # So near to touching, the file's rounding would decide whether it is an overlap.
+        # So near to touching, rounding in the file would decide whether it is an overlap.
         gap = np.where(np.abs(gap) < CLEAR_M, CLEAR_M, gap)
         work.x[rows] = rear - gap
         inside = np.flatnonzero(gap < 0) + rows.start
         work.used.add(ahead)
-        work.note("overlap", int(inside[0]), int(inside[-1]), depth)
+        work.add_defect("overlap", int(inside[0]), int(inside[-1]), depth)
         if unseen[0]:
-            # Some of the leader's entries are lost, but the headway to it has been recorded.
+            # Some of the leader's entries are lost, but the headway to it is recorded.
             unseen[0] = False
             lost = work.leader[inside][: max(1, len(inside) // 2)]
             work.lost_later[lost] = True
-            work.note("frame_gap", int(lost[0]), int(lost[-1]))
-            work.note("overlap_unseen", int(inside[0]), int(inside[0]) + len(lost) - 1, depth)
+            work.add_defect("frame_gap", int(lost[0]), int(lost[-1]))
+            work.add_defect("overlap_unseen", int(inside[0]), int(inside[0]) + len(lost) - 1, depth)
         return True
 
-    return inflict
+    return damage_vehicle
 
 
-def _nearest_to_leader(work: Work, place: int, wanted: int) -> tuple[int, int] | None:
-    """The run of `wanted` rows behind one leader around the smallest gap that is at most NEAREST_LEADER_M."""
-    rows = work.rows(place)
+def _find_nearest_run(work: DamagedTracks, place: int, wanted: int) -> tuple[int, int] | None:
+    """Find the run of `wanted` rows behind one leader around the smallest gap, of at most NEAREST_LEADER_M."""
+    rows = work.find_rows(place)
     leader = work.leader[rows]
     if rows.stop - rows.start < wanted or (leader < 0).all():
         return None
@@ -198,10 +211,10 @@ def _nearest_to_leader(work: Work, place: int, wanted: int) -> tuple[int, int] |
     return rows.start + first, rows.start + first + wanted - 1
 
 
-def _backward(work: Work, place: int) -> bool:
-    """The vehicle rolls back: a smooth swing where it is slow, wrong signs in its recorded speed where it is not."""
-    wanted = work.seconds(4.0, 5.0)
-    run = _slowest(work, place, wanted, margin=round(work.rate_hz / 2))
+def _inject_backward(work: DamagedTracks, place: int) -> bool:
+    """Let the vehicle roll back: smoothly if it is slow, else by wrong signs of its recorded speed."""
+    wanted = work.draw_frames(4.0, 5.0)
+    run = _find_slowest_run(work, place, wanted, margin=round(work.rate_hz / 2))
     if run is None:
         return False
     rows = slice(run[0], run[1] + 1)
@@ -213,7 +226,7 @@ def _backward(work: Work, place: int) -> bool:
         work.x[rows] -= depth / 2 * (1 - np.cos(phase))
         work.speed[rows] -= depth * np.pi / lasts * np.sin(phase)
         work.accel[rows] -= depth * 2 * np.pi**2 / lasts**2 * np.cos(phase)
-        # Rounded to nothing in the file, these would be slow and without acceleration by chance.
+        # Accelerations that the file rounds to 0 would break the rule of low constant speeds by chance.
         work.accel[rows] = np.where(np.abs(work.accel[rows]) < 0.02, 0.02, work.accel[rows])
     else:
         rows = slice(run[0], run[0] + max(1, wanted // 6))
@@ -221,37 +234,37 @@ def _backward(work: Work, place: int) -> bool:
     below = np.flatnonzero(work.speed[rows] < -0.02) + rows.start
     work.speed[rows] = np.where(np.abs(work.speed[rows]) <= 0.02, 0.05, work.speed[rows])
     for part in np.split(below, np.flatnonzero(np.diff(below) > 1) + 1):
-        work.note("backward", int(part[0]), int(part[-1]), work.speed[part].min())
+        work.add_defect("backward", int(part[0]), int(part[-1]), work.speed[part].min())
     return True
 
 
-def _frozen(work: Work, place: int) -> bool:
-    """A slow speed stays the same for a while, with exactly no acceleration."""
-    run = _slowest(work, place, work.seconds(0.4, 1.2), margin=round(work.rate_hz / 2))
+def _inject_frozen(work: DamagedTracks, place: int) -> bool:
+    """Keep a slow speed constant for a while, with an acceleration of exactly 0."""
+    run = _find_slowest_run(work, place, work.draw_frames(0.4, 1.2), margin=round(work.rate_hz / 2))
     if run is None:
         return False
     rows = slice(run[0], run[1] + 1)
     work.speed[rows] = work.random.uniform(0.1, 1.45)
     work.accel[rows] = 0.0
-    work.note("frozen_slow_speed", *run, work.speed[run[0]])
+    work.add_defect("frozen_slow_speed", *run, work.speed[run[0]])
     return True
 
 
-def _spike(work: Work, place: int) -> bool:
-    """The recorded acceleration is beyond what cars do."""
-    run = pick_run(work, place, work.seconds(0.05, 0.5), margin=2)
+def _inject_spike(work: DamagedTracks, place: int) -> bool:
+    """Record an acceleration that no vehicle reaches."""
+    run = draw_run(work, place, work.draw_frames(0.05, 0.5), margin=2)
     if run is None:
         return False
     work.accel[run[0] : run[1] + 1] = work.random.uniform(3.2, 9.0)
-    work.note("acceleration_spike", *run, work.accel[run[0]])
+    work.add_defect("acceleration_spike", *run, work.accel[run[0]])
     return True
 
 
-def _gap(work: Work, place: int) -> bool:
-    """Some frames in the middle of the track are missing."""
-    run = pick_run(work, place, work.seconds(0.1, 1.0), margin=round(work.rate_hz))
+def _inject_gap(work: DamagedTracks, place: int) -> bool:
+    """Remove some frames in the middle of the track."""
+    run = draw_run(work, place, work.draw_frames(0.1, 1.0), margin=round(work.rate_hz))
     if run is None:
         return False
     work.lost_later[run[0] : run[1] + 1] = True
-    work.note("frame_gap", *run)
+    work.add_defect("frame_gap", *run)
     return True

@@ -1,6 +1,6 @@
-"""What every rule of DESIGN section 5 finds in the written files, by a slow, obvious loop.
+"""Expected findings of every rule of DESIGN section 5 in the written files, by a slow, plain loop.
 
-It shares no code with the pipeline, its sources or its rules, so that equal counts mean something.
+The module shares no code with the pipeline, its sources or its rules, so that equal counts prove something.
 """
 
 import math
@@ -49,12 +49,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Surface:
-    """What is known of a subset's road and camera.
+    """The road and the camera of a subset.
 
     Args:
-        rate_hz: frames per second, 10 or 25.
-        markings: y of the lane markings, leftmost first; empty where unknown.
-        headway_stands_in: whether a recorded headway makes a gap to a leader without an entry in the frame.
+        rate_hz: frame rate, 10 or 25 Hz.
+        markings: y of the lane markings, leftmost first; empty = unknown.
+        headway_stands_in: whether a recorded headway gives the gap to a leader without an entry in the frame.
     """
 
     rate_hz: float = 10.0
@@ -64,13 +64,13 @@ class Surface:
 
 @dataclass
 class Scenery:
-    """A subset's entries, and where to find them."""
+    """The entries of a subset, indexed by frame and lane."""
 
     entries: dict[Key, Entry]
     surface: Surface
 
     def __post_init__(self) -> None:
-        """Put frames and lanes in order, and look at every track once."""
+        """Sort entries by frame and lane, and collect facts about every track."""
         self.lengths = {vehicle: entry.length for (vehicle, _), entry in self.entries.items()}
         self.in_frame: dict[int, list[Key]] = {}
         self.in_lane: dict[tuple[int, int], list[Key]] = {}
@@ -91,11 +91,11 @@ class Scenery:
         self.from_fronts = self._counts_from_fronts()
 
     def near(self, key: Key, frames: int) -> Entry | None:
-        """The vehicle's entry so many frames later (before: negative)."""
+        """Return the vehicle's entry a number of frames later (negative: earlier)."""
         return self.entries.get((key[0], key[1] + frames))
 
     def gap(self, key: Key) -> float | None:
-        """Bumper to bumper, m; None where it cannot be known."""
+        """Compute the gap from bumper to bumper in m; None = unknown."""
         own = self.entries[key]
         if own.leader == 0:
             return None
@@ -108,7 +108,7 @@ class Scenery:
         return None
 
     def recorded_gap(self, key: Key) -> float | None:
-        """The recorded headway from bumper to bumper, m."""
+        """Compute the gap from bumper to bumper in m by the recorded headway."""
         own = self.entries[key]
         if own.leader == 0 or own.headway is None or own.leader not in self.lengths:
             return None
@@ -127,7 +127,7 @@ class Scenery:
         return as_fronts <= median(abs(front + length - gap) for front, length, gap in known)
 
     def past_accel(self, key: Key, tenths: int) -> float | None:
-        """The acceleration so many tenths of a second before, between two frames the mean of theirs."""
+        """Return the acceleration some tenths of a second before; between two frames the mean of both."""
         frames = tenths * self.surface.rate_hz / 10
         if self.unbroken[key] < frames:
             return None
@@ -135,36 +135,36 @@ class Scenery:
         return (self.entries[key[0], key[1] - low].accel + self.entries[key[0], key[1] - high].accel) / 2
 
 
-def judge_gap(scene: Scenery, key: Key) -> bool:
-    """negative_headway."""
+def breaks_negative_headway(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks negative_headway."""
     gap = scene.gap(key)
     return gap is not None and gap < 0
 
 
-def judge_recorded_gap(scene: Scenery, key: Key) -> bool:
-    """negative_headway_recorded."""
+def breaks_negative_headway_recorded(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks negative_headway_recorded."""
     gap = scene.recorded_gap(key)
     return gap is not None and gap < 0
 
 
-def judge_acceleration(scene: Scenery, key: Key) -> bool:
-    """high_acceleration."""
+def breaks_high_acceleration(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks high_acceleration."""
     return scene.entries[key].accel > HIGH_ACCELERATION_MPS2
 
 
-def judge_constant_speed(scene: Scenery, key: Key) -> bool:
-    """low_constant_speed."""
+def breaks_low_constant_speed(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks low_constant_speed."""
     entry = scene.entries[key]
     return 0 < entry.speed <= LOW_SPEED_MPS and entry.accel == 0
 
 
-def judge_direction(scene: Scenery, key: Key) -> bool:
-    """Rule backward."""
+def breaks_backward(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks backward."""
     return scene.entries[key].speed < 0
 
 
-def judge_jump(scene: Scenery, key: Key) -> bool:
-    """position_jump."""
+def breaks_position_jump(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks position_jump."""
     before, now = scene.near(key, -1), scene.entries[key]
     if before is None:
         return False
@@ -172,13 +172,13 @@ def judge_jump(scene: Scenery, key: Key) -> bool:
     return round(abs(now.front - before.front - way), 6) > JUMP_M
 
 
-def judge_frames(scene: Scenery, key: Key) -> bool:
-    """frame_gap: the frame before is missing, and there are earlier ones."""
+def breaks_frame_gap(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks frame_gap: the frame before is missing, and there are earlier ones."""
     return scene.near(key, -1) is None and scene.first_frames[key[0]] < key[1]
 
 
-def judge_overlap(scene: Scenery, key: Key) -> bool:
-    """overlap: the boxes meet along and across the road, by half a millimetre or more."""
+def breaks_overlap(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks overlap: the boxes meet along and across the road, by half a millimetre or more."""
     own, keys = scene.entries[key], scene.in_frame[key[1]]
     for step in (-1, 1):
         place = scene.frame_place[key] + step
@@ -194,8 +194,8 @@ def judge_overlap(scene: Scenery, key: Key) -> bool:
     return False
 
 
-def judge_speed(scene: Scenery, key: Key) -> bool:
-    """speed_mismatch: against the positions 0.1 s before and after."""
+def breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks speed_mismatch: against the positions 0.1 s before and after."""
     steps = (1,) if scene.surface.rate_hz == 10 else (2, 3)
     if any(scene.near(key, step) is None for step in range(-steps[-1], steps[-1] + 1)):
         return False
@@ -204,14 +204,14 @@ def judge_speed(scene: Scenery, key: Key) -> bool:
     return round(abs(scene.entries[key].speed - (ahead - behind) / 0.2), 4) > SPEED_DIFFERENCE_MPS
 
 
-def judge_jerk(scene: Scenery, key: Key) -> bool:
-    """high_jerk."""
+def breaks_high_jerk(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks high_jerk."""
     before = scene.past_accel(key, 1)
     return before is not None and round(abs(scene.entries[key].accel - before) / 0.1, 3) > HIGH_JERK_MPS3
 
 
-def judge_jerk_signs(scene: Scenery, key: Key) -> bool:
-    """jerk_flicker: more than one change of sign among the jerks of the last second."""
+def breaks_jerk_flicker(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks jerk_flicker: more than one change of sign among the jerks of the last second."""
     accels = [scene.past_accel(key, tenths) for tenths in range(10, -1, -1)]
     signs = []
     for before, now in pairwise(accels):
@@ -220,8 +220,8 @@ def judge_jerk_signs(scene: Scenery, key: Key) -> bool:
     return sum(before != now for before, now in pairwise(signs)) > 1
 
 
-def judge_lane_stay(scene: Scenery, key: Key) -> bool:
-    """lane_flicker: walk back and forth to where the lane changes; it must be the same lane on either side."""
+def breaks_lane_flicker(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks lane_flicker: the lanes before and after its stay are the same, and it is short."""
     if scene.lane_changes.get(key[0], 0) < 2:
         return False
     lane = scene.entries[key].lane
@@ -235,8 +235,8 @@ def judge_lane_stay(scene: Scenery, key: Key) -> bool:
     return None not in around and around[0] == around[1] and stay / scene.surface.rate_hz <= FLICKER_S
 
 
-def judge_leader(scene: Scenery, key: Key) -> bool:
-    """leader_mismatch, with positions in tenths of a millimetre."""
+def breaks_leader_mismatch(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks leader_mismatch, with positions in tenths of a millimetre."""
     own = scene.entries[key]
     place = round(own.front * 10000)
     ahead_of = scene.in_lane[key[1], own.lane][scene.lane_place[key] + 1 :]
@@ -251,22 +251,22 @@ def judge_leader(scene: Scenery, key: Key) -> bool:
     return leader.lane != own.lane or ahead < 0 or (nearest is not None and ahead > nearest)
 
 
-def judge_headway(scene: Scenery, key: Key) -> bool:
-    """headway_mismatch."""
+def breaks_headway_mismatch(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks headway_mismatch."""
     gap, recorded = scene.gap(key), scene.recorded_gap(key)
     return gap is not None and recorded is not None and round(abs(recorded - gap), 3) > HEADWAY_DIFFERENCE_M
 
 
-def judge_size(scene: Scenery, key: Key) -> bool:
-    """implausible_size."""
+def breaks_implausible_size(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks implausible_size."""
     entry = scene.entries[key]
     shortest, longest, narrowest, widest = SIZES_M[entry.kind]
     inside = shortest <= round(entry.length, 4) <= longest and narrowest <= round(entry.width, 4) <= widest
     return not inside
 
 
-def judge_lane(scene: Scenery, key: Key) -> bool:
-    """outside_lane, where markings are known."""
+def breaks_outside_lane(scene: Scenery, key: Key) -> bool:
+    """Test whether an entry breaks outside_lane, where markings are known."""
     entry, markings = scene.entries[key], scene.surface.markings
     if not 1 <= entry.lane < len(markings):
         return False
@@ -274,46 +274,36 @@ def judge_lane(scene: Scenery, key: Key) -> bool:
     return round(left - entry.y, 3) > 0 or round(entry.y - right, 3) > 0
 
 
-JUDGES: dict[str, Callable[[Scenery, Key], bool]] = {
-    "negative_headway": judge_gap,
-    "negative_headway_recorded": judge_recorded_gap,
-    "high_acceleration": judge_acceleration,
-    "low_constant_speed": judge_constant_speed,
-    "backward": judge_direction,
-    "position_jump": judge_jump,
-    "frame_gap": judge_frames,
-    "overlap": judge_overlap,
-    "speed_mismatch": judge_speed,
-    "high_jerk": judge_jerk,
-    "jerk_flicker": judge_jerk_signs,
-    "lane_flicker": judge_lane_stay,
-    "leader_mismatch": judge_leader,
-    "headway_mismatch": judge_headway,
-    "implausible_size": judge_size,
-    "outside_lane": judge_lane,
+RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {
+    "negative_headway": breaks_negative_headway,
+    "negative_headway_recorded": breaks_negative_headway_recorded,
+    "high_acceleration": breaks_high_acceleration,
+    "low_constant_speed": breaks_low_constant_speed,
+    "backward": breaks_backward,
+    "position_jump": breaks_position_jump,
+    "frame_gap": breaks_frame_gap,
+    "overlap": breaks_overlap,
+    "speed_mismatch": breaks_speed_mismatch,
+    "high_jerk": breaks_high_jerk,
+    "jerk_flicker": breaks_jerk_flicker,
+    "lane_flicker": breaks_lane_flicker,
+    "leader_mismatch": breaks_leader_mismatch,
+    "headway_mismatch": breaks_headway_mismatch,
+    "implausible_size": breaks_implausible_size,
+    "outside_lane": breaks_outside_lane,
 }
-"""Whether an entry breaks a rule, by the rule's name."""
+"""Functions that test whether an entry breaks a rule, by the rule's name."""
 
 
 def find_broken(entries: dict[Key, Entry], surface: Surface) -> Iterator[tuple[str, list[Key]]]:
-    """Per rule: the entries that break it, sorted.
-
-    Args:
-        entries: of one subset.
-        surface: of that subset.
-    """
+    """Find the entries of one subset that break each rule, sorted."""
     scene = Scenery(entries, surface)
-    for rule, judge in JUDGES.items():
-        yield rule, [key for key in sorted(entries) if judge(scene, key)]
+    for rule, breaks_rule in RULE_TESTS.items():
+        yield rule, [key for key in sorted(entries) if breaks_rule(scene, key)]
 
 
 def count_rules(entries: dict[Key, Entry], surface: Surface) -> dict[str, tuple[int, int, int]]:
-    """Per rule: entries, vehicles and runs of consecutive frames that break it.
-
-    Args:
-        entries: of one subset.
-        surface: of that subset.
-    """
+    """Count the entries, vehicles and runs of consecutive frames of one subset that break each rule."""
     counts = {}
     for rule, keys in find_broken(entries, surface):
         runs = 0

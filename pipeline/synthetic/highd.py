@@ -1,4 +1,4 @@
-"""highD's three CSVs per recording, exactly as shipped.
+"""Files in highD's format: three CSVs per recording, exactly as shipped.
 
 Choices where the format leaves some: `dhw` is bumper to bumper (0 without a leader); `thw` = dhw / own speed and
 `ttc` = dhw / closing speed, both 0 where that speed is 0 or there is no leader; `numFrames`, `initialFrame` and
@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from tracklake.pipeline.synthetic.misreadings import headway_errors, recorded_leaders
-from tracklake.pipeline.synthetic.neighbors import find_surroundings, pick
+from tracklake.pipeline.synthetic.neighbors import find_surroundings, gather_values
+from tracklake.pipeline.synthetic.recording_errors import get_headway_errors, select_recorded_leaders
 from tracklake.pipeline.synthetic.scenarios import HighdScenario
-
-Floats = npt.NDArray[np.float64]
+from tracklake.schemas.arrays import Floats
 
 UPPER_FIRST_MARKING_M = 8.5
 MEDIAN_M = 4.2
@@ -53,20 +52,20 @@ class HighdFiles:
     tracks: str
 
 
-def place_markings(lanes: int, lane_width_m: float) -> Markings:
-    """Both carriageways of a site with equally many lanes."""
+def build_markings(lanes: int, lane_width_m: float) -> Markings:
+    """Build the markings of a site with the same number of lanes on both carriageways."""
     upper = tuple(round(UPPER_FIRST_MARKING_M + i * lane_width_m, 2) for i in range(lanes + 1))
     return Markings(upper, tuple(round(upper[-1] + MEDIAN_M + i * lane_width_m, 2) for i in range(lanes + 1)))
 
 
-def image_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_m: float) -> pl.DataFrame:
-    """One carriageway's rows of the tracks file, in image coordinates.
+def build_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_m: float) -> pl.DataFrame:
+    """Build one carriageway's rows of the tracks file, in image coordinates.
 
     Args:
-        tracks: generator's columns, those of `lost` entries included; x from the entrance in the direction of travel.
-        markings: of the site.
-        upper: drives left.
-        window_m: length of the window.
+        tracks: tracks of the generator, `lost` entries included; x from the entrance in the direction of travel.
+        markings: lane markings of the site.
+        upper: whether it is the upper carriageway, which drives left.
+        window_m: length of the window in m.
 
     Returns:
         The file's 25 columns, rounded as in the file, lost entries removed, sorted by id, frame.
@@ -81,10 +80,10 @@ def image_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_
     middle_y = markings.upper[-1] - y if upper else markings.lower[0] + y
     front = window_m - corner_x if upper else corner_x + length
     around = find_surroundings(tracks.with_columns(pl.Series("x", front)))
-    around = replace(around, leader=recorded_leaders(around.leader, tracks))
+    around = replace(around, leader=select_recorded_leaders(around.leader, tracks))
     led = around.leader >= 0
-    gap: Floats = np.where(led, pick(front - length, around.leader) - front + headway_errors(tracks), 0.0)
-    leader_speed = pick(speed, around.leader)
+    gap: Floats = np.where(led, gather_values(front - length, around.leader) - front + get_headway_errors(tracks), 0.0)
+    leader_speed = gather_values(speed, around.leader)
     x_speed, y_speed = np.round(sign * speed, 2), sign * lateral
     rate_of = _central_acceleration(tracks, y_speed)
     closing = np.round(speed, 2) - np.round(leader_speed, 2)
@@ -105,7 +104,7 @@ def image_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_
         "thw": _divide(gap, np.round(speed, 2)),
         "ttc": _divide(gap, closing),
         "precedingXVelocity": np.where(led, sign * leader_speed, 0.0),
-        **{name: pick(vehicle, getattr(around, where)) for name, where in NEIGHBORS.items()},
+        **{name: gather_values(vehicle, getattr(around, where)) for name, where in NEIGHBORS.items()},
         "laneId": lanes + 2 - lane if upper else lane + lanes + 2,
     }
     # Adding zero turns -0.00 into 0.00.
@@ -122,14 +121,14 @@ def _divide(gap: Floats, speed: Floats) -> Floats:
 
 
 def _central_acceleration(tracks: pl.DataFrame, speed: Floats) -> Floats:
-    """Difference of the lateral speed to the entry before, at 25 Hz; 0 for a track's first entry."""
+    """Compute the change of lateral speed since the entry before, at 25 Hz; 0 for a track's first entry."""
     same = np.diff(tracks["vehicle"].to_numpy(), prepend=-1) == 0
     steps: Floats = np.where(same, np.diff(speed, prepend=0.0) * 25.0, 0.0)
     return steps
 
 
 def describe_tracks(rows: pl.DataFrame, classes: Mapping[int, str], *, driving_direction: int) -> pl.DataFrame:
-    """Metadata of the tracks of one carriageway, from the very rows of its tracks file."""
+    """Compute the metadata of one carriageway's tracks from the rows of its tracks file."""
     speed = pl.col("xVelocity").abs()
     least = {
         "minDHW": pl.col("dhw").filter(pl.col("precedingId") != 0).min(),
@@ -161,19 +160,19 @@ def describe_tracks(rows: pl.DataFrame, classes: Mapping[int, str], *, driving_d
 
 
 def build_recording(scenario: HighdScenario, upper: pl.DataFrame, lower: pl.DataFrame, *, frames: int) -> HighdFiles:
-    """The three files of one recording.
+    """Build the three files of one recording.
 
     Args:
         scenario: names, site and time.
-        upper: tracks of the carriageway that drives left; with the column `lost`.
-        lower: tracks of the other; no vehicle stands in both.
-        frames: length of the recording.
+        upper: tracks of the carriageway that drives left, with the column `lost`.
+        lower: tracks of the other carriageway; no vehicle is in both.
+        frames: length of the recording in frames.
     """
-    markings = place_markings(scenario.road.lanes, scenario.road.lane_width_m)
+    markings = build_markings(scenario.road.lanes, scenario.road.lane_width_m)
     window = scenario.road.window_m
     rows, meta = [], []
     for tracks, is_upper, direction in ((upper, True, 1), (lower, False, 2)):
-        seen = image_rows(tracks, markings, upper=is_upper, window_m=window)
+        seen = build_rows(tracks, markings, upper=is_upper, window_m=window)
         classes = {
             vehicle: CLASSES[v_class] for vehicle, v_class in tracks.select("vehicle", "v_class").unique().iter_rows()
         }

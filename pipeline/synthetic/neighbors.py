@@ -1,4 +1,4 @@
-"""Who drives around whom, from positions: the ids and headways that the publishers' files carry."""
+"""Neighbors of every row, from positions: the ids that the publishers' files carry."""
 
 from dataclasses import dataclass
 from typing import TypeVar
@@ -7,17 +7,20 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-Integers = npt.NDArray[np.int64]
+from tracklake.schemas.arrays import Integers
+
 Number = TypeVar("Number", bound=np.generic)
 
-NOBODY = -1
-PLACES = (pl.col("x"), pl.col("x") - pl.col("length"))
-"""Front and rear."""
+NO_ROW = -1
+"""Row number that means none."""
+
+ENDS = (pl.col("x"), pl.col("x") - pl.col("length"))
+"""Positions of a vehicle's front and rear."""
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Row numbers of the vehicles around each row, NOBODY (-1) where there are none; all of shape (rows,).
+    """Row numbers of the vehicles around each row, (rows,) each; NO_ROW = none.
 
     `leader` and `follower` are next in the own lane, by front positions. In the lanes beside it, `preceding` has its
     rear ahead of the own front, `following` its front behind the own rear, and `alongside` is the nearest between.
@@ -34,17 +37,17 @@ class Surroundings:
 
 
 def find_surroundings(tracks: pl.DataFrame) -> Surroundings:
-    """Look around in every frame.
+    """Find the vehicles around each row.
 
     Args:
-        tracks: columns vehicle, frame, lane, x, length; x is the front, increasing in the direction of travel. They
-            are compared to three decimals, so that equal positions of a file are equal here.
+        tracks: columns vehicle, frame, lane, x, length; x is the front, increasing in the direction of travel.
+            Positions are compared to three decimals, so that equal positions of a file are equal here.
     """
     frame, lane, vehicle = (tracks[name].to_numpy().astype(np.int64) for name in ("frame", "lane", "vehicle"))
-    front, rear = (np.rint(tracks.select(place).to_series().to_numpy() * 1000).astype(np.int64) for place in PLACES)
+    front, rear = (np.rint(tracks.select(place).to_series().to_numpy() * 1000).astype(np.int64) for place in ENDS)
     order = np.lexsort((vehicle, front, lane, frame))
     same_lane = (np.diff(frame[order]) == 0) & (np.diff(lane[order]) == 0)
-    leader, follower = np.full(len(order), NOBODY), np.full(len(order), NOBODY)
+    leader, follower = np.full(len(order), NO_ROW), np.full(len(order), NO_ROW)
     leader[order[:-1][same_lane]] = order[1:][same_lane]
     follower[order[1:][same_lane]] = order[:-1][same_lane]
     left = _beside(frame, lane, front, rear, -1)
@@ -53,10 +56,10 @@ def find_surroundings(tracks: pl.DataFrame) -> Surroundings:
 
 
 def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, side: int) -> list[Integers]:
-    """Preceding, alongside and following rows in the lane next to one's own.
+    """Find preceding, alongside and following rows in an adjacent lane.
 
-    Positions become distances along one long line on which every (frame, lane) has its own stretch, so that one
-    binary search serves all frames.
+    Positions become distances along one line on which every (frame, lane) has its own stretch, so that one binary
+    search serves all frames.
     """
     if not len(frame):
         return [np.empty(0, np.int64)] * 3
@@ -67,9 +70,9 @@ def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, si
     fronts, rears = (own + front)[by_front], (own + rear)[by_rear]
     preceding = _valid(by_rear, np.searchsorted(rears, target + front, side="right"), own, target)
     following = _valid(by_front, np.searchsorted(fronts, target + rear, side="left") - 1, own, target)
-    # Alongside: of the nearest fronts at and behind, at and ahead of the own front, those that overlap lengthwise.
+    # Alongside: the nearest fronts behind and ahead of the own front that overlap lengthwise.
     near = np.searchsorted(fronts, target + front, side="left")
-    alongside = np.full(len(frame), NOBODY)
+    alongside = np.full(len(frame), NO_ROW)
     least = np.full(len(frame), np.iinfo(np.int64).max)
     for step in (-1, 0):
         candidate = _valid(by_front, near + step, own, target)
@@ -81,14 +84,14 @@ def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, si
 
 
 def _valid(order: Integers, place: Integers, own: Integers, target: Integers) -> Integers:
-    """Rows at these places of a sorted order, NOBODY where the place lies outside the searched lane and frame."""
+    """Return the rows at positions of a sorted order, NO_ROW outside the searched lane and frame."""
     inside = (place >= 0) & (place < len(order))
     rows = order[np.clip(place, 0, len(order) - 1)]
-    found: Integers = np.where(inside & (own[rows] == target), rows, NOBODY)
+    found: Integers = np.where(inside & (own[rows] == target), rows, NO_ROW)
     return found
 
 
-def pick(values: npt.NDArray[Number], rows: Integers) -> npt.NDArray[Number]:
-    """The values at those rows, zero where there is no row."""
+def gather_values(values: npt.NDArray[Number], rows: Integers) -> npt.NDArray[Number]:
+    """Gather the values at rows; 0 for NO_ROW."""
     found: npt.NDArray[Number] = np.where(rows >= 0, values[rows], np.zeros(1, dtype=values.dtype))
     return found

@@ -1,4 +1,4 @@
-"""NGSIM's trajectory files: the original 18-column text, the same as CSV, and the portal's 25-column export.
+"""Files in NGSIM's formats: the original 18-column text, the same as CSV, and the portal's 25-column export.
 
 Choices where the format leaves some: Total_Frames counts the rows of the vehicle in the file, so that neither what a
 late start lost nor a missing frame is in it; Space_Headway is front to front; Time_Headway is 9999.99 for a standing
@@ -11,8 +11,8 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.synthetic.misreadings import headway_errors, recorded_leaders
-from tracklake.pipeline.synthetic.neighbors import find_surroundings, pick
+from tracklake.pipeline.synthetic.neighbors import find_surroundings, gather_values
+from tracklake.pipeline.synthetic.recording_errors import get_headway_errors, select_recorded_leaders
 
 FOOT_M = 0.3048
 LOCATION = "us-101"
@@ -21,7 +21,7 @@ ZONE = ZoneInfo("America/Los_Angeles")
 STANDING_HEADWAY = 9999.99
 ORIGIN_FT = (6_451_110.0, 1_873_360.0)
 HEADING_RAD = -0.7653
-"""Where the section begins on the state's plane and which way it runs: only Global_X and Global_Y know of it."""
+"""Direction of the section on the state's plane in rad; only Global_X and Global_Y depend on it."""
 
 COLUMNS = (
     "Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y", "v_Length",
@@ -42,26 +42,23 @@ SEPARATED = ("Total_Frames", "Preceding", "Following", "Space_Headway", "Time_He
 TEXT_WIDTHS = (5, 6, 6, 14, 8, 9, 12, 12, 5, 5, 2, 6, 7, 3, 6, 6, 9, 8)
 
 
-def global_time_base(start_time: str) -> int:
-    """Global_Time - 100 * Frame_ID of a recording whose frame 1 is at that local time (`HH:MM`) of the day."""
+def compute_time_key(start_time: str) -> int:
+    """Compute Global_Time - 100 * Frame_ID of a recording whose frame 1 is at a local time (`HH:MM`) of the day."""
     local = datetime.fromisoformat(f"{DAY}T{start_time}").replace(tzinfo=ZONE)
     return round(local.timestamp() * 1000) - 100
 
 
-def recording_name(start_time: str) -> str:
-    """Site, local date and local time of frame 1, as recordings of unknown time keys are named."""
+def name_recording(start_time: str) -> str:
+    """Name a recording by site, local date and local time of frame 1, as unpublished recordings are named."""
     return f"{LOCATION}-{DAY.replace('-', '')}-{start_time.replace(':', '')}00"
 
 
-def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
-    """A recording's 18 columns, in feet, rounded as in the files, lost entries removed.
+def build_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
+    """Build a recording's 18 columns, in feet, rounded as in the files, sorted by Vehicle_ID, Frame_ID.
 
     Args:
-        tracks: generator's columns, those of `lost` entries included.
+        tracks: tracks of the generator; `lost` entries are removed.
         start_time: local time of frame 1, `HH:MM`.
-
-    Returns:
-        Sorted by Vehicle_ID, Frame_ID.
     """
     x_ft, y_ft, length_ft, width_ft, speed, accel = (
         tracks[name].to_numpy() / FOOT_M for name in ("x", "y", "length", "width", "speed", "accel")
@@ -69,9 +66,9 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
     x_ft, y_ft, speed = np.round(x_ft, 3), np.round(y_ft, 3), np.round(speed, 2) + 0.0
     vehicle, frame = tracks["vehicle"].to_numpy(), tracks["frame"].to_numpy().astype(np.int64)
     around = find_surroundings(tracks.with_columns(pl.Series("x", x_ft), pl.Series("length", length_ft)))
-    leader = recorded_leaders(around.leader, tracks)
+    leader = select_recorded_leaders(around.leader, tracks)
     led = leader >= 0
-    headway = np.where(led, np.round(pick(x_ft, leader) - x_ft + headway_errors(tracks) / FOOT_M, 2), 0.0)
+    headway = np.where(led, np.round(gather_values(x_ft, leader) - x_ft + get_headway_errors(tracks) / FOOT_M, 2), 0.0)
     moving = speed > 0
     seconds = np.divide(headway, speed, out=np.full_like(headway, STANDING_HEADWAY), where=moving)
     east, north = np.cos(HEADING_RAD), np.sin(HEADING_RAD)
@@ -80,7 +77,7 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
             "Vehicle_ID": vehicle,
             "Frame_ID": frame,
             "Total_Frames": frame,
-            "Global_Time": global_time_base(start_time) + 100 * frame,
+            "Global_Time": compute_time_key(start_time) + 100 * frame,
             "Local_X": y_ft,
             "Local_Y": x_ft,
             "Global_X": ORIGIN_FT[0] + east * x_ft + north * y_ft,
@@ -91,8 +88,8 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
             "v_Vel": speed,
             "v_Acc": accel,
             "Lane_ID": tracks["lane"],
-            "Preceding": pick(vehicle, leader),
-            "Following": pick(vehicle, around.follower),
+            "Preceding": gather_values(vehicle, leader),
+            "Following": gather_values(vehicle, around.follower),
             "Space_Headway": headway,
             "Time_Headway": np.where(led, np.minimum(seconds, STANDING_HEADWAY), 0.0),
         }
@@ -105,7 +102,7 @@ def feet_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
 
 
 def fixed(column: str, decimals: int) -> pl.Expr:
-    """A number as text with exactly so many decimals, never `-0.00`."""
+    """Format a number with a fixed number of decimals, never as `-0.00`."""
     scaled = (pl.col(column) * 10**decimals).round().cast(pl.Int64)
     sign = pl.when(scaled < 0).then(pl.lit("-")).otherwise(pl.lit(""))
     whole, part = (scaled.abs() // 10**decimals).cast(pl.String), (scaled.abs() % 10**decimals).cast(pl.String)
@@ -118,19 +115,19 @@ def _as_text(rows: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def text_lines(rows: pl.DataFrame) -> list[str]:
-    """Lines of the original text: 18 columns, right-aligned, blanks between, no header."""
+def format_text(rows: pl.DataFrame) -> list[str]:
+    """Format lines of the original text: 18 columns, right-aligned, separated by blanks, no header."""
     padded = (pl.col(name).str.pad_start(width) for name, width in zip(COLUMNS, TEXT_WIDTHS, strict=True))
     return _as_text(rows).select(pl.concat_str(padded, separator=" ")).to_series().to_list()
 
 
-def csv_lines(rows: pl.DataFrame) -> list[str]:
-    """Lines of the 18 columns as CSV, the header first."""
+def format_csv(rows: pl.DataFrame) -> list[str]:
+    """Format lines of the 18 columns as CSV, the header first."""
     return [",".join(COLUMNS), *_as_text(rows).select(pl.concat_str(pl.all(), separator=",")).to_series().to_list()]
 
 
-def portal_lines(rows: pl.DataFrame) -> list[str]:
-    """Lines of the 25-column export, the header first, in the order of `rows`; without BOM and line ends.
+def format_portal(rows: pl.DataFrame) -> list[str]:
+    """Format lines of the 25-column export, the header first, without BOM and line ends.
 
     Trailing zeros are trimmed (`15`, `33.96`), thousands separated and quoted (`"1,156"`) in SEPARATED.
     """
@@ -149,8 +146,8 @@ def portal_lines(rows: pl.DataFrame) -> list[str]:
     ]
 
 
-def shuffle_like_the_portal(rows: pl.DataFrame, random: np.random.Generator) -> pl.DataFrame:
-    """Put rows into an order like the export's: vehicle after vehicle at random, many of them last frame first."""
+def shuffle_rows(rows: pl.DataFrame, random: np.random.Generator) -> pl.DataFrame:
+    """Shuffle rows like the portal's export: vehicles in random order, many of them last frame first."""
     keys = rows.select("Global_Time", "Frame_ID", "Vehicle_ID").with_columns(
         base=pl.col("Global_Time") - 100 * pl.col("Frame_ID")
     )

@@ -1,21 +1,22 @@
-"""Tracking noise: what a camera adds to the simulator's exact positions, speeds and accelerations."""
+"""Tracking noise: errors that a camera adds to the simulator's exact positions, speeds and accelerations."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from tracklake.pipeline.synthetic.scenarios import Road
-from tracklake.pipeline.synthetic.sumo import lanes_at
-
-Floats = npt.NDArray[np.float64]
+from tracklake.pipeline.synthetic.sumo import compute_lanes
+from tracklake.schemas.arrays import Floats
 
 CALM_MPS = 2.0
-"""Below this speed the noise of speeds and accelerations fades out: a standing vehicle is recorded as standing."""
+"""Speed below which the noise of speeds and accelerations fades out, in m/s; a standing vehicle has none."""
+
 SLOW_MPS = 1.7
+"""Speed below which accelerations are at least LEAST_ACCEL_MPS2, in m/s."""
+
 LEAST_ACCEL_MPS2 = 0.02
-"""A slow vehicle is never recorded with exactly no acceleration by chance: only injected defects are."""
+"""Least acceleration of slow vehicles, in m/s2, so that only injected defects have exactly 0."""
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,10 @@ class Noise:
     """Standard deviations; position noise is smooth over about half a second, as that of a tracker is.
 
     Args:
-        along_m: of the position along the road.
-        across_m: of the position across it.
-        speed_mps: of the recorded speed.
-        accel_mps2: of the recorded acceleration.
+        along_m: noise of the position along the road.
+        across_m: noise of the position across the road.
+        speed_mps: noise of the recorded speed.
+        accel_mps2: noise of the recorded acceleration.
     """
 
     along_m: float
@@ -40,14 +41,7 @@ MAST = Noise(along_m=0.08, across_m=0.06, speed_mps=0.10, accel_mps2=0.15)
 
 
 def add_noise(tracks: pl.DataFrame, road: Road, noise: Noise, random: np.random.Generator) -> pl.DataFrame:
-    """Add tracking noise; the lane is that of the noisy position, the on-ramp excepted.
-
-    Args:
-        tracks: sorted by vehicle, frame.
-        road: whose lanes they are in.
-        noise: how much.
-        random: draws the same numbers for the same seed.
-    """
+    """Add noise to tracks sorted by vehicle, frame; the lane is that of the noisy position, except on the on-ramp."""
     rows = tracks.height
     width = max(3, round(road.rate_hz / 2))
     speed = tracks["speed"].to_numpy()
@@ -56,7 +50,7 @@ def add_noise(tracks: pl.DataFrame, road: Road, noise: Noise, random: np.random.
     noisy_speed = np.maximum(speed + noise.speed_mps * calm * _smooth(random, rows, width), 0)
     still = np.abs(accel) < LEAST_ACCEL_MPS2
     nudged = np.where((noisy_speed > 0) & (noisy_speed < SLOW_MPS) & still, LEAST_ACCEL_MPS2, accel)
-    # SUMO keeps creeping vehicles below a millimetre per second; a recording has either nothing or a centimetre.
+    # SUMO lets vehicles creep below a millimetre per second; a recording has either 0 or a centimetre per second.
     noisy_speed = np.where(noisy_speed < 0.01, 0, noisy_speed)
     return tracks.with_columns(
         pl.Series("x", tracks["x"].to_numpy() + noise.along_m * _smooth(random, rows, width)),
@@ -64,11 +58,11 @@ def add_noise(tracks: pl.DataFrame, road: Road, noise: Noise, random: np.random.
         pl.Series("speed", noisy_speed),
         pl.Series("accel", nudged),
         on_ramp=pl.lit(road.ramp) & (pl.col("lane") == road.lanes + 2),
-    ).with_columns(lane=lanes_at(road)).drop("on_ramp")  # fmt: skip
+    ).with_columns(lane=compute_lanes(road)).drop("on_ramp")  # fmt: skip
 
 
 def _smooth(random: np.random.Generator, rows: int, width: int) -> Floats:
-    """Normal noise of unit variance whose neighbours are alike over about `width` rows."""
+    """Draw normal noise of unit variance that is correlated over about `width` rows."""
     window = np.hanning(2 * width + 3)
     kernel = window / np.sqrt(np.sum(window**2))
     noise: Floats = np.convolve(random.standard_normal(rows + len(kernel) - 1), kernel, mode="valid")

@@ -1,16 +1,16 @@
-"""What is recorded: roads, traffic and how many defects of each kind, as data."""
+"""Scenarios of the sample as data: roads, traffic and the number of defects of each kind."""
 
 from dataclasses import dataclass, field
 
 FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata")
-"""Every raw format the generator writes."""
+"""Raw formats that the generator writes."""
 
 DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata")
-"""What a sample holds unless told otherwise."""
+"""Formats of a sample, unless set."""
 
 LEAST_MINUTES = 0.1
 MOST_MINUTES = 15.0
-"""The NGSIM-like recordings begin 15 minutes apart."""
+"""Longest unit of the recordings' length, in minutes; the NGSIM-like recordings begin 15 minutes apart."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Plan:
-    """How many vehicles of a subset get which defect; fewer where a short recording offers no more.
+    """The number of vehicles of a subset with each defect; fewer if the recording is too short.
 
     Args:
         late_starts: vehicles that lose the first part of their track.
@@ -65,13 +65,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Who drives on a carriageway.
+    """The traffic of a carriageway.
 
     Args:
         arrivals: vehicles per main lane and second.
         trucks: their share.
         bottleneck_mps: speed in the zone behind the window that holds the traffic up; None = free flow.
-        pulsing: for 15 of every 40 s that zone admits hardly anybody, so that waves of standing traffic run upstream.
+        pulsing: for 15 of every 40 s that zone admits hardly any vehicles, which causes waves of standing traffic.
         ramp_arrivals: vehicles per second on the on-ramp, where there is one.
         plan: the defects of this subset.
     """
@@ -128,7 +128,7 @@ class NgsimScenario:
         start_time: local time of frame 1 on 2005-06-15, `HH:MM`.
         first_vehicle_id: ids count from here.
         share: its length in units of `minutes`.
-        traffic: who drives.
+        traffic: traffic of the recording.
     """
 
     start_time: str
@@ -144,7 +144,7 @@ FREEWAY = Road(lanes=5, lane_width_m=3.6576, window_m=640.0, rate_hz=10.0, limit
 RAMP_VISIBLE_M = 60.0
 WEAVE_BEGINS_M = 180.0
 WEAVE_ENDS_M = 430.0
-"""Where the on-ramp comes into view, where it becomes the auxiliary lane, and where that ends."""
+"""Positions at which the on-ramp comes into view, becomes the auxiliary lane, and ends, in m."""
 
 _MISREAD = Plan(jumps=1, wrong_leaders=1, wrong_headways=2, lane_flickers=2)
 
@@ -178,4 +178,4 @@ _LATER = Traffic(0.30, trucks=0.1, ramp_arrivals=0.15, plan=_NGSIM_PLAN)
 NGSIM_TEXT = (NgsimScenario("09:30", 1, 1.0, _MORNING),)
 NGSIM_SOCRATA = (NgsimScenario("09:45", 1, 0.8, _QUEUE), NgsimScenario("10:00", 951, 0.52, _LATER))
 NGSIM_CSV = (NgsimScenario("10:15", 1, 0.6, _LATER),)
-"""Which recordings a format holds; the published ones of that day lie at 07:50, 08:05 and 08:20."""
+"""Recordings by format; the published ones of that day begin at 07:50, 08:05 and 08:20."""

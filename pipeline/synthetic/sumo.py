@@ -1,4 +1,4 @@
-"""Roads for SUMO, its runs as subprocesses, and what they recorded.
+"""Simulation by SUMO: its roads and demand, its runs as subprocesses, and their tracks.
 
 The binaries come with the wheel `eclipse-sumo`. They are run as programs: their libraries clash with Arrow's when
 loaded into this process.
@@ -19,14 +19,14 @@ from tracklake.schemas.errors import TracklakeError
 
 APPROACH_M = 500.0
 MARGIN_M = 40.0
-"""Recorded before and behind the window, so that its ends lie away from junctions."""
+"""Length recorded before and behind the window, in m, so that its ends are away from junctions."""
 BEYOND_M = 160.0
 BOTTLENECK_M = 300.0
 RAMP_M = 300.0
 LANE_CHANGE_S = 4.0
 PULSE_EVERY_S, PULSE_S, PULSE_MPS = 40.0, 15.0, 0.2
 MERGE_M = 80.0
-"""Over this stretch the on-ramp's lane closes in on the auxiliary lane."""
+"""Length over which the on-ramp's lane approaches the auxiliary lane, in m."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class SumoError(TracklakeError):
 
 
 def find_sumo() -> Path:
-    """The folder that holds SUMO's binaries.
+    """Find the folder that holds SUMO's binaries.
 
     Raises:
         SumoError: saying what to install.
@@ -109,7 +109,7 @@ def _call(home: Path, program: str, arguments: list[str]) -> None:
 
 
 def _edges(road: Road, traffic: Traffic) -> list[tuple[str, float, float, int, float]]:
-    """Stretches of road: name, from x, to x, lanes, speed limit."""
+    """List the stretches of road: name, from x, to x, lanes, speed limit."""
     slow = road.limit_mps if traffic.bottleneck_mps is None else traffic.bottleneck_mps
     end = road.window_m + MARGIN_M
     if road.ramp:
@@ -192,15 +192,15 @@ def write_demand(folder: Path, road: Road, traffic: Traffic, seconds: float) -> 
 
 
 def simulate(home: Path, folder: Path, road: Road, traffic: Traffic, *, frames: int, seed: int) -> pl.DataFrame:
-    """Run one carriageway and return what passes through its window.
+    """Simulate one carriageway and return the tracks in its window.
 
     Args:
-        home: where SUMO is.
-        folder: for its files; exists and is empty.
-        road: the carriageway.
-        traffic: who drives on it.
-        frames: to record; they count from 1.
-        seed: same seed, same tracks.
+        home: folder of SUMO.
+        folder: empty folder for its files.
+        road: carriageway to simulate.
+        traffic: traffic on it.
+        frames: number of frames to record.
+        seed: seed of the simulation.
 
     Returns:
         TRACK_SCHEMA; vehicles count from 1 in order of (first frame, foremost first).
@@ -272,7 +272,7 @@ def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
         pl.Series("on_ramp", on_ramp),
     ).join(kinds, on="type", how="left", maintain_order="left")
     visible = ~pl.col("on_ramp") | (pl.col("x") >= RAMP_VISIBLE_M)
-    tracks = tracks.filter(visible).with_columns(lane=lanes_at(road))
+    tracks = tracks.filter(visible).with_columns(lane=compute_lanes(road))
     order = (
         tracks.group_by("id")
         .agg(pl.col("frame").min().alias("first"), pl.col("x").sort_by("frame").first().alias("from"))
@@ -287,8 +287,8 @@ def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
     )
 
 
-def lanes_at(road: Road) -> pl.Expr:
-    """The lane in which `y` lies; the on-ramp (`on_ramp`) is the outermost."""
+def compute_lanes(road: Road) -> pl.Expr:
+    """Compute the lane that contains `y`; the on-ramp (`on_ramp`) is the outermost."""
     outermost = road.lanes + road.ramp
     inside = ((pl.col("y") / road.lane_width_m).floor().cast(pl.Int16) + 1).clip(1, outermost)
     return pl.when("on_ramp").then(pl.lit(road.lanes + 2)).otherwise(inside).cast(pl.Int16)

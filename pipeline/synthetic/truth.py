@@ -1,7 +1,7 @@
-"""The written files read back, and the table of what stands in them.
+"""The truth about a sample: the written files are read back and their contents counted.
 
-This and `judging` are the places of the project that loop over entries in Python, on purpose: they share no code with
-the pipeline, its sources or its rules, so that equal counts mean something.
+This module and `expected_findings` loop over entries in Python on purpose: they share no code with the pipeline, its
+sources or its rules, so that equal counts prove something.
 """
 
 import csv
@@ -55,7 +55,7 @@ class FileCount:
 
 @dataclass
 class Found:
-    """Everything read back: entries by subset and (vehicle, frame), and what became of the lines."""
+    """The contents read back: entries by subset and (vehicle, frame), and counts of lines."""
 
     entries: dict[tuple[str, str, str], dict[tuple[int, int], Entry]] = field(default_factory=dict)
     surfaces: dict[str, Surface] = field(default_factory=dict)
@@ -63,7 +63,7 @@ class Found:
 
 
 def _usable(line: str, separator: str | None, fields: int) -> list[str] | None:
-    """The fields of a line, or None where it is not a row of so many fields."""
+    """Split a line into fields; None if it is no row of that many fields."""
     if "\0" in line or not line.strip():
         return None
     if separator is not None and line.count('"') % 2:
@@ -152,9 +152,9 @@ def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
     """Read an NGSIM file back.
 
     Args:
-        path: 18-column text, 18-column CSV or 25-column CSV.
-        recordings: their names by Global_Time - 100 * Frame_ID.
-        found: is added to.
+        path: path of an 18-column text, 18-column CSV or 25-column CSV.
+        recordings: names of recordings by Global_Time - 100 * Frame_ID.
+        found: contents so far, to which the file's are added.
     """
     lines = _lines(path)
     header = lines[0].startswith("Vehicle_ID")
@@ -194,8 +194,8 @@ def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
     found.files.append(count)
 
 
-def rows_of(found: Found) -> list[dict[str, object]]:
-    """The `rule` and `rows` rows of the truth table."""
+def list_counts(found: Found) -> list[dict[str, object]]:
+    """List the `rule` and `rows` rows of the truth table."""
     rows: list[dict[str, object]] = []
     for (dataset, recording, subset), entries in sorted(found.entries.items()):
         for rule, (hits, vehicles, runs) in count_rules(entries, found.surfaces.get(subset, Surface())).items():
@@ -216,6 +216,6 @@ def rows_of(found: Found) -> list[dict[str, object]]:
     return rows
 
 
-def truth_table(rows: Iterable[dict[str, object]]) -> pl.DataFrame:
+def build_truth(rows: Iterable[dict[str, object]]) -> pl.DataFrame:
     """Put rows, of which any column may be missing, into TRUTH_SCHEMA."""
     return pl.DataFrame([{name: row.get(name) for name in TRUTH_SCHEMA} for row in rows], schema=TRUTH_SCHEMA)

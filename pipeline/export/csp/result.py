@@ -72,5 +72,5 @@ class CspExport:
         return {reason: counts[reason] for reason in REASONS if reason in counts}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the result as plain values."""
         return asdict(self)

@@ -35,7 +35,7 @@ class WindowsExport:
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the result as plain values."""
         return asdict(self) | {"out": str(self.out)}
 
 

@@ -33,6 +33,8 @@ TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 
 SAMPLE_COLUMNS = ("vehicle_id", "tick", "frame", "lane", "lateral_maneuver", "longitudinal_maneuver")
 
+NO_NEIGHBORS = Neighborhood(NEIGHBORS.empty(), collisions=0, crowded_out=0)
+
 PIECE_ROWS = 1 << 16
 """Entries tested and labelled at once; their arrays stay in the processor's cache."""
 
@@ -74,15 +76,12 @@ def draw_samples(
         vehicle_starts: vehicle_id, early, from `classify_starts`.
         missing_starts: rows from `estimate_missing_starts`.
         findings: vehicle_id, severity, first_frame, last_frame of the subset's findings, in any order.
-        protocol: recipe of the samples.
+        protocol: recipe of the samples; its clock may not be faster than the source.
         dataset: name of the dataset.
         subset: name of the subset.
         first_frame: first frame of the recording, at tick 0.
         frame_rate_hz: frame rate of the source.
         excluded: whether validation excludes the subset.
-
-    Raises:
-        ValueError: the protocol's clock is faster than the source.
     """
     rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     clock = put_on_clock(tracks.select(TRACK_COLUMNS), **rates)
@@ -90,8 +89,7 @@ def draw_samples(
     whole_subset = "excluded_subset" if excluded else "no_lane" if tracks["lane"].null_count() else None
     if whole_subset or clock.is_empty():
         drops = {whole_subset: clock.height} if whole_subset else {}
-        no_neighbors = Neighborhood(NEIGHBORS.empty(), collisions=0, crowded_out=0)
-        return _build_tables(clock.height, SAMPLES.empty(), drops, no_neighbors, names)
+        return _build_tables(clock.height, SAMPLES.empty(), drops, NO_NEIGHBORS, names)
 
     early_ids = vehicle_starts.filter("early")["vehicle_id"].implode()
     would_be = find_would_be_neighbors(clock, missing_starts, **rates)
@@ -100,23 +98,22 @@ def draw_samples(
     def filter_piece(bounds: tuple[int, int]) -> tuple[pl.DataFrame, dict[str, int]]:
         rows = slice(*bounds)
         piece = clock[rows]
-        applies = {
-            **_find_short(piece, protocol),
+        applies = _find_short(piece, protocol) | {
             "early_vehicle": piece["vehicle_id"].is_in(early_ids).to_numpy(),
             "would_be_neighbor": would_be[rows],
         }
         if protocol.drop_error_findings:
             applies["error_finding"] = find_error_entries(piece, findings, protocol=protocol, **rates)
         drops = _drop_entries(kept[rows], applies)
-        labelled = pl.concat((piece, label_maneuvers(piece, rate_hz=protocol.rate_hz)), how="horizontal")
-        return labelled.select(SAMPLE_COLUMNS).filter(kept[rows]), drops
+        labels = label_maneuvers(piece, rate_hz=protocol.rate_hz)
+        return piece.hstack(labels).select(SAMPLE_COLUMNS).filter(kept[rows]), drops
 
     pieces = map_in_threads(filter_piece, cut_runs(clock["segment"].to_numpy(), PIECE_ROWS))
     samples = pl.concat(piece for piece, _ in pieces)
     drops = {reason: sum(dropped.get(reason, 0) for _, dropped in pieces) for reason in DROP_REASONS}
     nearest = find_nearest(clock, protocol.nearest, kept) if protocol.nearest else pl.lit(None)
-    clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
     samples = samples.with_columns(nearest.alias("nearest"))
+    clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
     return _build_tables(clock.height, samples, drops, find_neighbors(clock, kept), names)
 
 

@@ -1,1 +1,1 @@
-"""Which subsets train, validate and evaluate."""
+"""Splits: the assignment of subsets to train, val and eval."""

@@ -1,8 +1,7 @@
-"""Which subsets train and which evaluate: the flow-balanced allocation.
+"""The flow-balanced allocation of subsets to parts.
 
-A subset never stands in two parts, so nothing of the evaluation can be reached from the training data. What is left to
-choose is which subsets evaluate, and there the parts should resemble each other: the sample-weighted mean and standard
-deviation of flow differ as little as can be.
+No subset is in two parts, so the evaluation data cannot be reached from the training data. Among such allocations the
+one is chosen whose parts differ least in the sample-weighted mean and standard deviation of flow.
 """
 
 from collections.abc import Sequence
@@ -16,10 +15,10 @@ from tracklake.pipeline.transforms.splits.search import (
     VEHICLES,
     Indices,
     Problem,
-    allocate,
+    find_allocation,
     sum_facts,
 )
-from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation, complete, tabulate
+from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation, add_defaults, tabulate_units
 from tracklake.schemas.split_recipes import find_shares
 
 
@@ -32,83 +31,85 @@ def allocate_flow_balanced(
     seed: int = 0,
     restarts: int = 200,
 ) -> Allocation:
-    """Divide the subsets of each dataset into train and eval (and val), so that flow is distributed alike.
+    """Divide the subsets of each dataset into train and eval (and val), so that their flows are alike.
 
-    Constraints, in the order in which they yield where not all can be met: train and eval each hold a subset with
-    samples; each (site, direction) with at least two subsets has one in train and one in eval; val holds a subset with
-    samples; train holds `train_share` of the vehicles and eval the rest (with a validation part train 0.1 less, and val
-    0.1), each +- 0.005.
-    Coverage is counted in missing (site, direction, part), shares in vehicles. What could not be met is `relaxed`, with
-    the reason. Among the allocations that meet them best: the least sum, over the pairs of parts, of the absolute
-    differences of the weighted mean and of the weighted standard deviation (of the population) of flow; among equals
-    the larger standard deviation in eval.
+    Constraints, the most important first: train and eval each hold a subset with samples; each (site, direction) with
+    at least two subsets has one in train and one in eval; val holds a subset with samples; train holds `train_share`
+    of the vehicles and eval the rest (with a validation part train 0.1 less, and val 0.1), each +- 0.005.
+    Coverage is counted in missing (site, direction, part), shares in vehicles. A constraint that cannot be met is
+    `relaxed`, with the reason. Among the allocations that meet the constraints best, the one is chosen with the least
+    sum, over pairs of parts, of the absolute differences of the weighted mean and of the weighted population standard
+    deviation of flow; among equals the one with the larger standard deviation in eval.
 
-    Subsets may be given in blocks; then everything here is said of blocks.
+    If subsets are given in blocks, all of this applies to blocks.
 
-    Up to 18 subsets (11 with a validation part) every allocation is tried: the optimum. Beyond, a local search: from
-    `restarts` random allocations of about the right shares, the best of all flips (one subset to another part) and
-    swaps (two subsets of different parts) is taken until none improves; then again twice as often from the best of
-    these with a dozen subsets exchanged, which halves what three parts still differ. The sums behind the two moments
-    are additive over subsets, so a step over all moves is a few array operations. Why it suffices: with flows of spread
-    s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and there are about n^2 / 6 swaps, so
-    a descent in the plane of the two moments ends about 12 s / n^2 from the target and the best of R descents about 12
-    s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No allocation has a difference below 0, which bounds
-    from below what any other search could find: the difference found is also the most that it can lie above the least.
+    Up to 18 subsets (11 with a validation part) every allocation is tried: the optimum. Beyond, a local search starts
+    from `restarts` random allocations of about the right shares and takes the best of all flips (one subset to another
+    part) and swaps (two subsets of different parts) until none improves. It then starts twice as often from the best
+    allocation with a dozen subsets exchanged, which halves the remaining difference of three parts. The sums behind the
+    two moments are additive over subsets, so a step over all moves is a few array operations. Why it suffices: with
+    flows of standard deviation s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and there
+    are about n^2 / 6 swaps, so a descent in the plane of the two moments ends about 12 s / n^2 from the target and the
+    best of R descents about 12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No difference is below 0, so
+    the difference found bounds its distance from the optimum.
 
     Args:
-        subsets: one row per freeway subset that is not excluded, the columns of `split_tables.COLUMNS` (and `block`,
-            where a subset has several rows), in any order. `weight` is the kept samples (before there are any: the
-            entries). A subset whose flow is null or whose weight is 0 takes part in the shares and in the coverage, and
-            not in the moments of flow.
-        split: the name to write into the tables.
-        train_share: of the vehicles, to train where there is no `val`.
+        subsets: one row per freeway subset that is not excluded, in any order: the columns of `splits.tables.COLUMNS`,
+            and `block` if a subset has several rows. `weight` is the number of kept samples (of entries, before samples
+            exist). A subset with null flow or weight 0 counts for shares and coverage, not for the moments of flow.
+        split: name of the split in the tables.
+        train_share: share of the vehicles in train if there is no `val`.
         validation: whether there is a third part, `val`.
-        seed: of the search's random starts; the result depends on nothing else (not on other datasets either).
-        restarts: how many random starts.
+        seed: seed of the search's random starts; a dataset's result does not depend on other datasets.
+        restarts: number of random starts.
 
     Raises:
-        ValueError: a column is missing, a subset (or block) stands in two rows, a count is null or negative, or a part
+        ValueError: a column is missing, a subset (or block) has two rows, a count is null or negative, or a part
             would have no share.
 
     Source: DESIGN section 8.
     """
-    table = _check(subsets)
+    table = _check_subsets(subsets)
     shares = find_shares(train_share, validation=validation)
     allocated = [table.with_columns(part=pl.lit(None, pl.String)).clear()]
     for (dataset,), rows in sorted(table.group_by("dataset"), key=lambda item: str(item[0][0])):
-        part = allocate(_pose(rows, shares), np.random.default_rng([seed, *str(dataset).encode()]), restarts)
+        part = find_allocation(
+            _build_problem(rows, shares), np.random.default_rng([seed, *str(dataset).encode()]), restarts
+        )
         names = pl.Series("part", [list(shares)[position] for position in part], dtype=pl.String)
         allocated.append(rows.with_columns(names))
-    return write_up(pl.concat(allocated), split=split, train_share=train_share, validation=validation)
+    return tabulate_allocation(pl.concat(allocated), split=split, train_share=train_share, validation=validation)
 
 
-def write_up(units: pl.DataFrame, *, split: str, train_share: float = 0.8, validation: bool = False) -> Allocation:
-    """Write an allocation up, and judge by the counts given whether it is relaxed.
+def tabulate_allocation(
+    units: pl.DataFrame, *, split: str, train_share: float = 0.8, validation: bool = False
+) -> Allocation:
+    """Build the tables of an allocation, and check by the given counts whether it is relaxed.
 
     Args:
-        units: the columns of `split_tables.COLUMNS` (and `block`, where a subset has several rows), and `part`.
-        split: the name to write into the tables.
-        train_share: of the vehicles, to train where there is no `val`.
+        units: the columns of `splits.tables.COLUMNS`, `part`, and `block` if a subset has several rows.
+        split: name of the split in the tables.
+        train_share: share of the vehicles in train if there is no `val`.
         validation: whether there is a third part, `val`.
     """
     shares = find_shares(train_share, validation=validation)
-    units = complete(units).sort("dataset", "site", "direction", "subset", "block")
+    units = add_defaults(units).sort("dataset", "site", "direction", "subset", "block")
     reasons: dict[str, str | None] = {}
     for (dataset,), rows in units.group_by("dataset"):
         part = rows["part"].replace_strict(list(shares), range(len(shares)), return_dtype=pl.Int64).to_numpy()
-        reasons[str(dataset)] = _explain(rows, _pose(rows, shares), part.astype(np.intp), shares)
-    return tabulate(units, split=split, parts=list(shares), reasons=reasons)
+        reasons[str(dataset)] = _describe_broken(rows, _build_problem(rows, shares), part.astype(np.intp), shares)
+    return tabulate_units(units, split=split, parts=list(shares), reasons=reasons)
 
 
-def _check(subsets: pl.DataFrame) -> pl.DataFrame:
-    """The columns needed, typed, in canonical order; an input that cannot be allocated is refused."""
+def _check_subsets(subsets: pl.DataFrame) -> pl.DataFrame:
+    """Select and cast the needed columns in canonical order; an input that cannot be allocated is refused."""
     missing = [name for name in COLUMNS if name not in subsets.columns]
     if missing:
         raise ValueError(
             f"the table of subsets lacks the column(s) {', '.join(missing)}: expected {', '.join(COLUMNS)}, "
             f"got {', '.join(subsets.columns)}"
         )
-    table = complete(subsets).select(
+    table = add_defaults(subsets).select(
         *(pl.col(name).cast(dtype) for name, dtype in COLUMNS.items()), pl.col("block").cast(pl.Int32)
     )
     bad = table.filter(
@@ -125,19 +126,19 @@ def _check(subsets: pl.DataFrame) -> pl.DataFrame:
         )
     twice = table.filter(pl.struct("dataset", "subset", "block").is_duplicated())
     if twice.height:
-        raise ValueError(f"the subset {twice['dataset'][0]}/{twice['subset'][0]} stands in more than one row")
+        raise ValueError(f"the subset {twice['dataset'][0]}/{twice['subset'][0]} has more than one row")
     return table.with_columns(pl.col("flow").fill_nan(None)).sort("dataset", "site", "direction", "subset", "block")
 
 
-def _pose(rows: pl.DataFrame, shares: dict[str, int]) -> Problem:
-    """Arrays of one dataset's subsets."""
+def _build_problem(rows: pl.DataFrame, shares: dict[str, int]) -> Problem:
+    """Build the arrays of one dataset's subsets."""
     weight = rows["weight"].to_numpy().astype(np.float64)
     flow = rows["flow"].to_numpy().astype(np.float64)
     known = np.where(np.isnan(flow), 0.0, weight)
     flow = np.nan_to_num(flow)
     # Centred, so that the variance is not a small difference of large numbers.
     flow = flow - (flow @ known / known.sum() if known.sum() > 0 else 0.0)
-    # Without samples in at least two subsets no part can be demanded to have any: then each subset counts as filled.
+    # If fewer than two subsets have samples, no part can be required to have some: then every subset counts as filled.
     filled = weight > 0 if (weight > 0).sum() > 1 else np.ones(len(weight), dtype=np.bool_)
     group = rows.select(pl.struct("site", "direction").rank("dense")).to_series().to_numpy().astype(np.intp) - 1
     return Problem(
@@ -150,8 +151,8 @@ def _pose(rows: pl.DataFrame, shares: dict[str, int]) -> Problem:
     )
 
 
-def _explain(rows: pl.DataFrame, problem: Problem, part: Indices, shares: dict[str, int]) -> str | None:
-    """Which constraints the allocation breaks and by how much; None where it breaks none."""
+def _describe_broken(rows: pl.DataFrame, problem: Problem, part: Indices, shares: dict[str, int]) -> str | None:
+    """Describe the constraints that the allocation breaks and by how much; None if it breaks none."""
     reasons: list[str] = []
     names: Sequence[str] = list(shares)
     sums = sum_facts(problem, part[None])[0]

@@ -1,10 +1,10 @@
-"""Splits to compare with: the one that published tables stand on, and recordings drawn at random."""
+"""Splits for comparison: the one of published tables, and recordings drawn at random."""
 
 import numpy as np
 import polars as pl
 
 from tracklake.pipeline.transforms.csp.parts import assign_parts_by_id
-from tracklake.pipeline.transforms.splits.tables import Allocation, tabulate
+from tracklake.pipeline.transforms.splits.tables import Allocation, tabulate_units
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.split_recipes import find_shares
 
@@ -12,13 +12,13 @@ from tracklake.schemas.split_recipes import find_shares
 def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = "csp-2018") -> Allocation:
     """Cut each subset at 70 and 80 % of its highest vehicle id, as conv-social-pooling's preprocessing does.
 
-    Ids are given in the order of appearance, so that the parts overlap in time, and cars either side of a cut are
-    neighbors. A part that would have no vehicles has no row.
+    Ids are numbered in the order of appearance, so the parts overlap in time and vehicles on either side of a cut are
+    neighbors. A part without vehicles has no row.
 
     Args:
-        subsets: the columns of `split_tables.COLUMNS`.
+        subsets: the columns of `splits.tables.COLUMNS`.
         vehicles: dataset, subset, vehicle_id, weight (kept samples) of every vehicle of these subsets.
-        split: the name to write into the tables.
+        split: name of the split in the tables.
 
     Source: Deo and Trivedi 2018, `preprocess_data.m`.
     """
@@ -39,7 +39,7 @@ def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = 
         )
         whole = subsets.filter((pl.col("dataset") == dataset) & (pl.col("subset") == subset))
         units.append(whole.drop("vehicles", "weight").join(ranges, how="cross"))
-    return tabulate(pl.concat(units, how="diagonal_relaxed"), split=split, parts=PARTS)
+    return tabulate_units(pl.concat(units, how="diagonal_relaxed"), split=split, parts=PARTS)
 
 
 def divide_by_recording(
@@ -50,17 +50,16 @@ def divide_by_recording(
     validation: bool = False,
     seed: int = 0,
 ) -> Allocation:
-    """Draw recordings at random, all subsets of one into the same part, by the shares of the flow-balanced split.
+    """Assign recordings to parts at random, each with all its subsets, by the shares of the flow-balanced split.
 
-    Shares are of recordings, to the nearest whole one, but at least one evaluates where there are two, and one is in
-    val where there are three.
+    Shares are of recordings, rounded, but at least one of two recordings is in eval, and one of three in val.
 
     Args:
-        subsets: the columns of `split_tables.COLUMNS` and `recording`.
-        split: the name to write into the tables.
-        train_share: of the recordings, to train where there is no `val`.
-        validation: whether there is a part `val`.
-        seed: of the draw; a dataset's draw does not depend on other datasets.
+        subsets: the columns of `splits.tables.COLUMNS` and `recording`.
+        split: name of the split in the tables.
+        train_share: share of the recordings in train if there is no `val`.
+        validation: whether there is a third part, `val`.
+        seed: seed of the draw; a dataset's draw does not depend on other datasets.
 
     Raises:
         ValueError: a part would have no share.
@@ -71,11 +70,11 @@ def divide_by_recording(
         names = rows["recording"].unique().sort()
         order = np.random.default_rng([seed, *str(dataset).encode()]).permutation(len(names))
         parts: list[str] = []
-        for part in reversed(shares):  # eval first: train has what is left
+        for part in reversed(shares):  # eval first; train gets the rest
             wanted = max(1, round(len(names) * shares[part] / 1000)) if part != "train" else len(names)
             parts += [part] * min(wanted, len(names) - len(parts) - (part != "train"))
         drawn.append(
             pl.DataFrame({"recording": names.gather(order), "part": parts}).with_columns(dataset=pl.lit(dataset))
         )
-    parted = subsets.join(pl.concat(drawn, how="diagonal"), on=["dataset", "recording"])
-    return tabulate(parted, split=split, parts=list(shares))
+    units = subsets.join(pl.concat(drawn, how="diagonal"), on=["dataset", "recording"])
+    return tabulate_units(units, split=split, parts=list(shares))

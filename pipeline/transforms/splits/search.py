@@ -1,6 +1,6 @@
-"""The search behind the flow-balanced allocation: which of all allocations of n subsets is the best.
+"""The search for the best flow-balanced allocation of n subsets.
 
-All of them are scored where they are few; else a local search takes the best flip or swap until none improves.
+If there are few allocations, all are scored; else a local search takes the best flip or swap until none improves.
 """
 
 from dataclasses import dataclass
@@ -8,25 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Flags, Floats
+
 TOLERANCE = 5
-"""How far a part's share of the vehicles may lie from its target, in thousandths."""
+"""Largest deviation of a part's share of the vehicles from its target, in thousandths."""
 
 EXHAUSTIVE_STATES = 2**18
-"""Up to so many allocations all of them are tried: 18 subsets in two parts, 11 in three."""
+"""Largest number of allocations that are all tried: 18 subsets in two parts, 11 in three."""
 
 MAX_SWAPS = 50_000
-"""Swaps looked at in one step of the search; more (beyond about 500 subsets) are sampled."""
+"""Swaps scored in one step of the search; more (beyond about 500 subsets) are sampled."""
 
 KICKS, KICKED = 2, 12
-"""After the random starts: descents from the best allocation with the parts of so many subsets exchanged."""
+"""Descents per random start from the best allocation so far, and subsets whose parts are exchanged before each."""
 
 TIE = 1e-8
-"""Differences of flow (veh/lane/s) closer than this are equal; sums of squares carry no more digits."""
+"""Difference of flow (veh/lane/s) below which two are equal; sums of squares carry no more digits."""
 
 VEHICLES, FILLED, WEIGHT, FLOW, FLOW2 = range(5)
 """Columns of `Problem.facts`."""
 
-Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 
@@ -35,38 +36,38 @@ class Problem:
     """One dataset's subsets as arrays, in an order that does not depend on the rows' order.
 
     Args:
-        shares: (P,) thousandths of the vehicles; the first part trains, the last evaluates.
+        shares: (P,) thousandths of the vehicles; the first part is train, the last eval.
         facts: (n, 5) vehicles, filled (1 = has samples), weight, weight * flow, weight * flow^2; flow is centred.
-        group: (n,) which (site, direction) a subset belongs to.
+        group: (n,) number of the subset's (site, direction).
         paired: (G,) whether that (site, direction) has at least two subsets.
     """
 
     shares: Floats
     facts: Floats
     group: Indices
-    paired: npt.NDArray[np.bool_]
+    paired: Flags
 
     @property
     def parts(self) -> int:
-        """P: how many parts there are."""
+        """P, the number of parts."""
         return len(self.shares)
 
     @property
     def subsets(self) -> int:
-        """n: how many subsets are to be allocated."""
+        """n, the number of subsets."""
         return len(self.group)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good M allocations are, in the order in which it counts; all arrays are (M,).
+    """The scores of M allocations, the most important first; lower is better, but for eval_std. All arrays are (M,).
 
     Args:
-        broken: constraints broken: an empty training or evaluation part counts most, then each (site, direction)
-            without a subset in one of the two, then an empty validation part.
-        share: vehicles (in thousandths) by which the parts' shares miss their bands, together.
-        difference: sum of the absolute differences of flow's mean and standard deviation; infinite where undefined.
-        eval_std: standard deviation of flow in the evaluation part, which decides ties.
+        broken: broken constraints: an empty train or eval part counts most, then each (site, direction) without a
+            subset in one of the two, then an empty val part.
+        share: vehicles (in thousandths) by which the parts' shares lie outside their bands, in total.
+        difference: sum of the absolute differences of flow's mean and standard deviation; infinite if undefined.
+        eval_std: standard deviation of flow in eval, which decides ties.
     """
 
     broken: Floats
@@ -74,45 +75,39 @@ class Scores:
     difference: Floats
     eval_std: Floats
 
-    def best(self) -> int:
-        """Position of the best one; the first of those that are equal in everything."""
+    def find_best(self) -> int:
+        """Return the index of the best allocation; the first of equal ones."""
         among = np.flatnonzero(self.broken == self.broken.min())
         among = among[self.share[among] == self.share[among].min()]
         among = among[self.difference[among] <= self.difference[among].min() + TIE]
         return int(among[np.argmax(self.eval_std[among])])
 
-    def steepest(self) -> int:
-        """Position of the best one, ties apart."""
+    def find_steepest(self) -> int:
+        """Return the index of the best allocation, without the rule for ties."""
         among = np.flatnonzero(self.broken == self.broken.min())
         among = among[self.share[among] == self.share[among].min()]
         return int(among[np.argmin(self.difference[among])])
 
-    def key(self, position: int) -> tuple[float, float, float]:
-        """What counts before ties, to compare as tuples."""
-        return (float(self.broken[position]), float(self.share[position]), float(self.difference[position]))
+    def get_key(self, index: int) -> tuple[float, float, float]:
+        """Return an allocation's scores as a tuple that sorts from best to worst, without the rule for ties."""
+        return (float(self.broken[index]), float(self.share[index]), float(self.difference[index]))
 
 
-def allocate(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
-    """Find the best allocation: (n,) positions of parts.
+def find_allocation(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
+    """Find the best allocation: the (n,) numbers of the subsets' parts.
 
     Args:
-        problem: what is allocated.
-        random: draws the search's starts; not used where all allocations are tried.
-        restarts: descents of the search.
+        problem: subsets to allocate.
+        random: generator of the search's starts; unused if all allocations are tried.
+        restarts: number of descents of the search.
     """
     if problem.parts**problem.subsets <= EXHAUSTIVE_STATES:
         return _try_all(problem)
-    return _search(problem, random, restarts)
+    return _search_locally(problem, random, restarts)
 
 
-def _score(problem: Problem, sums: Floats, uncovered: Floats) -> Scores:
-    """Score M allocations.
-
-    Args:
-        problem: what is allocated.
-        sums: (M, P, 5) the facts summed over each part's subsets.
-        uncovered: (M,) how many (site, direction, train or eval) lack a subset.
-    """
+def _score_sums(problem: Problem, sums: Floats, uncovered: Floats) -> Scores:
+    """Score M allocations by the (M, P, 5) sums of facts and the (M,) counts of `_count_uncovered`."""
     filled = sums[:, :, FILLED]
     available = problem.facts[:, FILLED].sum()
     empty = (filled[:, 0] == 0) | (filled[:, -1] == 0) if available > 1 else filled[:, 0] == 0
@@ -121,7 +116,7 @@ def _score(problem: Problem, sums: Floats, uncovered: Floats) -> Scores:
         broken = broken + (filled[:, 1] == 0)
 
     total = problem.facts[:, VEHICLES].sum()
-    miss = np.abs(1000.0 * sums[:, :, VEHICLES] - problem.shares * total) - TOLERANCE * total
+    excess = np.abs(1000.0 * sums[:, :, VEHICLES] - problem.shares * total) - TOLERANCE * total
     weight = sums[:, :, WEIGHT]
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = sums[:, :, FLOW] / weight
@@ -132,19 +127,19 @@ def _score(problem: Problem, sums: Floats, uncovered: Floats) -> Scores:
             difference += np.abs(mean[:, a] - mean[:, b]) + np.abs(std[:, a] - std[:, b])
     return Scores(
         broken=broken,
-        share=np.maximum(miss, 0.0).sum(axis=1),
+        share=np.maximum(excess, 0.0).sum(axis=1),
         difference=np.where(np.isnan(difference), np.inf, difference),
         eval_std=np.nan_to_num(std[:, -1]),
     )
 
 
 def sum_facts(problem: Problem, part: Indices) -> Floats:
-    """(M, P, 5) sums of the facts over the parts of M allocations (M, n)."""
+    """Sum the facts over the parts of M allocations (M, n), to (M, P, 5)."""
     return np.stack([(part == p).astype(np.float64) @ problem.facts for p in range(problem.parts)], axis=1)
 
 
-def _uncovered(problem: Problem, part: Indices) -> Floats:
-    """(M,) how many (site, direction, train or eval) lack a subset in allocations (M, n)."""
+def _count_uncovered(problem: Problem, part: Indices) -> Floats:
+    """Count the (site, direction, train or eval) without a subset in allocations (M, n), to (M,)."""
     membership = np.eye(len(problem.paired))[problem.group][:, problem.paired]
     uncovered = np.zeros(len(part))
     for end in (0, problem.parts - 1):
@@ -152,39 +147,39 @@ def _uncovered(problem: Problem, part: Indices) -> Floats:
     return uncovered
 
 
+def _score_parts(problem: Problem, part: Indices) -> Scores:
+    """Score allocations (M, n)."""
+    return _score_sums(problem, sum_facts(problem, part), _count_uncovered(problem, part))
+
+
 def _try_all(problem: Problem) -> Indices:
-    """The best of all allocations: (n,) parts."""
+    """Find the best of all allocations, (n,)."""
     codes = np.arange(problem.parts**problem.subsets)
     part = (codes[:, None] // problem.parts ** np.arange(problem.subsets)) % problem.parts
-    best: Indices = part[_score(problem, sum_facts(problem, part), _uncovered(problem, part)).best()]
+    best: Indices = part[_score_parts(problem, part).find_best()]
     return best
 
 
-def _search(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
-    """The best allocation that descents find: (n,) parts.
+def _search_locally(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
+    """Find the best allocation of many descents, (n,).
 
-    `restarts` begin at random ones, and KICKS times as many near the best of those. The latter are short, so that many
-    fit into the time; each goes on from the best that is known by then.
+    `restarts` descents start at random allocations, and KICKS times as many near the best allocation so far; the
+    latter are short.
     """
-    ends = np.stack([_descend(problem, _random_start(problem, random), random) for _ in range(max(1, restarts))])
-    best = ends[_best_of(problem, ends)]
+    ends = np.stack([_descend(problem, _draw_start(problem, random), random) for _ in range(max(1, restarts))])
+    best = ends[_score_parts(problem, ends).find_best()]
     for _ in range(KICKS * restarts):
         start = best.copy()
         moved = random.permutation(problem.subsets)[:KICKED]
         start[moved] = best[random.permutation(moved)]
         pair = np.stack([best, _descend(problem, start, random)])
-        best = pair[_best_of(problem, pair)]
+        best = pair[_score_parts(problem, pair).find_best()]
     found: Indices = best
     return found
 
 
-def _best_of(problem: Problem, part: Indices) -> int:
-    """Position of the best of allocations (M, n)."""
-    return _score(problem, sum_facts(problem, part), _uncovered(problem, part)).best()
-
-
-def _random_start(problem: Problem, random: np.random.Generator) -> Indices:
-    """Subsets in random order, dealt out by their vehicles: eval first, then val, and the rest to train."""
+def _draw_start(problem: Problem, random: np.random.Generator) -> Indices:
+    """Deal out subsets in random order by their vehicles: first to eval, then to val, the rest to train."""
     order = random.permutation(problem.subsets)
     vehicles = problem.facts[order, VEHICLES]
     middle = np.cumsum(vehicles) - vehicles / 2
@@ -200,13 +195,13 @@ def _descend(problem: Problem, part: Indices, random: np.random.Generator) -> In
     first, second = np.triu_indices(n, k=1)
     flip_subset = np.repeat(np.arange(n), parts)
     flip_to = np.tile(np.arange(parts), n)
-    here = _score(problem, sum_facts(problem, part[None]), _uncovered(problem, part[None])).key(0)
+    here = _score_parts(problem, part[None]).get_key(0)
     while True:
         flips = flip_to != part[flip_subset]
         swaps = np.flatnonzero(part[first] != part[second])
         if len(swaps) > MAX_SWAPS:
             swaps = random.choice(swaps, MAX_SWAPS, replace=False)
-        # Every move as: subset i goes to `to`, and subset j (its swap; i itself in a flip) comes to i's part.
+        # Every move puts subset i into part `to`, and subset j (its swap; i itself in a flip) into i's part.
         i = np.concatenate([flip_subset[flips], first[swaps]])
         j = np.concatenate([flip_subset[flips], second[swaps]])
         to = np.concatenate([flip_to[flips], part[second[swaps]]])
@@ -218,15 +213,15 @@ def _descend(problem: Problem, part: Indices, random: np.random.Generator) -> In
         sums[moves, part[i]] -= gain
         sums[moves, to] += gain
 
-        change = _coverage_change(problem, part)
+        change = _find_coverage_changes(problem, part)
         apart = swapped & (problem.group[i] != problem.group[j])
-        uncovered = _uncovered(problem, part[None]) + np.where(
+        uncovered = _count_uncovered(problem, part[None]) + np.where(
             apart, change[i, to] + change[j, part[i]], np.where(swapped, 0.0, change[i, to])
         )
-        scores = _score(problem, sums, uncovered)
-        move = scores.steepest()
-        # The sums above are exact for whole numbers; flow's are not, hence the smallest improvement that counts.
-        broken, share, difference = scores.key(move)
+        scores = _score_sums(problem, sums, uncovered)
+        move = scores.find_steepest()
+        # The sums are exact for whole numbers but not for flow, so an improvement must exceed rounding errors.
+        broken, share, difference = scores.get_key(move)
         if (broken, share, difference + TIE / 100) >= here:
             return part
         here = (broken, share, difference)
@@ -234,8 +229,8 @@ def _descend(problem: Problem, part: Indices, random: np.random.Generator) -> In
         part[j[move]], part[i[move]] = part[i[move]], to[move]
 
 
-def _coverage_change(problem: Problem, part: Indices) -> Floats:
-    """(n, P): by how much `uncovered` changes when subset i goes to part q."""
+def _find_coverage_changes(problem: Problem, part: Indices) -> Floats:
+    """Find the change of `uncovered` when subset i moves to part q, (n, P)."""
     n, parts = problem.subsets, problem.parts
     counts = np.zeros((len(problem.paired), parts))
     np.add.at(counts, (problem.group, part), 1.0)

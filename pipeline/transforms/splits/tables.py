@@ -1,6 +1,6 @@
-"""An allocation as tables: which unit stands in which part, and how the parts compare.
+"""The tables of a split: the part of each unit, and a comparison of the parts.
 
-A unit is what a split moves as a whole: a subset, a block of one, or a range of its vehicles.
+A unit is assigned as a whole: a subset, a block of one, or a range of its vehicles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,23 +22,23 @@ COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "first_frame": pl.Int32,
     "last_frame": pl.Int32,
 }
-"""What is known of a unit: counts, flow and frames."""
+"""Columns of a unit: counts, flow and frames."""
 
 WHOLE: dict[str, pl.Expr] = {
     "block": pl.lit(0, pl.Int32),
     "first_vehicle_id": pl.lit(None, pl.Int32),
     "last_vehicle_id": pl.lit(None, pl.Int32),
 }
-"""Which unit of its subset it is; these, where nothing is said, of one that is its whole subset."""
+"""Columns that identify a unit within its subset, with their defaults for a whole subset."""
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """A split and how alike its parts are.
+    """A split and the balance of its parts.
 
     Args:
         splits: rows of `schemas.splits.SPLITS`.
-        balance: rows of `schemas.splits.SPLIT_BALANCE`; a part without subsets stands there with zeros.
+        balance: rows of `schemas.splits.SPLIT_BALANCE`; a part without subsets has zeros.
     """
 
     splits: pl.DataFrame
@@ -46,46 +46,46 @@ class Allocation:
 
     @property
     def relaxations(self) -> dict[str, str]:
-        """By dataset: which constraints could not be met, and by how much."""
+        """Constraints that could not be met, and by how much, by dataset."""
         relaxed = self.balance.filter(pl.col("relaxed")).unique("dataset", maintain_order=True)
         return dict(relaxed.select("dataset", "relaxed_reason").iter_rows())
 
 
-def tabulate(
+def tabulate_units(
     units: pl.DataFrame, *, split: str, parts: Sequence[str], reasons: Mapping[str, str | None] | None = None
 ) -> Allocation:
-    """Write an allocation up.
+    """Build the tables of a split from its units.
 
     Args:
-        units: the columns of `COLUMNS`, those of `WHOLE` where units are no whole subsets, and `part`.
-        split: the name to write into the tables.
-        parts: all that there are, in order.
-        reasons: by dataset, which constraints are broken; None: none.
+        units: COLUMNS, `part`, and the columns of WHOLE if units are no whole subsets.
+        split: name of the split in the tables.
+        parts: names of all parts, in order.
+        reasons: description of broken constraints by dataset; None = none.
     """
-    # Sorted, so that the same units give the same sums, to the last digit.
-    units = complete(units).sort("dataset", "subset", "block", "part")
+    # Sorted, so that the same units give the same sums to the last digit.
+    units = add_defaults(units).sort("dataset", "subset", "block", "part")
     balances = [SPLIT_BALANCE.empty()]
     for (dataset,), rows in units.group_by("dataset"):
-        balances.append(_compare(rows, split, parts, (reasons or {}).get(str(dataset))))
+        balances.append(_compare_parts(rows, split, parts, (reasons or {}).get(str(dataset))))
     return Allocation(
         splits=SPLITS.conform(units.lazy().with_columns(split=pl.lit(split, pl.String))).collect().sort(SPLITS.key),
         balance=pl.concat(balances).sort(SPLIT_BALANCE.key),
     )
 
 
-def complete(units: pl.DataFrame) -> pl.DataFrame:
-    """The units with the columns of `WHOLE`."""
+def add_defaults(units: pl.DataFrame) -> pl.DataFrame:
+    """Add the columns of WHOLE that are missing."""
     missing = [value.alias(name) for name, value in WHOLE.items() if name not in units.columns]
     return units.with_columns(missing)
 
 
-def _compare(rows: pl.DataFrame, split: str, parts: Sequence[str], reason: str | None) -> pl.DataFrame:
-    """Rows of `split_balance` of one dataset: one per part, those without units included."""
+def _compare_parts(rows: pl.DataFrame, split: str, parts: Sequence[str], reason: str | None) -> pl.DataFrame:
+    """Build one dataset's rows of `split_balance`: one per part, also without units."""
     total = max(1, int(rows["vehicles"].sum()))
     balance: list[dict[str, object]] = []
     for part in parts:
         members = rows.filter(pl.col("part") == part)
-        mean, std = _moments(members)
+        mean, std = _compute_moments(members)
         balance.append(
             {
                 "split": split,
@@ -104,8 +104,8 @@ def _compare(rows: pl.DataFrame, split: str, parts: Sequence[str], reason: str |
     return pl.DataFrame(balance, schema=SPLIT_BALANCE.dtypes)
 
 
-def _moments(members: pl.DataFrame) -> tuple[float, float] | tuple[None, None]:
-    """Weighted mean and population standard deviation of flow, in two passes (these are the figures published)."""
+def _compute_moments(members: pl.DataFrame) -> tuple[float, float] | tuple[None, None]:
+    """Compute the weighted mean and population standard deviation of flow, in two passes for accuracy."""
     known = members.filter(pl.col("flow").is_not_null())
     weight, flow = known["weight"].to_numpy().astype(np.float64), known["flow"].to_numpy()
     if weight.sum() == 0:

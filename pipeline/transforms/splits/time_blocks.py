@@ -1,7 +1,7 @@
 """Subsets cut into blocks of time with a purge between them, for lakes of few recordings.
 
-No history, future or neighbor crosses a block's border. A vehicle may still be on the road in two blocks; where these
-stand in different parts it gives nothing to val and eval, and is listed.
+No history, future or neighbor crosses a block's border. A vehicle may be on the road in two blocks; if these are in
+different parts, it is left out of val and eval and listed.
 """
 
 import polars as pl
@@ -16,7 +16,7 @@ BLOCKS: dict[str, pl.DataType | type[pl.DataType]] = {
     "first_frame": pl.Int32,
     "last_frame": pl.Int32,
 }
-"""What `cut_blocks` returns."""
+"""Columns of `cut_blocks`."""
 
 VISITS: dict[str, pl.DataType | type[pl.DataType]] = {
     "dataset": pl.String,
@@ -25,7 +25,7 @@ VISITS: dict[str, pl.DataType | type[pl.DataType]] = {
     "vehicle_id": pl.Int32,
     "entries": pl.Int64,
 }
-"""What `find_visits` returns."""
+"""Columns of `find_visits`."""
 
 WEIGHTS: dict[str, pl.DataType | type[pl.DataType]] = {
     "dataset": pl.String,
@@ -34,29 +34,29 @@ WEIGHTS: dict[str, pl.DataType | type[pl.DataType]] = {
     "vehicle_id": pl.Int32,
     "weight": pl.Int64,
 }
-"""What `count_samples` returns."""
+"""Columns of `count_samples`."""
 
-SMALLEST = 1e-6
-"""Of a frame: positions between frames are floating-point."""
+ROUNDING_FRAMES = 1e-6
+"""Tolerance of frame numbers, since positions between frames are floating-point."""
 
 
 def cut_blocks(subsets: pl.DataFrame, *, block_s: float, purge_s: float) -> pl.DataFrame:
     """Cut each subset into blocks with at least `purge_s` between the last entry of one and the first of the next.
 
-    All blocks last `block_s` but the last one, which ends with the subset: what remains after the last whole block is a
-    block of its own where, after the purge, at least half a block is left; else the last whole block is the longer. A
-    subset shorter than a block is one.
+    All blocks last `block_s` except the last one, which ends with the subset: the rest after the last whole block is a
+    block of its own if, after the purge, at least half a block is left; else it extends the last whole block. A subset
+    shorter than a block is one block.
 
     Args:
         subsets: dataset, subset, first_frame, last_frame, frame_rate_hz.
-        block_s: length of a block, above 0.
-        purge_s: between two.
+        block_s: length of a block in s, above 0.
+        purge_s: length of the purge between blocks in s.
 
     Returns:
         One row per block, the columns of `BLOCKS`, sorted by them.
     """
-    block = (block_s * pl.col("frame_rate_hz") - SMALLEST).ceil().cast(pl.Int64)
-    purge = (purge_s * pl.col("frame_rate_hz") - SMALLEST).ceil().cast(pl.Int64)
+    block = (block_s * pl.col("frame_rate_hz") - ROUNDING_FRAMES).ceil().cast(pl.Int64)
+    purge = (purge_s * pl.col("frame_rate_hz") - ROUNDING_FRAMES).ceil().cast(pl.Int64)
     length = pl.col("last_frame").cast(pl.Int64) - pl.col("first_frame") + 1
     whole = (length + purge) // (block + purge)
     left = length - whole * (block + purge)
@@ -76,14 +76,11 @@ def cut_blocks(subsets: pl.DataFrame, *, block_s: float, purge_s: float) -> pl.D
 
 
 def find_visits(entries: pl.DataFrame, blocks: pl.DataFrame) -> pl.DataFrame:
-    """Count the entries of every vehicle in every block in which it has any.
+    """Count the entries of each vehicle in each block, VISITS sorted by key.
 
     Args:
         entries: vehicle_id and frame of one subset, in any order.
-        blocks: its rows of `cut_blocks`.
-
-    Returns:
-        The columns of `VISITS`, sorted by them.
+        blocks: the subset's rows of `cut_blocks`.
     """
     return (
         entries.select(pl.col("vehicle_id"), pl.col("frame").cast(pl.Int32))
@@ -100,22 +97,19 @@ def find_visits(entries: pl.DataFrame, blocks: pl.DataFrame) -> pl.DataFrame:
 def count_samples(
     samples: pl.DataFrame, blocks: pl.DataFrame, *, stride: float, first_frame: int, history: float, future: float
 ) -> pl.DataFrame:
-    """Count the samples of every vehicle in every block whose history and least future lie within it.
+    """Count each vehicle's samples in each block that holds their history and least future, WEIGHTS sorted by key.
 
     Args:
         samples: vehicle_id and tick of one subset's samples.
-        blocks: its rows of `cut_blocks`.
+        blocks: the subset's rows of `cut_blocks`.
         stride: source frames per tick.
-        first_frame: where tick 0 lies.
-        history: what a sample needs before it, in source frames.
-        future: what it needs after it, likewise.
-
-    Returns:
-        The columns of `WEIGHTS`, sorted by them; blocks without samples are not there.
+        first_frame: frame of tick 0.
+        history: length of a sample's history in source frames.
+        future: length of a sample's least future in source frames.
     """
     at = first_frame + pl.col("tick") * stride
     return (
-        samples.select("vehicle_id", begins=at - history + SMALLEST, ends=at + future - SMALLEST)
+        samples.select("vehicle_id", begins=at - history + ROUNDING_FRAMES, ends=at + future - ROUNDING_FRAMES)
         .sort("begins")
         .join_asof(
             blocks.with_columns(pl.col("first_frame").cast(pl.Float64)).sort("first_frame"),
@@ -134,17 +128,15 @@ def count_samples(
 def describe_blocks(
     blocks: pl.DataFrame, subsets: pl.DataFrame, visits: pl.DataFrame, weights: pl.DataFrame
 ) -> pl.DataFrame:
-    """Put together what the allocation needs to know of each block.
+    """Describe each block for the allocation: the columns of `splits.tables.COLUMNS` and `block`.
+
+    Flow is the block's own: vehicles with an entry in it / lanes / its length in s.
 
     Args:
-        blocks: of `cut_blocks`.
+        blocks: rows of `cut_blocks`.
         subsets: dataset, subset, site, direction, lanes, frame_rate_hz.
-        visits: of `find_visits`, of all subsets.
-        weights: of `count_samples`, of all subsets.
-
-    Returns:
-        One row per block: the columns of `split_tables.COLUMNS` and `block`. Flow is that of the block alone: vehicles
-        with an entry in it / lanes / its length in s.
+        visits: rows of `find_visits` of all subsets.
+        weights: rows of `count_samples` of all subsets.
     """
     key = ["dataset", "subset", "block"]
     seconds = (pl.col("last_frame") - pl.col("first_frame") + 1) / pl.col("frame_rate_hz")
@@ -162,15 +154,13 @@ def describe_blocks(
 
 
 def find_left_out(visits: pl.DataFrame, splits: pl.DataFrame) -> pl.DataFrame:
-    """Find the vehicles that have entries in two parts.
+    """Find the vehicles that have entries in two parts, as rows of `schemas.splits.SPLIT_LEFT_OUT`.
+
+    A vehicle in train and another part stays in train; one in val and eval is left out of both.
 
     Args:
-        visits: of `find_visits`, of all subsets.
-        splits: rows of `schemas.splits.SPLITS` of one split, in whose blocks the visits were counted.
-
-    Returns:
-        Rows of `schemas.splits.SPLIT_LEFT_OUT`. A vehicle in train and another part stays in train; one in val and eval
-        goes into neither.
+        visits: rows of `find_visits` of all subsets.
+        splits: rows of `schemas.splits.SPLITS` of one split, whose blocks are those of the visits.
     """
     elsewhere = pl.col("entries").filter(pl.col("part") != PARTS[0]).sum()
     return (
@@ -190,34 +180,31 @@ def find_left_out(visits: pl.DataFrame, splits: pl.DataFrame) -> pl.DataFrame:
 def recount_blocks(
     units: pl.DataFrame, splits: pl.DataFrame, left_out: pl.DataFrame, visits: pl.DataFrame, weights: pl.DataFrame
 ) -> pl.DataFrame:
-    """Count what each block gives to its part once vehicles are left out.
+    """Add `part` to the units, and count their vehicles and samples again without vehicles that are left out.
+
+    A vehicle counts in the first of its blocks in a part, so that sums over blocks count none twice.
 
     Args:
-        units: of `describe_blocks`.
+        units: rows of `describe_blocks`.
         splits: rows of `schemas.splits.SPLITS` of one split, one per block.
-        left_out: of `find_left_out`, of this split.
-        visits: of `find_visits`, of all subsets.
-        weights: of `count_samples`, of all subsets.
-
-    Returns:
-        `units` with `part`, and both counts anew: weight, the samples without those of vehicles left out of the part;
-        vehicles, those that give entries to the part, each in its first block there, so that sums over blocks count
-        none twice.
+        left_out: rows of `find_left_out` of this split.
+        visits: rows of `find_visits` of all subsets.
+        weights: rows of `count_samples` of all subsets.
     """
     vehicle, key = ["dataset", "subset", "vehicle_id"], ["dataset", "subset", "block"]
     parts = splits.select(*key, "part")
-    gone = left_out.select(*vehicle, gone=True)
+    removed = left_out.select(*vehicle, removed=True)
 
-    def stay(counted: pl.DataFrame) -> pl.DataFrame:
-        known = counted.join(parts, on=key).join(gone, on=vehicle, how="left")
-        return known.filter((pl.col("part") == PARTS[0]) | pl.col("gone").is_null())
+    def drop_removed(counted: pl.DataFrame) -> pl.DataFrame:
+        known = counted.join(parts, on=key).join(removed, on=vehicle, how="left")
+        return known.filter((pl.col("part") == PARTS[0]) | pl.col("removed").is_null())
 
-    present = stay(visits).group_by(*vehicle, "part").agg(pl.col("block").min())
+    present = drop_removed(visits).group_by(*vehicle, "part").agg(pl.col("block").min())
     return (
         units.drop("vehicles", "weight")
         .join(parts, on=key)
         .join(present.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
-        .join(stay(weights).group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
+        .join(drop_removed(weights).group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
         .with_columns(pl.col("vehicles", "weight").fill_null(0))
         .sort(key)
     )

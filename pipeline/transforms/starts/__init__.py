@@ -1,1 +1,1 @@
-"""Tracks that start late, and the frames that are missing before them."""
+"""Late starts of tracks, and estimates of the missing frames before them."""

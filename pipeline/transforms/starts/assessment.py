@@ -1,7 +1,7 @@
-"""How good the estimates of missing starts are: whole tracks are cut, and what is estimated is held against the truth.
+"""Assessment of the estimates of missing starts: whole tracks are cut, and the estimates compared with the truth.
 
-DESIGN section 6, last paragraph. A fully tracked vehicle is taken as if it had first been seen at a known position; the
-other fully tracked vehicles are its references, and its own track tells the truth about the part that was cut off.
+DESIGN section 6, last paragraph. A fully tracked vehicle is treated as if first seen at a known position; the other
+fully tracked vehicles are its references, and its own track gives the truth about the part that was cut off.
 """
 
 from collections.abc import Iterator
@@ -11,14 +11,16 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.transforms.starts.estimators import ESTIMATES, Cut
-from tracklake.pipeline.transforms.starts.references import Floats, Ints, References
+from tracklake.pipeline.transforms.starts.references import References
+from tracklake.schemas.arrays import Floats, Integers
 from tracklake.schemas.start_assessments import START_ASSESSMENTS
 
 POSITIONS_M = tuple(20.0 * number for number in range(1, 11))
-"""Beyond the cut-off. Late starts of recordings are known up to 200 m; steps of 20 m show how estimates worsen with the
-distance, and are long beside what a vehicle drives in a frame."""
+"""Distances of the cuts from the cut-off, in m. Late starts are known up to 200 m; steps of 20 m show how estimates
+worsen with distance, and are long compared with a vehicle's way in a frame."""
+
 TRACKS_AT_ONCE = 128
-"""Cut tracks held against all references in one go: bounds the memory."""
+"""Cut tracks compared with all references at once, which limits the memory."""
 
 CUT_SCHEMA = {
     "vehicle_id": pl.Int32,
@@ -49,14 +51,14 @@ def assess_starts(
     Args:
         tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
         vehicle_starts: vehicle_id, fully_tracked, from `classify_starts`.
-        dataset: the subset's.
-        subset: its name.
-        cutoff_m: from `classify_starts`, of the whole tracks; None = nothing to assess.
-        first_frame: the recording's first frame.
-        frame_rate_hz: the source's.
+        dataset: name of the dataset.
+        subset: name of the subset.
+        cutoff_m: cut-off of the whole tracks from `classify_starts`; None = no assessment.
+        first_frame: first frame of the recording.
+        frame_rate_hz: frame rate of the source.
 
     Returns:
-        `start_assessments`; a position that no fully tracked vehicle reaches has no row.
+        Rows of `start_assessments`; a position that no fully tracked vehicle reaches has none.
     """
     cut = cut_and_estimate(
         tracks, vehicle_starts, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=frame_rate_hz
@@ -97,17 +99,10 @@ def cut_and_estimate(
     first_frame: int,
     frame_rate_hz: float,
 ) -> pl.DataFrame:
-    """Cut every fully tracked vehicle's track at each position that it reaches, and estimate what was cut off.
+    """Cut every fully tracked vehicle's track at each position that it reaches, and estimate the missing start.
 
-    The first entry at or beyond the position is the first one left. The cut-off stays that of the whole tracks. Neither
-    the vehicle's own drive nor the speeds that were cut off enter its estimates.
-
-    Args:
-        tracks: as for `assess_starts`.
-        vehicle_starts: likewise.
-        cutoff_m: likewise.
-        first_frame: likewise.
-        frame_rate_hz: likewise.
+    Arguments are those of `assess_starts`. The first entry at or beyond the position is the first one left. The cut-off
+    stays that of the whole tracks. The vehicle's own drive and the speeds that were cut off are not used.
 
     Returns:
         A row per vehicle, position and estimator: vehicle_id, beyond_m, start_frame; frames_true (since the vehicle's
@@ -116,51 +111,53 @@ def cut_and_estimate(
     """
     if cutoff_m is None or not vehicle_starts["fully_tracked"].any():
         return pl.DataFrame(schema=CUT_SCHEMA)
-    track = _Whole.gather(tracks, vehicle_starts, cutoff_m, first_frame, frame_rate_hz)
+    references = References.from_tracks(tracks, vehicle_starts, cutoff_m)
+    whole = _WholeTracks(
+        references,
+        cutoff_m,
+        first_frame,
+        frame_rate_hz,
+        entries=tracks.height,
+        speeds_mps=float(tracks["speed_mps"].to_numpy().sum(dtype=np.float64)),
+        speeds_before_mps=np.concatenate(([0.0], np.cumsum(references.speed_mps)[:-1])),
+    )
     frames = [
-        _estimate(vehicles, cut, beyond_m, track)
+        _estimate_windows(vehicles, cut, beyond_m, whole)
         for beyond_m in POSITIONS_M
-        for vehicles, cut in track.cut_at(cutoff_m + beyond_m)
+        for vehicles, cut in whole.cut_tracks(cutoff_m + beyond_m)
     ]
     return pl.concat([pl.DataFrame(schema=CUT_SCHEMA), *frames])
 
 
 @dataclass(frozen=True)
-class _Whole:
-    """The tracks before they are cut."""
+class _WholeTracks:
+    """The tracks of a subset before they are cut.
+
+    Args:
+        references: fully tracked vehicles.
+        cutoff_m: cut-off of the subset.
+        first_frame: first frame of the recording.
+        frame_rate_hz: frame rate of the source.
+        entries: number of entries of all vehicles of the subset.
+        speeds_mps: sum of the speeds of all entries.
+        speeds_before_mps: sum of the speeds of all earlier rows of the references, for each row.
+    """
 
     references: References
     cutoff_m: float
     first_frame: int
     frame_rate_hz: float
     entries: int
-    """Of all vehicles of the subset."""
     speeds_mps: float
-    """The sum of their speeds."""
     speeds_before_mps: Floats
-    """Of each of the references' rows: the sum of the speeds of the rows before it."""
 
-    @classmethod
-    def gather(
-        cls,
-        tracks: pl.DataFrame,
-        vehicle_starts: pl.DataFrame,
-        cutoff_m: float,
-        first_frame: int,
-        frame_rate_hz: float,
-    ) -> "_Whole":
-        references = References.gather(tracks, vehicle_starts, cutoff_m)
-        speeds_mps = float(tracks["speed_mps"].to_numpy().sum(dtype=np.float64))
-        before = np.concatenate(([0.0], np.cumsum(references.speed_mps)[:-1]))
-        return cls(references, cutoff_m, first_frame, frame_rate_hz, tracks.height, speeds_mps, before)
-
-    def cut_at(self, x_m: float) -> Iterator[tuple[Ints, Cut]]:
-        """Cut the tracks that reach x_m, TRACKS_AT_ONCE at a time: which vehicles, and what the others say of them."""
+    def cut_tracks(self, x_m: float) -> Iterator[tuple[Integers, Cut]]:
+        """Cut the tracks that reach x_m, and yield the vehicles and their cuts, TRACKS_AT_ONCE at a time."""
         whole = self.references
         reach = whole.find_reaching(x_m)
         first, last, left_cutoff = whole.first[reach], whole.last[reach], whole.left_cutoff[reach]
         starts = whole.find_row(first, last, x_m)
-        # All tracks begin now within the length that one of them drives in a frame: others cross their starts here.
+        # All cut tracks begin within a vehicle's way in a frame, so other tracks cross their starts in these rows.
         latest = whole.find_row(starts, last, whole.x_m[starts].max(initial=x_m))
         for begin in range(0, reach.size, TRACKS_AT_ONCE):
             own = np.arange(begin, min(begin + TRACKS_AT_ONCE, reach.size))
@@ -169,14 +166,14 @@ class _Whole:
             after = whole.find_row(starts, latest, start_x_m)
             known = whole.farthest_m[after] >= start_x_m
             known[np.arange(own.size), own] = False
-            passed_frame, nearer = whole.cross(first, after, start_x_m)
+            passed_frame, nearer = whole.find_crossings(first, after, start_x_m)
             yield (
                 reach[own],
                 Cut(
                     start_frame=whole.frame[start],
                     speed_mps=whole.speed_mps[start],
                     lane=whole.lane[start],
-                    by_mean_speed=self._drive_at_mean_speed(first[own], start),
+                    by_mean_speed=self._estimate_by_mean_speed(first[own], start),
                     known=known,
                     frames=np.where(known, passed_frame - left_cutoff, 0.0),
                     speeds_mps=whole.speed_mps[nearer],
@@ -186,10 +183,10 @@ class _Whole:
                 ),
             )
 
-    def _drive_at_mean_speed(self, first: Ints, start: Ints) -> Floats:
-        """Frames from the cut-off to the start at the mean speed of what is left of all tracks.
+    def _estimate_by_mean_speed(self, first: Integers, start: Integers) -> Floats:
+        """Estimate the frames from the cut-off to the start by the mean speed of all entries that are left.
 
-        Since the recording's first frame where that speed is not positive.
+        If that speed is not positive, these are all frames since the recording's first.
         """
         whole = self.references
         cut_off_mps = self.speeds_before_mps[start] - self.speeds_before_mps[first]
@@ -199,11 +196,11 @@ class _Whole:
         return np.divide(frames, mean_mps, out=longest, where=mean_mps > 0)
 
 
-def _estimate(vehicles: Ints, cut: Cut, beyond_m: float, track: _Whole) -> pl.DataFrame:
-    """Every estimator's windows for the vehicles cut beyond_m after the cut-off."""
-    whole = track.references
+def _estimate_windows(vehicles: Integers, cut: Cut, beyond_m: float, tracks: _WholeTracks) -> pl.DataFrame:
+    """Estimate the windows of the vehicles cut beyond_m after the cut-off, with every estimator."""
+    whole = tracks.references
     first = whole.first[vehicles]
-    begun = whole.find_row(first, whole.last[vehicles], track.cutoff_m)
+    begun = whole.find_row(first, whole.last[vehicles], tracks.cutoff_m)
     truth = pl.DataFrame(
         {
             "vehicle_id": whole.vehicle_id[vehicles],
@@ -221,7 +218,7 @@ def _estimate(vehicles: Ints, cut: Cut, beyond_m: float, track: _Whole) -> pl.Da
             truth.with_columns(
                 pl.Series("frames_estimated", frames),
                 pl.Series("margin_frames", margin),
-                pl.Series("first_missing_frame", np.maximum(begins, track.first_frame)),
+                pl.Series("first_missing_frame", np.maximum(begins, tracks.first_frame)),
                 estimator=pl.lit(estimator),
                 beyond_m=pl.lit(beyond_m),
             ).select(pl.col(name).cast(dtype) for name, dtype in CUT_SCHEMA.items())

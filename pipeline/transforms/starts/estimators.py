@@ -1,7 +1,7 @@
-"""Estimates of how long a track's missing start lasts, for many cut tracks at once: the contract's, simpler, better.
+"""Estimators of the length of a track's missing start, for many cut tracks at once.
 
-Each estimator takes a `Cut` and returns an estimate and a margin in frames, (B,) each; the window begins
-max(1, estimate) + margin before the start.
+An estimator takes a `Cut` and returns an estimate and a margin in frames, (B,) each; the window begins
+max(1, estimate) + margin frames before the start. The contract is DESIGN section 6.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,39 +9,40 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.starts.late_starts import LEAST_REFERENCES, SIGMAS
-from tracklake.pipeline.transforms.starts.references import Floats, Ints
+from tracklake.schemas.arrays import Flags, Floats, Integers
 
 NEAREST = 12
-LANE_APART_S = 10.0
-ERRORS = 3.0
-"""Of `estimate_locally`. Chosen on a generated sample and on an excerpt of US-101 for at least the contract's coverage
-with little excess. Neither depends much on them: with 10 to 30 references, 10 to 30 s and 2.5 to 3 errors coverage
-stays above the contract's or within 0.001 of it, with 0.28 to 0.77 of its excess."""
+"""References of `estimate_locally`. Its three constants were chosen on a generated sample and on an excerpt of US-101
+for at least the contract's coverage with little excess. With 10 to 30 references, 10 to 30 s and 2.5 to 3 errors the
+coverage is above the contract's or within 0.001 of it, with 0.28 to 0.77 of its excess."""
 
-Flags = NDArray[np.bool_]
+LANE_APART_S = 10.0
+"""Time that a lane between two vehicles counts as in `estimate_locally`, in s."""
+
+ERRORS = 3.0
+"""Margin of `estimate_locally` in standard errors of prediction."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """B tracks cut at one position, and what R fully tracked vehicles say about each; the own track says nothing.
+    """B tracks cut at one position, and the drives of R fully tracked vehicles, of which a track's own is unknown.
 
     Args:
-        start_frame: (B,) of the first entry left.
-        speed_mps: (B,) recorded there.
-        lane: (B,) there; NaN where unknown.
+        start_frame: (B,) frame of the first entry left.
+        speed_mps: (B,) speed of that entry.
+        lane: (B,) lane of that entry; NaN = unknown.
         by_mean_speed: (B,) frames from the cut-off to the start at the subset's mean speed.
-        known: (B, R) whether the vehicle is another one and reaches the start.
-        frames: (B, R) that it took from the cut-off to the start; 0 where not known.
-        speeds_mps: (B, R) of its entry nearest to the start.
-        lanes: (B, R) of that entry.
-        passed_frame: (B, R) when it crossed the start.
-        frame_rate_hz: the source's.
+        known: (B, R) whether the reference is another vehicle and reaches the start.
+        frames: (B, R) frames from the cut-off to the start; 0 if not known.
+        speeds_mps: (B, R) speed of the reference's entry nearest to the start.
+        lanes: (B, R) lane of that entry.
+        passed_frame: (B, R) frame at which the reference crossed the start.
+        frame_rate_hz: frame rate of the source.
     """
 
-    start_frame: Ints
+    start_frame: Integers
     speed_mps: Floats
     lane: Floats
     by_mean_speed: Floats
@@ -54,12 +55,12 @@ class Cut:
 
     @cached_property
     def lines(self) -> "_Lines":
-        """(B,) the contract's regressions, over all references of each track."""
+        """The contract's regressions over all references of each track, (B,)."""
         return _Lines.fit(self.known, self.speeds_mps, self.frames)
 
     @property
     def sigma(self) -> Floats:
-        """(B,) sample standard deviation of the references' frames; of fewer than two, a quarter of the estimate."""
+        """Sample standard deviation of the references' frames, (B,); a quarter of the estimate for fewer than two."""
         variance = self.lines.variation / np.maximum(self.lines.n - 1, 1)
         return np.where(self.lines.n >= 2, np.sqrt(variance), self.by_mean_speed / 4)
 
@@ -69,30 +70,37 @@ Estimator = Callable[[Cut], tuple[Floats, Floats]]
 
 @dataclass(frozen=True)
 class _Lines:
-    """(B,) lines frames = b0 + b1 * speed, each fitted by ordinary least squares to its own n points."""
+    """Lines frames = b0 + b1 * speed, fitted by ordinary least squares to n points each; all arrays are (B,).
 
-    n: Ints
+    Args:
+        n: number of points.
+        mean_speed_mps: mean of the speeds.
+        mean_frames: mean of the frames.
+        spread: sum of squared offsets of the speeds; 0 if they do not vary.
+        slope: b1.
+        variation: sum of squared offsets of the frames.
+        residual: sum of squared residuals.
+    """
+
+    n: Integers
     mean_speed_mps: Floats
     mean_frames: Floats
     spread: Floats
-    """Sum of squared offsets of the speeds; 0 where they do not vary."""
     slope: Floats
     variation: Floats
-    """Sum of squared offsets of the frames."""
     residual: Floats
-    """Sum of squared residuals."""
 
     @classmethod
     def fit(cls, known: Flags, speeds_mps: Floats, frames: Floats) -> "_Lines":
-        """Fit each row's line to the points that are known."""
+        """Fit each row's line to its known points."""
         n = known.sum(axis=1)
-        some = np.maximum(n, 1)
-        mean_speed, mean_frames = ((values * known).sum(axis=1) / some for values in (speeds_mps, frames))
+        count = np.maximum(n, 1)
+        mean_speed, mean_frames = ((values * known).sum(axis=1) / count for values in (speeds_mps, frames))
         speed_offset = np.where(known, speeds_mps - mean_speed[:, np.newaxis], 0.0)
         frames_offset = np.where(known, frames - mean_frames[:, np.newaxis], 0.0)
         slowest, fastest = (np.where(known, speeds_mps, limit) for limit in (np.inf, -np.inf))
         varies = fastest.max(axis=1, initial=-np.inf) > slowest.min(axis=1, initial=np.inf)
-        # What rounding leaves of a mean is no spread.
+        # Offsets that are only rounding errors of a mean are no spread.
         spread = np.where(varies, (speed_offset**2).sum(axis=1), 0.0)
         products = (speed_offset * frames_offset).sum(axis=1)
         slope = np.divide(products, spread, out=np.zeros_like(spread), where=varies)
@@ -100,40 +108,40 @@ class _Lines:
         return cls(n, mean_speed, mean_frames, spread, slope, (frames_offset**2).sum(axis=1), residual)
 
     def predict(self, speed_mps: Floats) -> Floats:
-        """The frames at one speed for each line."""
+        """Predict the frames at one speed for each line."""
         return self.mean_frames + self.slope * (speed_mps - self.mean_speed_mps)
 
     def predict_error(self, speed_mps: Floats) -> Floats:
-        """Standard error of a prediction: s sqrt(1 + 1/n + (v - mean v)2 / spread), s2 = residual / (n - 2)."""
+        """Compute the standard error s sqrt(1 + 1/n + (v - mean v)2 / spread), s2 = residual / (n - 2)."""
         offset = (speed_mps - self.mean_speed_mps) ** 2
         leverage = np.divide(offset, self.spread, out=np.zeros_like(offset), where=self.spread > 0)
         return np.sqrt(self.residual / np.maximum(self.n - 2, 1) * (1 + 1 / np.maximum(self.n, 1) + leverage))
 
 
 def estimate_by_regression(cut: Cut) -> tuple[Floats, Floats]:
-    """The contract's: all references, 2 sigma of their frames; the mean speed with fewer than 10."""
+    """Estimate as the contract does: regression over all references, or the mean speed with fewer than 10."""
     enough = cut.lines.n >= LEAST_REFERENCES
     return np.where(enough, cut.lines.predict(cut.speed_mps), cut.by_mean_speed), SIGMAS * cut.sigma
 
 
 def estimate_by_mean_speed(cut: Cut) -> tuple[Floats, Floats]:
-    """Distance / mean speed, with the contract's margin."""
+    """Estimate distance / mean speed, with the contract's margin."""
     return cut.by_mean_speed, SIGMAS * cut.sigma
 
 
 def estimate_without_margin(cut: Cut) -> tuple[Floats, Floats]:
-    """The contract's estimate, and no margin."""
+    """Estimate as the contract does, without a margin."""
     estimate, margin = estimate_by_regression(cut)
     return estimate, np.zeros_like(margin)
 
 
 def estimate_locally(cut: Cut) -> tuple[Floats, Floats]:
-    """The regression over the NEAREST references only, and a margin of ERRORS standard errors of prediction.
+    """Estimate by regression over the NEAREST references, with a margin of ERRORS standard errors of prediction.
 
-    Near in time, when they passed the start; each lane that they were apart there counts as LANE_APART_S, and none
-    where a lane is unknown. Where traffic slows down and recovers, the vehicles just before and after tell more than
-    the whole recording, whose spread is the course of traffic rather than the uncertainty of one drive. Where the
-    contract's falls back to the mean speed, it is the contract's.
+    Nearest in time of passing the start; each lane between two vehicles counts as LANE_APART_S, an unknown lane as
+    none. Where traffic slows down and recovers, the vehicles just before and after predict better than the whole
+    recording, whose spread reflects the course of traffic rather than the uncertainty of one drive. If the contract
+    uses the mean speed, this is the contract's estimate.
     """
     apart_s = np.abs(cut.passed_frame - cut.start_frame[:, np.newaxis]) / cut.frame_rate_hz
     lanes_apart = np.nan_to_num(np.abs(cut.lanes - cut.lane[:, np.newaxis]), nan=0.0)
@@ -158,4 +166,4 @@ ESTIMATES: Mapping[str, Estimator] = {
     "no_margin": estimate_without_margin,
     "local_regression": estimate_locally,
 }
-"""By the names of `schemas.start_assessments.ESTIMATORS`."""
+"""Estimators by their names in `schemas.start_assessments.ESTIMATORS`."""

@@ -1,40 +1,48 @@
-"""Tracks that start late: which, what is missing of them, and whose surroundings are therefore incomplete.
+"""Late starts: tracks that start late, the frames missing before them, and entries with incomplete surroundings.
 
-DESIGN section 6. Positions are never invented: the tables made here only say where something is missing.
+DESIGN section 6. Positions are never invented: the tables only state where something is missing.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.resample import find_stride
-from tracklake.pipeline.transforms.starts.references import Floats, References
+from tracklake.pipeline.transforms.starts.references import References
+from tracklake.schemas.arrays import Flags, Floats
 from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from tracklake.schemas.vehicles import VEHICLE_STARTS
 
 ELIGIBLE_AFTER_S = 1.0
-"""A track whose first entry lies this long after the recording's first frame was not on the road when it began."""
+"""Least time from the recording's first frame to a track's first entry that shows it was not yet on the road, in s."""
+
 CUTOFF_STEP_M = 2.0
+"""Step between candidates for the cut-off, in m."""
+
 LEAST_REFERENCES = 10
-"""With fewer the frames are estimated from the subset's mean speed."""
+"""Least number of references for a regression; with fewer the subset's mean speed is used."""
+
 SIGMAS = 2.0
+"""Margin of a missing start in standard deviations."""
+
 REACH_M = 40.0
-"""A missing vehicle this near, along the road, belongs to an entry's surroundings."""
+"""Distance along the road within which a missing vehicle is a would-be neighbor, in m."""
+
 ROUNDING_M = 1e-6
-"""Far below the precision of a position (1 mm): keeps rounding from deciding an inclusive bound."""
+"""Tolerance of inclusive bounds, in m; far below the precision of a position (1 mm)."""
 
 
 def find_cutoff(start_x_m: Floats) -> float | None:
     """Find the first c = 0, 2, 4 ... m with at least half of the starts at or before it and none in (c, c + 2].
 
     Args:
-        start_x_m: first positions of the eligible tracks. A cut-off exists as soon as there is one.
+        start_x_m: first positions of the eligible tracks.
 
     Returns:
-        c in metres; None where there are no starts.
+        c in m; None if there are no starts.
     """
     if not start_x_m.size:
         return None
@@ -55,24 +63,18 @@ def classify_starts(
     frame_rate_hz: float,
     on_ramp_lanes: tuple[int, ...] = (),
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Judge how each track of a subset begins, against the subset's own cut-off (DESIGN section 6, points 1, 2, 5).
+    """Classify how each track of a subset begins, by the subset's own cut-off (DESIGN section 6, points 1, 2, 5).
 
-    Where no track is eligible there is no cut-off: nobody is late, fully tracked or early. A vehicle without a lane
-    counts as not on a ramp.
-
-    Early: tracking began only at the entrance if no track (but those first seen on a ramp, whose entrance is
-    elsewhere) starts beyond the cut-off within the first second. Then vehicles first seen before the last frame of the
-    first fully tracked vehicle (by first frame) that has reached the section's end have unrecorded road ahead of them.
-    The section's end is the median last position of the fully tracked vehicles; a track that ends more than 40 m
-    before it (left by a ramp, or was still on the road when the recording ended) has not reached it.
+    If no track is eligible there is no cut-off, and no vehicle is late, fully tracked or early. A vehicle without a
+    lane is not on a ramp. For early vehicles see `_find_first_arrival`.
 
     Args:
         vehicles: vehicle_id, first_frame, last_frame, entries, start_x_m, end_x_m, start_lane of one subset.
-        dataset: the subset's.
-        subset: its name.
-        first_frame: the recording's first frame.
-        frame_rate_hz: the source's.
-        on_ramp_lanes: lanes on which a vehicle is not yet on the road that the cut-off is about.
+        dataset: name of the dataset.
+        subset: name of the subset.
+        first_frame: first frame of the recording.
+        frame_rate_hz: frame rate of the source.
+        on_ramp_lanes: lanes that are on-ramps.
 
     Returns:
         `vehicle_starts` (a row per vehicle) and `start_cutoffs` (one row).
@@ -114,9 +116,14 @@ def classify_starts(
 
 
 def _find_first_arrival(starts: pl.DataFrame) -> int | None:
-    """Last frame of the first fully tracked vehicle that reached the section's end; None if tracking began everywhere.
+    """Find the last frame of the first fully tracked vehicle that reached the section's end.
 
-    Also None where nobody is fully tracked: then there is nothing to tell how long the road stayed unseen.
+    Vehicles first seen before that frame are early: tracking began only at the entrance, so the road ahead of them was
+    not yet recorded. None if tracking began everywhere, that is if a track (not first seen on a ramp) starts beyond
+    the cut-off within the first second, and if no vehicle is fully tracked.
+
+    The section's end is the median last position of the fully tracked vehicles; a track that ends more than 40 m
+    before it (on a ramp, or when the recording ended) has not reached it.
     """
     if starts["tracked_from_within"].any():
         return None
@@ -144,85 +151,79 @@ def estimate_missing_starts(
     deviation of the references' frames.
 
     With fewer than 10 references (`method` = mean_speed) the estimate is (x - cutoff) / mean recorded speed of all the
-    subset's entries, and sigma that of the references there are, or a quarter of the estimate where there are fewer
-    than 2. Where that mean speed is not positive nothing can be estimated, and all frames since the recording's first
-    count as missing. Where all references have the same speed the slope is 0; r2 is null where their frames do not
-    vary.
+    subset's entries, and sigma is that of the references, or a quarter of the estimate with fewer than 2. If that mean
+    speed is not positive, all frames since the recording's first count as missing. If all references have the same
+    speed the slope is 0; r2 is null if their frames do not vary.
 
     Args:
         tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
         vehicle_starts: vehicle_id, starts_late, fully_tracked, from `classify_starts`.
-        dataset: the subset's.
-        subset: its name.
-        cutoff_m: from `classify_starts`; None = no late starts.
-        first_frame: the recording's first frame.
-        frame_rate_hz: the source's.
+        dataset: name of the dataset.
+        subset: name of the subset.
+        cutoff_m: cut-off from `classify_starts`; None = no late starts.
+        first_frame: first frame of the recording.
+        frame_rate_hz: frame rate of the source.
 
     Returns:
-        `missing_starts`.
+        Rows of `missing_starts`.
     """
     late = vehicle_starts.filter("starts_late").select("vehicle_id")
     if cutoff_m is None or late.is_empty():
         return MISSING_STARTS.empty()
     first_entries = tracks.join(late, on="vehicle_id", how="semi").sort("vehicle_id", "frame")
     first_entries = first_entries.unique("vehicle_id", keep="first", maintain_order=True)
-    references = References.gather(tracks, vehicle_starts, cutoff_m)
+    first_entries = first_entries.select(
+        "vehicle_id", "lane", start_x_m="x_m", start_frame="frame", start_speed_mps="speed_mps"
+    )
+    references = References.from_tracks(tracks, vehicle_starts, cutoff_m)
     mean_speed_mps = float(tracks["speed_mps"].to_numpy().mean(dtype=np.float64))
-
     rows = []
-    for entry in first_entries.select("vehicle_id", "lane", "frame", "x_m", "speed_mps").iter_rows(named=True):
-        frames, speeds = references.drive_to(entry["x_m"])
-        sigma = float(frames.std(ddof=1)) if frames.size >= 2 else None
-        if frames.size >= LEAST_REFERENCES:
-            fit = fit_frames(speeds, frames)
-            estimate = fit["intercept_frames"] + fit["slope_frames_per_mps"] * entry["speed_mps"]
-            method = "regression"
-        else:
-            fit, method = {}, "mean_speed"
-            estimate = (
-                (entry["x_m"] - cutoff_m) / mean_speed_mps * frame_rate_hz
-                if mean_speed_mps > 0
-                else float(entry["frame"] - first_frame)
-            )
-        if sigma is None:
-            sigma = estimate / 4
-        first_missing = math.floor(entry["frame"] - max(1.0, estimate) - SIGMAS * sigma)
-        rows.append(
-            {
-                "dataset": dataset,
-                "subset": subset,
-                "vehicle_id": entry["vehicle_id"],
-                "lane": entry["lane"],
-                "cutoff_m": cutoff_m,
-                "start_x_m": entry["x_m"],
-                "start_frame": entry["frame"],
-                "start_speed_mps": entry["speed_mps"],
-                "method": method,
-                "references": frames.size,
-                "frames_estimated": estimate,
-                "frames_sigma": sigma,
-                "first_missing_frame": max(first_frame, first_missing),
-                **fit,
-            }
+    for start in first_entries.iter_rows(named=True):
+        by_mean_speed = (
+            (start["start_x_m"] - cutoff_m) / mean_speed_mps * frame_rate_hz
+            if mean_speed_mps > 0
+            else float(start["start_frame"] - first_frame)
         )
+        estimate = _estimate_start(references, start, by_mean_speed)
+        margin = SIGMAS * estimate["frames_sigma"]
+        first_missing = math.floor(start["start_frame"] - max(1.0, estimate["frames_estimated"]) - margin)
+        names = {"dataset": dataset, "subset": subset, "cutoff_m": cutoff_m}
+        rows.append({**names, **start, **estimate, "first_missing_frame": max(first_frame, first_missing)})
     return pl.DataFrame(rows, schema=MISSING_STARTS.dtypes)
+
+
+def _estimate_start(references: References, start: Mapping[str, Any], by_mean_speed: float) -> dict[str, Any]:
+    """Estimate the missing frames of one start: the columns of `missing_starts` from `method` to the fit."""
+    frames, speeds = references.measure_drives(start["start_x_m"])
+    if frames.size >= LEAST_REFERENCES:
+        fit = fit_frames(speeds, frames)
+        estimate = fit["intercept_frames"] + fit["slope_frames_per_mps"] * start["start_speed_mps"]
+    else:
+        fit, estimate = {}, by_mean_speed
+    return {
+        "method": "regression" if fit else "mean_speed",
+        "references": frames.size,
+        "frames_estimated": estimate,
+        "frames_sigma": float(frames.std(ddof=1)) if frames.size >= 2 else estimate / 4,
+        **fit,
+    }
 
 
 def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
     """Fit frames = b0 + b1 * speed by ordinary least squares.
 
     Returns:
-        intercept_frames (b0), slope_frames_per_mps (b1; 0 where the speeds do not vary), r2 (None where the frames do
-        not vary).
+        intercept_frames (b0), slope_frames_per_mps (b1; 0 if the speeds do not vary), r2 (None if the frames do not
+        vary).
     """
     frames_vary = float(np.ptp(frames)) > 0
-    if not frames_vary or float(np.ptp(speed_mps)) == 0:  # what rounding leaves of a mean would pass for a slope
+    if not frames_vary or float(np.ptp(speed_mps)) == 0:  # else rounding errors of the mean would give a slope
         return {
             "intercept_frames": float(frames.mean()),
             "slope_frames_per_mps": 0.0,
             "r2": 0.0 if frames_vary else None,
         }
-    from sklearn.linear_model import LinearRegression  # imported only where something is fitted
+    from sklearn.linear_model import LinearRegression  # slow to import
 
     speeds = speed_mps[:, np.newaxis]
     line = LinearRegression().fit(speeds, frames)
@@ -235,23 +236,23 @@ def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
 
 def find_would_be_neighbors(
     clock: pl.DataFrame, missing_starts: pl.DataFrame, *, first_frame: int, frame_rate_hz: float, rate_hz: int
-) -> NDArray[np.bool_]:
-    """Tell which entries on the clock have a missing vehicle around them (DESIGN section 6, point 4).
+) -> Flags:
+    """Find the entries on the clock that have a missing vehicle near them (DESIGN section 6, point 4).
 
     In its window the missing vehicle drives at constant speed from the cut-off (at first_missing_frame) to its first
     position (at start_frame), in its first lane. An entry with abs(dx) <= 40 m and abs(lane difference) <= 1 is a
-    would-be neighbor; where either lane is unknown, abs(dx) decides alone. A tick between the window's last frame and
-    start_frame belongs to the window: the vehicle has no entry there either.
+    would-be neighbor; if either lane is unknown, abs(dx) decides alone. A tick between the window's last frame and
+    start_frame belongs to the window, since the vehicle has no entry there.
 
     Args:
-        clock: tick, x_m, lane, as `put_on_clock` leaves them.
-        missing_starts: of the same subset.
-        first_frame: the recording's first frame, where tick 0 lies.
-        frame_rate_hz: the source's.
-        rate_hz: the clock's.
+        clock: tick, x_m, lane from `put_on_clock`.
+        missing_starts: rows of the same subset.
+        first_frame: first frame of the recording, at tick 0.
+        frame_rate_hz: frame rate of the source.
+        rate_hz: rate of the clock.
 
     Returns:
-        (N,) in the clock's order.
+        (N,) flags in the clock's order.
     """
     near = np.zeros(clock.height, np.bool_)
     if missing_starts.is_empty() or clock.is_empty():

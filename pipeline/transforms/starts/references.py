@@ -1,53 +1,54 @@
-"""Fully tracked vehicles: when each crossed a position, and how fast and in which lane it was there."""
+"""Fully tracked vehicles: frame, speed and lane at which each crossed a position."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from tracklake.schemas.arrays import Floats, Integers, find_run_starts
 
 
 @dataclass(frozen=True)
 class References:
-    """The fully tracked vehicles' entries, vehicle after vehicle, and when each vehicle first crossed the cut-off.
+    """The (N,) entries of R fully tracked vehicles, one vehicle after the other; a row is an index of an entry.
 
-    A row is an index into the entries; R vehicles.
+    Args:
+        vehicle_id: (R,) id of the vehicle.
+        frame: (N,) frame number.
+        x_m: (N,) position along the road.
+        farthest_m: (N,) running maximum of x_m within a track.
+        speed_mps: (N,) recorded speed.
+        lane: (N,) lane; NaN = unknown.
+        first: (R,) first row of the vehicle.
+        last: (R,) last row of the vehicle.
+        left_cutoff: (R,) frame of the first crossing of the cut-off; NaN if it is never reached.
     """
 
-    vehicle_id: Ints
-    """(R,)"""
-    frame: Ints
+    vehicle_id: Integers
+    frame: Integers
     x_m: Floats
     farthest_m: Floats
-    """Running maximum of x_m within a track: it rises, and first reaches a position when the track does."""
     speed_mps: Floats
     lane: Floats
-    """NaN where unknown."""
-    first: Ints
-    """(R,) each vehicle's first row."""
-    last: Ints
-    """(R,) its last row."""
+    first: Integers
+    last: Integers
     left_cutoff: Floats
-    """(R,) frame of the first crossing of the cut-off; NaN where it is never reached."""
 
     @classmethod
-    def gather(cls, tracks: pl.DataFrame, vehicle_starts: pl.DataFrame, cutoff_m: float) -> "References":
-        """Pick the fully tracked vehicles out of the tracks.
+    def from_tracks(cls, tracks: pl.DataFrame, vehicle_starts: pl.DataFrame, cutoff_m: float) -> "References":
+        """Select the fully tracked vehicles.
 
         Args:
             tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
             vehicle_starts: vehicle_id, fully_tracked.
-            cutoff_m: where their tracks should begin.
+            cutoff_m: position where their tracks should begin.
         """
         wanted = vehicle_starts.filter("fully_tracked").select("vehicle_id")
         entries = tracks.join(wanted, on="vehicle_id", how="semi", maintain_order="left").with_columns(
             farthest_m=pl.col("x_m").cum_max().over("vehicle_id")
         )
         vehicle_id = entries["vehicle_id"].cast(pl.Int64).to_numpy()
-        first = np.flatnonzero(np.diff(vehicle_id, prepend=vehicle_id[:1] - 1))
+        first = find_run_starts(vehicle_id)
         references = cls(
             vehicle_id=vehicle_id[first],
             frame=entries["frame"].cast(pl.Int64).to_numpy(),
@@ -61,39 +62,40 @@ class References:
         )
         reach = references.find_reaching(cutoff_m)
         begin, end = references.first[reach], references.last[reach]
-        references.left_cutoff[reach] = references.cross(begin, references.find_row(begin, end, cutoff_m), cutoff_m)[0]
+        after = references.find_row(begin, end, cutoff_m)
+        references.left_cutoff[reach] = references.find_crossings(begin, after, cutoff_m)[0]
         return references
 
-    def find_reaching(self, x_m: float) -> Ints:
-        """The vehicles (0 to R - 1) that come as far as x_m."""
+    def find_reaching(self, x_m: float) -> Integers:
+        """Find the vehicles (0 to R - 1) that reach x_m."""
         return np.flatnonzero(self.farthest_m[self.last] >= x_m)
 
-    def drive_to(self, x_m: float) -> tuple[Floats, Floats]:
-        """Frames from the cut-off to x_m and speeds there, of those vehicles that reach it (x_m beyond the cut-off)."""
+    def measure_drives(self, x_m: float) -> tuple[Floats, Floats]:
+        """Measure the frames from the cut-off to x_m (beyond it) and the speeds there, of vehicles that reach it."""
         reach = self.find_reaching(x_m)
         begin = self.first[reach]
-        arrived, nearer = self.cross(begin, self.find_row(begin, self.last[reach], x_m), x_m)
+        arrived, nearer = self.find_crossings(begin, self.find_row(begin, self.last[reach], x_m), x_m)
         return arrived - self.left_cutoff[reach], self.speed_mps[nearer]
 
-    def find_row(self, low: Ints, high: Ints, x_m: float | Floats) -> Ints:
-        """The first row of low ... high (of one track each) at or past x_m; high where there is none.
+    def find_row(self, low: Integers, high: Integers, x_m: float | Floats) -> Integers:
+        """Find the first row of low ... high (of one track each) at or past x_m; high if there is none.
 
-        The three are broadcast.
+        The three arguments are broadcast.
         """
         low, high, _ = np.broadcast_arrays(low, high, x_m)
-        while (low < high).any():  # binary search in all tracks at once: as many rounds as the longest one needs
+        while (low < high).any():  # binary search in all tracks at once
             middle = (low + high) // 2
-            there = self.farthest_m[middle] >= x_m
-            low, high = np.where(there, low, np.minimum(middle + 1, high)), np.where(there, middle, high)
+            reached = self.farthest_m[middle] >= x_m
+            low, high = np.where(reached, low, np.minimum(middle + 1, high)), np.where(reached, middle, high)
         return low
 
-    def cross(self, first: Ints, after: Ints, x_m: float | Floats) -> tuple[Floats, Ints]:
-        """First crossings of x_m: frame (between entries: linear) and row of the nearer entry (the earlier of equals).
+    def find_crossings(self, first: Integers, after: Integers, x_m: float | Floats) -> tuple[Floats, Integers]:
+        """Find first crossings of x_m: the interpolated frame and the row of the nearer entry (the earlier of equals).
 
         Args:
             first: first rows of the tracks.
-            after: their first rows at or past x_m, from `find_row`.
-            x_m: broadcast against both.
+            after: first rows at or past x_m, from `find_row`.
+            x_m: position, broadcast against both.
         """
         before = np.maximum(after - 1, first)  # the same entry where a track starts on x_m exactly
         step_m = self.x_m[after] - self.x_m[before]

@@ -1,1 +1,1 @@
-"""Training tensors: flat arrays over a protocol's clock, and their index."""
+"""Training tensors: flat arrays on a protocol's clock, and their index."""

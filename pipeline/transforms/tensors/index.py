@@ -1,4 +1,4 @@
-"""What `index.json` says of a tensor folder's arrays: where they come from, how large and how exact they are."""
+"""The contents of a tensor folder's `index.json`: sources, sizes and rounding errors of the arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -14,11 +14,11 @@ from tracklake.schemas.tensors import NOMINAL_LANE_M, TENSORS_VERSION
 
 
 def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[str, Any]:
-    """One entry of the index's `subsets`, of `schemas.tensors.SUBSET_KEYS`.
+    """Describe a subset by `schemas.tensors.SUBSET_KEYS`.
 
     Args:
-        facts: dataset, subset, frame_rate_hz, lane_markings_m (null where unknown).
-        tensors: of the subset.
+        facts: dataset, subset, frame_rate_hz, lane_markings_m (null = unknown).
+        tensors: tensors of the subset.
     """
     markings = facts["lane_markings_m"]
     last_lane = len(markings) - 1 if markings else tensors.last_lane
@@ -45,19 +45,19 @@ def describe_tensors(
     squared_error_m2: Sequence[float],
     split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What `index.json` holds: `schemas.tensors.INDEX_KEYS`.
+    """Describe the tensors by `schemas.tensors.INDEX_KEYS`.
 
     Args:
-        subsets: of `describe_subset`, in the order of `run_subset`.
-        splits: the split's rows of `schemas.splits.SPLITS`; they let an evaluation prove that a model was trained on
+        subsets: descriptions from `describe_subset`, in the order of `run_subset`.
+        splits: the split's rows of `schemas.splits.SPLITS`, by which an evaluation proves that a model was trained on
             other data.
-        protocol: of the samples.
-        storage: of positions.
-        sizes: of all arrays, by letter.
-        samples_by_part: in the order of PARTS.
-        max_error_m: greatest rounding error of all positions: along, across.
-        squared_error_m2: sums of the squared rounding errors.
-        split_recipe: digest, parameters, left_out_vehicles; None: not known.
+        protocol: protocol of the samples.
+        storage: storage of positions.
+        sizes: sizes of all arrays by letter.
+        samples_by_part: number of samples in the order of PARTS.
+        max_error_m: largest rounding error of positions: along, across.
+        squared_error_m2: sums of the squared rounding errors: along, across.
+        split_recipe: digest, parameters, left_out_vehicles; None = unknown.
     """
     split = splits["split"].unique().sort()
     return {

@@ -1,44 +1,45 @@
-"""How positions are stored in tensors: as they are, or as whole steps from the subset's centre in int16."""
+"""Storage of positions in tensors: float32, or int16 in whole steps from the subset's centre."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from tracklake.schemas.arrays import Floats, Singles
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import STEPS_M
 
 REACH = 2**15 - 1
-"""Steps that int16 reaches either way."""
+"""Largest number of steps in int16."""
 
 _ALONG, _ACROSS = "along the road", "across it"
 
 
 @dataclass(frozen=True)
 class Stored:
-    """Positions as they are stored, and what that cost.
+    """Stored positions and their rounding errors.
 
     Args:
         steps: (N, 2) float32 in m, or int16 in steps.
-        centre_m: what int16 counts from: along, across; (0, 0) for float32.
-        max_error_m: greatest difference between what a reader gets and what was given: along, across.
-        squared_error_m2: the sum of its squares.
+        centre_m: origin of int16 steps: along, across; (0, 0) for float32.
+        max_error_m: largest rounding error: along, across.
+        squared_error_m2: sum of the squared rounding errors: along, across.
     """
 
-    steps: npt.NDArray[np.float32] | npt.NDArray[np.int16]
+    steps: Singles | npt.NDArray[np.int16]
     centre_m: tuple[float, float]
     max_error_m: tuple[float, float]
     squared_error_m2: tuple[float, float]
 
 
-def store_positions(x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64], *, storage: str, where: str) -> Stored:
+def store_positions(x_m: Floats, y_m: Floats, *, storage: str, where: str) -> Stored:
     """Round positions to their storage and measure the error.
 
     Args:
-        x_m: (N,) along the direction of travel.
-        y_m: (N,) across it.
+        x_m: (N,) positions along the direction of travel.
+        y_m: (N,) positions across it.
         storage: one of `schemas.tensors.POSITION_STORAGES`.
-        where: the subset, for messages.
+        where: name of the subset in messages.
 
     Raises:
         TracklakeError: a position lies farther from the median than int16 reaches in the storage's steps.
@@ -47,12 +48,12 @@ def store_positions(x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64], 
     """
     given = np.stack([x_m, y_m], axis=-1).astype(np.float64, copy=False)
     if storage not in STEPS_M:
-        steps: npt.NDArray[np.float32] | npt.NDArray[np.int16] = given.astype(np.float32)
+        steps: Singles | npt.NDArray[np.int16] = given.astype(np.float32)
         centre = np.zeros(2)
         read = steps.astype(np.float64)
     else:
         step = np.array(STEPS_M[storage])
-        # The centre is a whole number of steps, so that positions on the steps' grid are stored exactly.
+        # The centre is a whole number of steps, so positions on the steps' grid are stored exactly.
         centre = np.round(np.median(given, axis=0) / step) * step if len(given) else np.zeros(2)
         counted = np.round((given - centre) / step)
         for axis, name in enumerate((_ALONG, _ACROSS)):

@@ -1,22 +1,21 @@
-"""Scenes: every vehicle of one moment, found among the rows of a subset's tensors."""
+"""Scenes: all vehicles of a subset's tensors at one tick."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-Integers = npt.NDArray[np.int64]
+from tracklake.schemas.arrays import Integers, find_run_starts
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """C scenes of M vehicles together, sorted by (block, tick).
+    """C scenes with M vehicles in total, sorted by (block, tick).
 
     Args:
         offset: (C + 1,) vehicles of scene c are [offset[c], offset[c + 1]).
-        block: (C,) the block that each scene stands in.
+        block: (C,) block of each scene.
         row: (M,) rows of the vehicles, increasing within a scene.
-        sample: (M,) number of the sample that the vehicle is there; -1 where it is none.
+        sample: (M,) number of the vehicle's sample; -1 = none.
     """
 
     offset: Integers
@@ -26,19 +25,18 @@ class Scenes:
 
 
 def find_scenes(tick: Integers, block: Integers, sample: Integers) -> Scenes:
-    """Gather rows by block and tick; moments at which nobody is a sample are left out.
+    """Gather rows by block and tick; scenes without samples are left out.
 
     Args:
-        tick: (N,) of rows sorted by (vehicle_id, tick), 0 to 2**31 - 1.
-        block: (N,) of the split, 0 or more.
-        sample: (N,) number of the sample that the row is; -1 where it is none.
+        tick: (N,) ticks of rows sorted by (vehicle_id, tick), 0 to 2**31 - 1.
+        block: (N,) block of the split, 0 or more.
+        sample: (N,) number of the row's sample; -1 = none.
     """
-    moment = (block << 32) | tick
-    row = np.argsort(moment, kind="stable")
-    moment = moment[row]
-    start = np.flatnonzero(np.diff(moment, prepend=-1))
+    scene = (block << 32) | tick
+    row = np.argsort(scene, kind="stable")
+    start = find_run_starts(scene[row])
     length = np.diff(start, append=len(row))
-    # How many samples each moment has, from the running count of them.
+    # A scene has samples if their running count grows over it.
     running = np.concatenate([[0], np.cumsum(sample[row] >= 0)])
     sampled = running[start + length] > running[start]
     row = row[np.repeat(sampled, length)]

@@ -1,26 +1,23 @@
-"""What tensors say of vehicles beside their places: sizes, and which of their entries findings touch."""
+"""Facts about vehicles in tensors: their sizes, and the findings on their entries."""
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
-from tracklake.pipeline.transforms.resample import find_stride
+from tracklake.pipeline.transforms.resample import find_stride, join_key
+from tracklake.schemas.arrays import Bytes, Integers, Singles
 from tracklake.schemas.columns import SEVERITIES
 
-Integers = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float32]
 
-
-def find_sizes(vehicles: pl.DataFrame, vehicle_id: Integers, *, where: str) -> tuple[Floats, Floats]:
-    """Look up lengths and widths.
+def find_sizes(vehicles: pl.DataFrame, vehicle_id: Integers, *, where: str) -> tuple[Singles, Singles]:
+    """Look up lengths and widths of vehicles.
 
     Args:
-        vehicles: vehicle_id (unique), length_m, width_m (null where the source has none), in any order.
-        vehicle_id: (R,) whose are wanted.
-        where: the subset, for messages.
+        vehicles: vehicle_id (unique), length_m, width_m (null = unknown), in any order.
+        vehicle_id: (R,) ids of the vehicles.
+        where: name of the subset in messages.
 
     Returns:
-        (R,) lengths and (R,) widths in m; NaN where there is none.
+        (R,) lengths and (R,) widths in m; NaN = unknown.
 
     Raises:
         ValueError: a vehicle is not among `vehicles`.
@@ -32,7 +29,7 @@ def find_sizes(vehicles: pl.DataFrame, vehicle_id: Integers, *, where: str) -> t
     if unknown.any():
         raise ValueError(
             f"{where}: expected every vehicle of the tracks in `vehicles`, got {int(unknown.sum())} runs of others, "
-            f"for example vehicle {vehicle_id[np.argmax(unknown)]}; ingest the recording anew"
+            f"for example vehicle {vehicle_id[np.argmax(unknown)]}; ingest the recording again"
         )
     sizes = known.select(pl.col("length_m", "width_m").cast(pl.Float32).fill_null(np.nan))
     return sizes["length_m"].to_numpy()[row], sizes["width_m"].to_numpy()[row]
@@ -46,41 +43,35 @@ def mark_findings(
     first_frame: int,
     frame_rate_hz: float,
     rate_hz: int,
-) -> npt.NDArray[np.uint8]:
-    """Tell the worst severity of a vehicle's own findings at every tick.
+) -> Bytes:
+    """Mark every tick with the worst severity of the vehicle's own findings.
 
-    A tick stands for the frames after the tick before, up to its own: what a source of 25 Hz shows between two ticks
-    is not lost. Ticks between two frames are made of both: the later one counts here, and again at the next tick.
+    A tick stands for the frames after the previous tick up to its own, so no frame of a 25 Hz source is skipped. A
+    tick between two frames covers both: the later one counts there, and again at the next tick.
 
     Args:
-        vehicle_id: (N,) of entries on the clock, sorted by (vehicle_id, tick).
-        tick: (N,) of the same.
+        vehicle_id: (N,) vehicles of entries on the clock, sorted by (vehicle_id, tick).
+        tick: (N,) ticks of the entries.
         findings: vehicle_id, severity, first_frame, last_frame, in any order; they may overlap.
-        first_frame: the subset's first frame, where tick 0 lies.
-        frame_rate_hz: of the source.
-        rate_hz: of the clock.
+        first_frame: first frame of the subset, at tick 0.
+        frame_rate_hz: frame rate of the source.
+        rate_hz: rate of the clock.
 
     Returns:
-        (N,) 1 + position in SEVERITIES, the worst being 1; 0 where there is none.
+        (N,) 1 + position in SEVERITIES, 1 being the worst; 0 = no finding.
     """
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
-    ends = _key(vehicle_id, first_frame - (-tick * stride.numerator // stride.denominator))
-    begins = _key(vehicle_id, first_frame + (tick - 1) * stride.numerator // stride.denominator + 1)
+    ends = join_key(vehicle_id, first_frame - (-tick * stride.numerator // stride.denominator))
+    begins = join_key(vehicle_id, first_frame + (tick - 1) * stride.numerator // stride.denominator + 1)
     marked = np.zeros(len(tick), dtype=np.uint8)
-    for code, severity in reversed(list(enumerate(SEVERITIES, start=1))):  # the worse overwrites the less bad
+    for code, severity in reversed(list(enumerate(SEVERITIES, start=1))):  # worse severities overwrite others
         own = findings.filter(pl.col("severity") == severity)
         if own.is_empty():
             continue
-        who = own["vehicle_id"].to_numpy().astype(np.int64)
+        ids = own["vehicle_id"].to_numpy()
         # Rows of a finding: from the first that does not end before it to the last that does not begin after it.
-        first = np.searchsorted(ends, _key(who, own["first_frame"].to_numpy()), side="left")
-        beyond = np.searchsorted(begins, _key(who, own["last_frame"].to_numpy()), side="right")
+        first = np.searchsorted(ends, join_key(ids, own["first_frame"].to_numpy()), side="left")
+        beyond = np.searchsorted(begins, join_key(ids, own["last_frame"].to_numpy()), side="right")
         open_findings = np.bincount(first, minlength=len(tick) + 1) - np.bincount(beyond, minlength=len(tick) + 1)
         marked[np.cumsum(open_findings)[:-1] > 0] = code
     return marked
-
-
-def _key(vehicle_id: Integers, frame: npt.NDArray[np.integer]) -> Integers:
-    """Vehicle and frame as one number of the same order, also for frames some way beyond those of Int32."""
-    key: Integers = (vehicle_id << 32) + frame
-    return key

@@ -1,1 +1,1 @@
-"""Raw entries to the canonical frame: orientation, kinematics, gaps and vehicle identities."""
+"""The canonical frame of tracks: orientation, kinematics, gaps and vehicle identities."""

@@ -1,18 +1,19 @@
-"""One id, one vehicle: source ids that stand for several vehicles are told apart."""
+"""Identities of vehicles: source ids that stand for several vehicles are split."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
-from tracklake.pipeline.transforms.tracks.continuity import Moves, follow
+from tracklake.pipeline.transforms.tracks.continuity import Moves, link_tracks
+from tracklake.schemas.arrays import Integers
 
 INT32_MAX = 2**31 - 1
 ROW = "row_of_entry"
 TRACK = "track_of_entry"
-SAID = "said_by_any_entry_"
+FILLED = "filled_"
+"""Prefix of constants whose nulls are filled from other entries of the id."""
 
 
 @dataclass(frozen=True)
@@ -20,8 +21,8 @@ class Identified:
     """Entries with a vehicle_id that is unique within the subset.
 
     Args:
-        entries: as given, plus vehicle_id, leader_id and follower_id (null = none), sorted by vehicle_id, frame.
-        ids_split: source ids that stood for more than one vehicle.
+        entries: given entries with vehicle_id, leader_id and follower_id (null = none), sorted by vehicle_id, frame.
+        ids_split: number of source ids that stood for more than one vehicle.
     """
 
     entries: pl.DataFrame
@@ -38,45 +39,43 @@ def identify_vehicles(
 ) -> Identified:
     """Give every vehicle of a subset an id of its own; no entry is dropped.
 
-    A source id stands for as many vehicles as it has different sets of constants (frames announced, length, width,
-    class: the same in all rows of one vehicle; where one is missing in some rows of an id, they have the one that the
-    others have, if that is one). Within these, it stands for as many as `pipeline.transforms.tracks.continuity` tells
-    apart by how they move: several in one frame, or one that comes back where no vehicle can have got to. An id whose
-    vehicle may just have been out of sight stays one. The vehicle seen first keeps the source's id; the others get ids
-    that nothing in the subset carries or names.
+    A source id stands for as many vehicles as it has different sets of constants (announced frames, length, width,
+    class: equal in all rows of one vehicle; a missing one is filled if the id's other rows agree on it). Within these,
+    `pipeline.transforms.tracks.continuity` splits by motion: several entries in one frame, or a return to where the
+    vehicle cannot have moved. An id whose vehicle may just have been out of sight stays one. The vehicle seen first
+    keeps the source's id; the others get ids that are not used in the subset.
 
-    A leader or follower that names an id that was split is the vehicle of that id in the same frame: for a leader the
-    nearest one ahead, for a follower the nearest one behind, one in the same lane before one in another, and only where
-    there is none, one on the other side. Where no vehicle of that id has an entry in that frame, it is the one whose
-    first and last frame lie either side of it; where that is none or several, nobody can say, and it is null. An id
-    that was not split is left as recorded. Nobody is the leader or follower of itself: where an entry names its own id
-    and no other vehicle has that, there is none.
+    A leader or follower with an id that was split is the vehicle of that id in the same frame: for a leader the
+    nearest one ahead, for a follower the nearest one behind, in the same lane before another lane, and only if there
+    is none, one on the other side. If no vehicle of that id has an entry in that frame, it is the only one whose first
+    and last frame lie on either side of it, else null. An id that was not split is left as recorded. No vehicle is its
+    own leader or follower: if an entry names its own id and no other vehicle has it, there is none.
 
     Args:
         entries: source_id, frame, x_m, y_m, speed_mps, lane, leader_source_id, follower_source_id (0 or null = none)
-            and the constants, in any order (sorted by source_id and frame is fastest).
-        constants: columns that are the same in all entries of one vehicle.
-        frame_rate_hz: frames per second.
-        announced: the constant that says how many entries a vehicle has.
-        one_way: all vehicles drive towards larger x_m, and none turns off and comes back.
+            and the constants, in any order (fastest if sorted by source_id and frame).
+        constants: columns that are equal in all entries of one vehicle.
+        frame_rate_hz: frame rate of the source.
+        announced: the constant with the number of entries of a vehicle.
+        one_way: whether all vehicles drive towards larger x_m, and none leaves and comes back.
     """
     if not _is_sorted(entries):
         entries = entries.sort("source_id", "frame")
     ids = entries["source_id"].to_numpy()
     vehicle = ids
     split = pl.Series("source_id", [], entries.schema["source_id"])
-    doubtful = _doubtful(entries, constants, announced, frame_rate_hz)
+    doubtful = _find_doubtful(entries, constants, announced, frame_rate_hz)
     if len(doubtful):
-        some = entries.with_row_index(ROW).filter(pl.col("source_id").is_in(doubtful.implode()))
-        some = _tell_apart(some, constants, announced, frame_rate_hz, one_way)
-        vehicles, split = _name(some, entries)
-        named = some.join(vehicles, on=TRACK, maintain_order="left")
+        tracked = entries.with_row_index(ROW).filter(pl.col("source_id").is_in(doubtful.implode()))
+        tracked = _add_tracks(tracked, constants, announced, frame_rate_hz, one_way)
+        vehicles, split = _assign_ids(tracked, entries)
+        named = tracked.join(vehicles, on=TRACK, maintain_order="left")
         vehicle = ids.copy()
         vehicle[named[ROW].to_numpy()] = named["vehicle_id"].to_numpy()
     entries = entries.with_columns(pl.Series("vehicle_id", vehicle))
-    entries = entries.with_columns(_other("leader"), _other("follower"))
+    entries = entries.with_columns(_select_other("leader"), _select_other("follower"))
     if len(split):
-        entries = entries.with_columns(_in_frame(entries, "leader", split), _in_frame(entries, "follower", split))
+        entries = entries.with_columns(_resolve_role(entries, role, split) for role in ("leader", "follower"))
         entries = entries.sort("vehicle_id", "frame")
     return Identified(entries, len(split))
 
@@ -86,10 +85,10 @@ def _is_sorted(entries: pl.DataFrame) -> bool:
     return bool(np.all((ids[1:] > ids[:-1]) | ((ids[1:] == ids[:-1]) & (frames[1:] >= frames[:-1]))))
 
 
-def _doubtful(
+def _find_doubtful(
     entries: pl.DataFrame, constants: Sequence[str], announced: str | None, frame_rate_hz: float
 ) -> pl.Series:
-    """Source ids that may stand for more than one vehicle: a sieve, cheap because all entries pass it."""
+    """Find source ids that may stand for more than one vehicle, by a cheap test of all entries."""
     ids, frames = entries["source_id"].to_numpy(), entries["frame"].to_numpy()
     same = ids[1:] == ids[:-1]
     step = np.where(same, frames[1:] - frames[:-1], 1)
@@ -97,12 +96,13 @@ def _doubtful(
     found = same & (step == 0)
     if constants:
         found |= same & entries.select(differs)[1:].to_series().to_numpy()
-    # The few entries after an absence are looked at one by one.
+    # The few entries after an absence are tested one by one.
     after = np.flatnonzero(step > 1) + 1
     if len(after):
-        moves = _moves(entries[np.stack([after - 1, after], axis=1).ravel()], None, None, frame_rate_hz, one_way=True)
+        around = entries[np.stack([after - 1, after], axis=1).ravel()]
+        moves = _build_moves(around, None, None, frame_rate_hz, one_way=True)
         first = np.arange(0, 2 * len(after), 2)
-        found[after - 1] |= ~moves.reachable(first, first + 1)
+        found[after - 1] |= ~moves.are_reachable(first, first + 1)
     doubtful = pl.Series("source_id", ids[1:][found]).unique()
     if announced is None or not len(after):
         return doubtful
@@ -112,8 +112,8 @@ def _doubtful(
     return pl.concat([doubtful, too_many["source_id"]]).unique()
 
 
-def _moves(
-    entries: pl.DataFrame, group: npt.NDArray[np.int64] | None, announced: str | None, rate_hz: float, *, one_way: bool
+def _build_moves(
+    entries: pl.DataFrame, group: Integers | None, announced: str | None, rate_hz: float, *, one_way: bool
 ) -> Moves:
     size = entries.height
     return Moves(
@@ -130,36 +130,36 @@ def _moves(
     )
 
 
-def _tell_apart(
+def _add_tracks(
     entries: pl.DataFrame, constants: Sequence[str], announced: str | None, rate_hz: float, one_way: bool
 ) -> pl.DataFrame:
-    """Entries of doubtful ids, sorted, with the track of each."""
+    """Sort entries of doubtful ids and add the track of each."""
     values = {name: pl.col(name).n_unique() - pl.col(name).has_nulls() for name in constants}
-    said = [
+    filled = [
         pl.when(values[name].over("source_id") == 1)
         .then(pl.col(name).max().over("source_id"))
         .otherwise(pl.col(name))
-        .alias(SAID + name)
+        .alias(FILLED + name)
         for name in constants
     ]
-    key = ["source_id", *(SAID + name for name in constants)]
+    key = ["source_id", *(FILLED + name for name in constants)]
     rest = [name for name in entries.columns if name not in ("source_id", "frame", "x_m", ROW)]
-    # By all columns, so that the order in which entries came decides nothing.
-    entries = entries.with_columns(said).sort(*key, "frame", "x_m", *rest)
+    # Sorted by all columns, so that the given order does not matter.
+    entries = entries.with_columns(filled).sort(*key, "frame", "x_m", *rest)
     changes = pl.any_horizontal(pl.col(name).ne_missing(pl.col(name).shift(1)) for name in key)
     group = entries.select(changes.cast(pl.Int64).cum_sum()).to_series().to_numpy()
-    counted = None if announced is None else SAID + announced
-    track = follow(_moves(entries, group, counted, rate_hz, one_way=one_way))
+    counted = None if announced is None else FILLED + announced
+    track = link_tracks(_build_moves(entries, group, counted, rate_hz, one_way=one_way))
     return entries.with_columns(pl.Series(TRACK, track))
 
 
-def _name(some: pl.DataFrame, entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.Series]:
-    """(vehicle_id of each track, source ids that have several)."""
+def _assign_ids(tracked: pl.DataFrame, entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.Series]:
+    """Assign a vehicle_id to each track; also return the source ids that have several."""
     vehicles = (
-        some.with_row_index("place")
+        tracked.with_row_index("position")
         .group_by(TRACK)
-        .agg(pl.col("source_id").first(), first=pl.col("frame").min(), place=pl.col("place").min())
-        .sort("source_id", "first", "place")
+        .agg(pl.col("source_id").first(), first=pl.col("frame").min(), position=pl.col("position").min())
+        .sort("source_id", "first", "position")
         .with_columns(later=~pl.col("source_id").is_first_distinct())
     )
     extra = vehicles.filter("later")
@@ -167,10 +167,10 @@ def _name(some: pl.DataFrame, entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.S
     known = vehicles.filter(~pl.col("later")).select(TRACK, vehicle_id="source_id")
     if extra.is_empty():
         return known, split
-    return pl.concat([known, extra.select(TRACK, _unused_ids(entries, extra.height).alias("vehicle_id"))]), split
+    return pl.concat([known, extra.select(TRACK, _find_unused_ids(entries, extra.height).alias("vehicle_id"))]), split
 
 
-def _unused_ids(entries: pl.DataFrame, count: int) -> pl.Series:
+def _find_unused_ids(entries: pl.DataFrame, count: int) -> pl.Series:
     used = np.concatenate(
         [
             entries[name].drop_nulls().unique().to_numpy()
@@ -183,14 +183,14 @@ def _unused_ids(entries: pl.DataFrame, count: int) -> pl.Series:
     return pl.Series(np.setdiff1d(np.arange(1, used.size + count + 1), used)[:count].astype(np.int32))
 
 
-def _other(role: str) -> pl.Expr:
-    """The id that an entry names, unless it is none or its own."""
+def _select_other(role: str) -> pl.Expr:
+    """Select the id that an entry names as its leader or follower, unless it is none or its own."""
     named = pl.col(f"{role}_source_id")
     return pl.when((named != 0) & (named != pl.col("source_id"))).then(named).alias(f"{role}_id")
 
 
-def _in_frame(entries: pl.DataFrame, role: str, split: pl.Series) -> pl.Series:
-    """The ids of a role, pointed at vehicles where the source id they name was split."""
+def _resolve_role(entries: pl.DataFrame, role: str, split: pl.Series) -> pl.Series:
+    """Replace leader or follower ids that were split by the id of the vehicle that is meant."""
     source, sign = f"{role}_source_id", 1 if role == "leader" else -1
     several = entries.filter(pl.col("source_id").is_in(split.implode()))
     present = several.select("frame", "lane", "x_m", pl.col("source_id").alias(source), named="vehicle_id")

@@ -1,4 +1,4 @@
-"""Raw coordinates to the canonical frame: x along the direction of travel, y to the driver's right, front centre.
+"""Raw coordinates turned into the canonical frame: x along the direction of travel, y to the driver's right.
 
 Formulas: DESIGN section 4, 'Orientation of highD' and 'NGSIM'.
 """
@@ -8,12 +8,13 @@ import polars as pl
 from tracklake.schemas.columns import FOOT_M
 
 UPPER, LOWER = 1, 2
-"""highD's drivingDirection: the upper carriageway drives to the left of the image, the lower one to the right."""
+"""Codes of highD's drivingDirection: the upper carriageway drives to the image's left, the lower one to its right."""
 
 EAST, NORTH, WEST, SOUTH = 1, 2, 3, 4
-"""NGSIM's Direction on arterials, where Local_Y runs north and Local_X east."""
+"""Codes of NGSIM's Direction on arterials, where Local_Y runs north and Local_X east."""
 
 DIRECTIONS = {EAST: "east", NORTH: "north", WEST: "west", SOUTH: "south"}
+"""Names of NGSIM's directions by code."""
 
 
 def orient_highd(entries: pl.DataFrame, direction: int, upper_m: list[float], lower_m: list[float]) -> pl.DataFrame:
@@ -23,13 +24,13 @@ def orient_highd(entries: pl.DataFrame, direction: int, upper_m: list[float], lo
     side and the driver's right is down; on the upper one the front is the left side and the driver's right is up.
 
     Args:
-        entries: highD's names; x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId. One carriageway.
+        entries: x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId of one carriageway, as in highD.
         direction: UPPER or LOWER.
-        upper_m: y of the upper carriageway's lane markings, from the top.
-        lower_m: y of the lower carriageway's lane markings, from the top.
+        upper_m: y of the upper carriageway's lane markings in m, from the top.
+        lower_m: y of the lower carriageway's lane markings in m, from the top.
 
     Returns:
-        x_m, y_m, lane, speed_mps, accel_mps2, lateral_speed_mps beside the columns given.
+        The entries with x_m, y_m, lane, speed_mps, accel_mps2, lateral_speed_mps.
     """
     upper_lanes = len(upper_m) - 1
     centre_y = pl.col("y") + pl.col("height") / 2
@@ -53,18 +54,18 @@ def orient_highd(entries: pl.DataFrame, direction: int, upper_m: list[float], lo
 
 
 def orient_ngsim(entries: pl.DataFrame, direction: int | None) -> pl.DataFrame:
-    """Turn feet into the canonical frame.
+    """Turn NGSIM's coordinates into the canonical frame.
 
-    Freeways: Local_X and Local_Y as they are. Arterials: x_m is measured along the direction of travel from the first
-    point recorded in it where that runs against the axis; y_m for north and south from the street's centre line, for
-    the crossing streets from the leftmost point recorded.
+    Freeways keep Local_X and Local_Y. On arterials x_m is measured along the direction of travel, from the first
+    recorded point if travel runs against the axis; y_m for north and south from the street's centre line, for the
+    crossing streets from the leftmost recorded point.
 
     Args:
-        entries: Local_X, Local_Y (feet, front centre), v_Vel, v_Acc. One subset.
-        direction: EAST, NORTH, WEST, SOUTH or, on a freeway, None.
+        entries: Local_X, Local_Y (feet, front centre), v_Vel, v_Acc of one subset.
+        direction: EAST, NORTH, WEST or SOUTH; None on a freeway.
 
     Returns:
-        x_m, y_m, speed_mps, accel_mps2 beside the columns given.
+        The entries with x_m, y_m, speed_mps, accel_mps2.
     """
     lateral, along = pl.col("Local_X") * FOOT_M, pl.col("Local_Y") * FOOT_M
     x_m, y_m = {

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from tracklake.pipeline.lake import connect
-from tracklake.pipeline.synthetic.expected_findings import JUDGES
+from tracklake.pipeline.synthetic.expected_findings import RULE_TESTS
 from tracklake.schemas import TABLES
 
 
@@ -25,7 +25,7 @@ def sql(lake):
 
 
 def test_every_rule_finds_exactly_what_the_slow_loop_over_the_files_found(sql, truth):
-    names = list(JUDGES)  # a rule that the slow loop does not know has its case alone (test_rule_cases.py)
+    names = list(RULE_TESTS)  # a rule that the slow loop does not know has its case alone (test_rule_cases.py)
     found = sql(
         f"""
         SELECT s.dataset, s.subset, r.rule AS name, coalesce(sum(f.entries), 0) AS entries,

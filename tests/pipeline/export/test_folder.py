@@ -35,7 +35,7 @@ def test_files_come_beside_what_is_there(tmp_path, there):
 
 def test_what_stands_in_the_way_is_found_before_any_work(tmp_path):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ExportError, match=r"file is no folder to write in"):
+    with pytest.raises(ExportError, match=r"file is not a folder that can be written to"):
         refuse_taken(tmp_path / "file" / "out", NAMES, force=True, lake=tmp_path / "lake")
     (tmp_path / "out" / "b").mkdir(parents=True)
     with pytest.raises(ExportError, match=r"out: holds folders named b\."):

@@ -136,7 +136,7 @@ def test_frames_that_were_numbered_anew(tmp_path):
     )
 
 
-def test_what_metadata_leave_empty_is_not_judged(tmp_path):
+def test_counts_that_metadata_leave_empty_are_not_compared(tmp_path):
     vehicles = [row.replace(",1,", ",,", 1) if place else row for place, row in enumerate(VEHICLES)]
     paths = write_recording(tmp_path, meta=meta_row().replace(",4,3,1,", ",4,,,"), vehicles=vehicles)
     canonical = read_highd(paths)
@@ -246,7 +246,7 @@ def test_total_frames_that_are_kept_and_others(tmp_path):
     assert complete.notes == ()
 
 
-def test_files_without_total_frames_are_not_judged_by_it(tmp_path):
+def test_files_without_total_frames_are_not_compared_by_it(tmp_path):
     names = [name for name in TEXT_NAMES if name != "Total_Frames"]
     canonical = ngsim(tmp_path, as_csv(vehicle_rows(3, (1, 2), 2), names))
     assert figures(canonical) == {

@@ -4,10 +4,10 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tracklake.pipeline.synthetic.defects import inject
-from tracklake.pipeline.synthetic.misreadings import recorded_leaders
+from tracklake.pipeline.synthetic.defects import inject_defects
 from tracklake.pipeline.synthetic.neighbors import find_surroundings
 from tracklake.pipeline.synthetic.noise import DRONE, add_noise
+from tracklake.pipeline.synthetic.recording_errors import select_recorded_leaders
 from tracklake.pipeline.synthetic.scenarios import FREEWAY, TWO_LANES, Plan
 
 RATE = 10.0
@@ -31,7 +31,7 @@ def platoon(vehicles=40, frames=200, speed=20.0, spacing=20.0):
 
 def damage(plan, *, tracks=None, seed=1, unseen=False, ramp=None):
     before = platoon() if tracks is None else tracks
-    done = inject(
+    done = inject_defects(
         before,
         plan,
         rate_hz=RATE,
@@ -172,7 +172,7 @@ def test_skipped_leaders_and_wrong_headways_stand_where_declared():
     assert done.tracks.select(before.columns).equals(before)
     # Vehicle v follows v - 1 in the lane: recorded is v - 2, wherever the two are there.
     around = find_surroundings(done.tracks)
-    recorded = recorded_leaders(around.leader, done.tracks)
+    recorded = select_recorded_leaders(around.leader, done.tracks)
     vehicle = done.tracks["vehicle"].to_numpy()
     for defect in leaders:
         rows = (vehicle == defect.vehicle) & done.tracks["leader_skipped"].to_numpy()
@@ -212,7 +212,7 @@ def test_lanes_flicker_where_declared_and_nobody_is_beside():
     assert damage(only(lane_flickers=2), tracks=full)[1].defects == []
 
 
-def test_too_short_tracks_are_passed_by():
+def test_too_short_tracks_are_skipped():
     tracks = platoon().filter(pl.col("frame") <= 4)
     _, done = damage(Plan(backward_share=0.5), tracks=tracks)
     assert {defect.name for defect in done.defects} <= {"acceleration_spike"}

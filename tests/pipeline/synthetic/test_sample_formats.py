@@ -35,7 +35,7 @@ def image_row(seen, vehicle, frame=1):
     return seen.filter((pl.col("id") == vehicle) & (pl.col("frame") == frame)).row(0, named=True)
 
 
-MARKINGS = highd.place_markings(2, 3.75)
+MARKINGS = highd.build_markings(2, 3.75)
 
 
 def test_markings_stand_where_the_image_has_them():
@@ -45,7 +45,7 @@ def test_markings_stand_where_the_image_has_them():
 
 def test_upper_carriageway_drives_left_in_the_image():
     # Vehicle 1 leads 2 in the leftmost lane; the driver's left is the image's bottom.
-    seen = highd.image_rows(tracks((1, 1, 150, 1.9, 1), (2, 1, 100, 1.9, 1)), MARKINGS, upper=True, window_m=420.0)
+    seen = highd.build_rows(tracks((1, 1, 150, 1.9, 1), (2, 1, 100, 1.9, 1)), MARKINGS, upper=True, window_m=420.0)
     row = image_row(seen, 2)
     assert row["x"] == 320.0  # 420 - 100: the front is the left edge
     assert row["y"] == pytest.approx(13.1)  # 16.0 - 1.9 - 2 / 2
@@ -61,7 +61,7 @@ def test_upper_carriageway_drives_left_in_the_image():
 
 
 def test_lower_carriageway_drives_right_in_the_image():
-    seen = highd.image_rows(tracks((1, 1, 150, 5.6, 2), (2, 1, 100, 5.6, 2)), MARKINGS, upper=False, window_m=420.0)
+    seen = highd.build_rows(tracks((1, 1, 150, 5.6, 2), (2, 1, 100, 5.6, 2)), MARKINGS, upper=False, window_m=420.0)
     row = image_row(seen, 2)
     assert row["x"] == 96.0  # the rear is the left edge
     assert row["y"] == pytest.approx(24.8)  # 20.2 + 5.6 - 1
@@ -73,7 +73,7 @@ def test_lower_carriageway_drives_right_in_the_image():
 
 def test_a_follower_names_a_leader_whose_frame_is_lost():
     both = tracks((1, 1, 150, 1.9, 1), (2, 1, 100, 1.9, 1)).with_columns(lost=pl.col("vehicle") == 1)
-    seen = highd.image_rows(both, MARKINGS, upper=False, window_m=420.0)
+    seen = highd.build_rows(both, MARKINGS, upper=False, window_m=420.0)
     assert seen["id"].to_list() == [2]
     assert seen["precedingId"].to_list() == [1]
 
@@ -151,7 +151,7 @@ def feet_pair():
 
 
 def test_ngsim_rows_by_hand():
-    rows = ngsim.feet_rows(feet_pair(), "09:30")
+    rows = ngsim.build_rows(feet_pair(), "09:30")
     columns = ("Vehicle_ID", "Local_X", "Local_Y", "v_Vel", "Preceding", "Following", "Space_Headway", "Time_Headway")
     picked = rows.select(columns).rows()
     assert picked[0] == (7, 6.0, 300.0, 0.0, 0, 8, 0.0, 0.0)
@@ -159,16 +159,16 @@ def test_ngsim_rows_by_hand():
     assert picked[2] == (9, 6.0, 100.0, 50.0, 8, 0, 100.0, 2.0)
     # Frame 1 of the published 07:50 recording is at 07:49:39.0, 1118846979000; 09:30 is 6,021 s later.
     assert rows["Global_Time"].to_list() == [1_118_853_000_000] * 3
-    assert ngsim.recording_name("09:30") == "us-101-20050615-093000"
+    assert ngsim.name_recording("09:30") == "us-101-20050615-093000"
 
 
 def test_ngsim_text_and_csv_lines():
-    rows = ngsim.feet_rows(feet_pair(), "09:30").with_columns(Global_X=pl.lit(6451137.641), Global_Y=pl.lit(1.5))
+    rows = ngsim.build_rows(feet_pair(), "09:30").with_columns(Global_X=pl.lit(6451137.641), Global_Y=pl.lit(1.5))
     values = "9 1 1 1118853000000 6.000 100.000 6451137.641 1.500 15.0 6.0 2 50.00 -10.00 1 8 0 100.00 2.00"
-    line = ngsim.text_lines(rows)[2]
+    line = ngsim.format_text(rows)[2]
     assert line.split() == values.split()
     assert line.startswith("    9      1      1  1118853000000    6.000   100.000")
-    lines = ngsim.csv_lines(rows)
+    lines = ngsim.format_csv(rows)
     assert lines[0] == (
         "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,v_Width,v_Class,"
         "v_Vel,v_Acc,Lane_ID,Preceding,Following,Space_Headway,Time_Headway"
@@ -177,11 +177,11 @@ def test_ngsim_text_and_csv_lines():
 
 
 def test_portal_lines_trim_zeros_and_quote_thousands():
-    rows = ngsim.feet_rows(feet_pair(), "09:30").with_columns(
+    rows = ngsim.build_rows(feet_pair(), "09:30").with_columns(
         Total_Frames=pl.lit(1156), Following=pl.lit(1289), Space_Headway=pl.lit(1066.52), Global_X=pl.lit(10.5),
         Global_Y=pl.lit(1000.25), Vehicle_ID=pl.lit(1311),
     )  # fmt: skip
-    lines = ngsim.portal_lines(rows)
+    lines = ngsim.format_portal(rows)
     assert lines[0] == (
         "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_length,v_Width,v_Class,v_Vel,"
         "v_Acc,Lane_ID,O_Zone,D_Zone,Int_ID,Section_ID,Direction,Movement,Preceding,Following,Space_Headway,"
@@ -193,10 +193,10 @@ def test_portal_lines_trim_zeros_and_quote_thousands():
 
 
 def test_shuffling_keeps_every_row():
-    one = ngsim.feet_rows(tracks(*((v, f, 10.0 * v, 1, 1) for v in range(1, 9) for f in range(1, 6))), "09:45")
-    two = ngsim.feet_rows(tracks(*((v, f, 10.0 * v, 1, 1) for v in range(5, 9) for f in range(1, 6))), "10:00")
+    one = ngsim.build_rows(tracks(*((v, f, 10.0 * v, 1, 1) for v in range(1, 9) for f in range(1, 6))), "09:45")
+    two = ngsim.build_rows(tracks(*((v, f, 10.0 * v, 1, 1) for v in range(5, 9) for f in range(1, 6))), "10:00")
     both = pl.concat([one, two])
-    mixed = ngsim.shuffle_like_the_portal(both, np.random.default_rng(3))
+    mixed = ngsim.shuffle_rows(both, np.random.default_rng(3))
     key = ["Global_Time", "Vehicle_ID"]
     assert mixed.sort(key).equals(both.sort(key))
     assert not mixed["Global_Time"].is_sorted()
@@ -216,7 +216,7 @@ def test_fixed_decimals(decimals, value, text):
 def test_damage_only_adds_lines(header):
     lines = ["a,b,c,d"] * header + [f"{i},{i},{i},{i}" for i in range(100)]
     dialect = damage.Dialect(header=header, separator=",", number_field=1, quotes=True)
-    damaged, defects = damage.damage(lines, dialect, np.random.default_rng(1))
+    damaged, defects = damage.damage_lines(lines, dialect, np.random.default_rng(1))
     extra = {defect.line: defect for defect in defects}
     assert [line for number, line in enumerate(damaged, start=1) if number not in extra] == lines
     for number, defect in extra.items():

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rule_scenes import change, driver, entries_found, scene_of
 
-from tracklake.pipeline.synthetic.expected_findings import JUDGES, Entry, Surface, find_broken
+from tracklake.pipeline.synthetic.expected_findings import RULE_TESTS, Entry, Surface, find_broken
 from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
 from tracklake.quality_reports.rules.findings import SubsetOrderError
 from tracklake.quality_reports.rules.registry import RULES, ThresholdError
@@ -16,7 +16,7 @@ from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSETS, TRACKS, VEHICLE_
 LARGEST = 2**31 - 1
 ROAD = Surface(rate_hz=10.0, markings=(0.0, 4.0, 8.0, 12.0))
 FRAMES = range(1, 41)
-JUDGED = tuple(rule for rule in RULES if rule.name in JUDGES)
+JUDGED = tuple(rule for rule in RULES if rule.name in RULE_TESTS)
 """The rules that the slow loop knows; any other has its own case alone (test_rule_cases.py)."""
 
 
@@ -94,7 +94,7 @@ def test_injected_defects_are_found_entry_for_entry_and_nothing_else():
     ]
     assert [row[:-1] for row in runs.rows()] == [row[:-1] for row in expected]
     assert runs["worst"].to_list() == pytest.approx([row[-1] for row in expected], abs=1e-6)
-    assert set(runs["rule"]) == set(JUDGES), "every rule has its defect"
+    assert set(runs["rule"]) == set(RULE_TESTS), "every rule has its defect"
     severities = {rule.name: rule.severity for rule in RULES}
     assert all(severities[rule] == severity for rule, severity in found.select("rule", "severity").iter_rows())
 

@@ -160,7 +160,7 @@ def test_members_that_cannot_be_read_are_refused_once_for_all_and_the_others_go_
     ]
 
 
-def test_an_archive_without_raw_files_is_passed_by_where_the_user_did_not_name_it(tmp_path):
+def test_an_archive_without_raw_files_is_skipped_unless_the_user_names_it(tmp_path):
     document = pack(tmp_path / "in" / "documents.zip", {"a.pdf": b"%PDF", "notes.txt": b"Some words.\n"})
     empty = pack(tmp_path / "in" / "empty.zip", {})
     write(tmp_path / "in" / "raw.txt", NGSIM_FILES["text"])
@@ -186,7 +186,7 @@ def test_an_unknown_table_in_an_archive_is_refused_and_a_plain_file_called_zip_i
     assert discovery.refusals[0].startswith("a.zip/results.csv, line 1: not a known trajectory file")
 
 
-def test_an_archive_that_changed_after_it_was_looked_into(tmp_path):
+def test_an_archive_that_changed_after_it_was_listed(tmp_path):
     path = pack(tmp_path / "a.zip", {"raw.txt": NGSIM_FILES["text"]})
     (file,) = find(path).units[0][1].files
     pack(path, {"other.txt": NGSIM_FILES["text"]})

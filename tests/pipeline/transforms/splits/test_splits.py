@@ -259,7 +259,7 @@ def test_blocks_are_allocated_as_subsets_are():
     allocation = allocate_flow_balanced(blocks)
     assert allocation.splits.select("subset", "block", "part").rows() == [("a", 0, "train"), ("a", 1, "eval")]
     assert allocation.balance["subsets"].to_list() == [1, 1]
-    with pytest.raises(ValueError, match="stands in more than one row"):
+    with pytest.raises(ValueError, match="has more than one row"):
         allocate_flow_balanced(blocks.with_columns(block=0))
 
 
@@ -273,7 +273,7 @@ def test_no_subsets_give_empty_tables():
     ("change", "message"),
     [
         (lambda frame: frame.drop("flow", "site"), "lacks the column\\(s\\) site, flow"),
-        (lambda frame: pl.concat([frame, frame]), "highd/a stands in more than one row"),
+        (lambda frame: pl.concat([frame, frame]), "highd/a has more than one row"),
         (lambda frame: frame.with_columns(vehicles=pl.lit(-1)), "'vehicles': -1"),
         (lambda frame: frame.with_columns(site=pl.lit(None)), "needs a site"),
     ],

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, write_up
+from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, tabulate_allocation
 from tracklake.pipeline.transforms.splits.time_blocks import (
     VISITS,
     WEIGHTS,
@@ -182,7 +182,7 @@ def test_parts_count_vehicles_once_and_no_samples_of_those_left_out():
     found = recount_blocks(units, splits, left_out, visits, weights)
     expected = [("train", 1, 1), ("train", 1, 2 + 4), ("val", 0, 0), ("eval", 1, 64), ("eval", 0, 128)]
     assert found.select("part", "vehicles", "weight").rows() == expected
-    allocation = write_up(found, split="time-blocks", validation=True)
+    allocation = tabulate_allocation(found, split="time-blocks", validation=True)
     columns = ("part", "vehicles", "vehicle_share", "samples")
     assert {row[0]: row[1:] for row in allocation.balance.select(columns).iter_rows()} == {
         "train": (2, 2 / 3, 7), "val": (0, 0.0, 0), "eval": (1, 1 / 3, 192),

@@ -233,7 +233,7 @@ def test_nothing_to_assess():
     assert assess(short).is_empty(), "19 m, and one frame: shorter than any window"
 
 
-def test_one_vehicle_alone_is_judged_by_its_own_remaining_speed():
+def test_one_vehicle_alone_is_estimated_by_its_own_remaining_speed():
     """No references: (20 m / 16 m/s) 12.5 frames and a margin of twice a quarter of it; 20 were missing."""
     rows = assess(make_tracks([*drive(1, 50, 20, speed_mps=1.0), *drive(1, 70, 5, speed_mps=16.0, start_x_m=20.0)]))
     for row in rows.to_dicts():

@@ -19,7 +19,7 @@ from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from tracklake.schemas.vehicles import VEHICLE_STARTS
 
 
-def judge(rows, *, frame_rate_hz=10.0, first_frame=0, on_ramp_lanes=()):
+def classify(rows, *, frame_rate_hz=10.0, first_frame=0, on_ramp_lanes=()):
     """(vehicle_id, first_frame, last_frame, entries, start_x_m, end_x_m, start_lane) rows -> sets of ids, cut-offs."""
     schema = {
         "vehicle_id": pl.Int32,
@@ -86,7 +86,7 @@ def test_cutoff_agrees_with_trying_one_after_the_other(start_x_m):
 
 
 def test_late_and_fully_tracked():
-    ids, row = judge(
+    ids, row = classify(
         [
             full(1, 9, 200.0),  # 0.9 s: on the road already
             full(2, 10, 0.0),  # 1.0 s: eligible
@@ -104,36 +104,36 @@ def test_late_and_fully_tracked():
 
 
 def test_first_second_is_counted_from_the_recordings_first_frame():
-    ids, _ = judge([full(1, 25, 0.0), full(2, 26, 0.0)], first_frame=1, frame_rate_hz=25.0)
+    ids, _ = classify([full(1, 25, 0.0), full(2, 26, 0.0)], first_frame=1, frame_rate_hz=25.0)
     assert ids["eligible"] == {2}
 
 
 def test_a_start_on_the_cutoff_is_not_late():
-    ids, row = judge([full(1, 20, 4.0), full(2, 30, 4.0), full(3, 40, 90.0)])
+    ids, row = classify([full(1, 20, 4.0), full(2, 30, 4.0), full(3, 40, 90.0)])
     assert row["cutoff_m"] == 4.0
     assert ids["starts_late"] == {3}
 
 
 def test_vehicles_first_seen_on_a_ramp_neither_count_nor_are_late_nor_references():
-    ids, row = judge([full(1, 20, 0.0), *(full(10 + i, 30, 150.0, lane=7) for i in range(9))], on_ramp_lanes=(7,))
+    ids, row = classify([full(1, 20, 0.0), *(full(10 + i, 30, 150.0, lane=7) for i in range(9))], on_ramp_lanes=(7,))
     assert row["cutoff_m"] == 0.0
     assert ids["eligible"] == ids["fully_tracked"] == {1}
     assert ids["starts_late"] == set()
-    ids, row = judge([full(1, 20, 0.0, lane=None), full(2, 20, 0.0, lane=7)], on_ramp_lanes=(7,))
+    ids, row = classify([full(1, 20, 0.0, lane=None), full(2, 20, 0.0, lane=7)], on_ramp_lanes=(7,))
     assert ids["eligible"] == {1}
 
 
 def test_nobody_is_eligible():
-    ids, row = judge([full(1, 0, 30.0), full(2, 5, 0.0), full(3, 50, 0.0, lane=7)], on_ramp_lanes=(7,))
+    ids, row = classify([full(1, 0, 30.0), full(2, 5, 0.0), full(3, 50, 0.0, lane=7)], on_ramp_lanes=(7,))
     assert (row["cutoff_m"], row["road_seen_from_frame"]) == (None, None)
     assert all(not flagged for flagged in ids.values())
-    ids, row = judge([])
+    ids, row = classify([])
     assert row["eligible"] == 0
 
 
 def test_early_until_the_first_fully_tracked_vehicle_reached_the_end():
     """Tracking begins at the entrance; vehicle 2 is the first fully tracked one and ends on frame 111."""
-    ids, row = judge(
+    ids, row = classify(
         [
             full(1, 0, 0.0),
             full(2, 12, 0.0),
@@ -147,7 +147,7 @@ def test_early_until_the_first_fully_tracked_vehicle_reached_the_end():
 
 
 def test_early_is_not_ended_by_a_vehicle_that_left_on_the_way():
-    ids, row = judge(
+    ids, row = classify(
         [
             full(1, 12, 0.0, end_x_m=359.0, frames=30),  # 41 m before the end: left by a ramp
             full(2, 13, 0.0, end_x_m=360.0),  # 40 m before the end counts as there
@@ -162,15 +162,15 @@ def test_early_is_not_ended_by_a_vehicle_that_left_on_the_way():
 
 def test_early_applies_only_where_no_track_starts_beyond_the_cutoff_within_the_first_second():
     entrance_only = [full(1, 5, 0.0), full(2, 30, 0.0), full(3, 40, 0.0)]
-    assert judge(entrance_only)[1]["road_seen_from_frame"] == 129
-    assert judge([*entrance_only, full(4, 9, 2.5)])[1]["road_seen_from_frame"] is None
-    assert judge([*entrance_only, full(4, 10, 200.0)])[1]["road_seen_from_frame"] == 129  # late, not early
+    assert classify(entrance_only)[1]["road_seen_from_frame"] == 129
+    assert classify([*entrance_only, full(4, 9, 2.5)])[1]["road_seen_from_frame"] is None
+    assert classify([*entrance_only, full(4, 10, 200.0)])[1]["road_seen_from_frame"] == 129  # late, not early
     on_ramp = [*entrance_only, full(4, 0, 200.0, lane=7)]
-    assert judge(on_ramp, on_ramp_lanes=(7,))[1]["road_seen_from_frame"] == 129
+    assert classify(on_ramp, on_ramp_lanes=(7,))[1]["road_seen_from_frame"] == 129
 
 
 def test_without_a_fully_tracked_vehicle_nobody_is_early():
-    _, row = judge([(1, 20, 120, 100, 0.0, 400.0, 1)])
+    _, row = classify([(1, 20, 120, 100, 0.0, 400.0, 1)])
     assert row["road_seen_from_frame"] is None
 
 

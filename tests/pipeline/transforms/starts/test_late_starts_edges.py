@@ -56,7 +56,7 @@ def repair(tracks, *, first_frame=0, frame_rate_hz=10.0, on_ramp_lanes=()):
 
 @settings(max_examples=80, deadline=None)
 @given(scenes(), st.sampled_from([(), (0,), (7,)]))
-def test_whatever_drives_by_is_judged_once_and_every_late_start_has_a_window(tracks, on_ramp_lanes):
+def test_every_vehicle_is_classified_once_and_every_late_start_has_a_window(tracks, on_ramp_lanes):
     starts, cutoffs, missing = repair(tracks, on_ramp_lanes=on_ramp_lanes)
     vehicles = summarise(tracks)
     assert starts["vehicle_id"].to_list() == vehicles["vehicle_id"].to_list()

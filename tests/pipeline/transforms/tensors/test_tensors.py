@@ -174,7 +174,7 @@ def test_blocks_by_vehicle_keep_neighbors_of_other_parts_away():
     assert arrays["neighbor_offset"].tolist() == [0, 0, 0]
 
 
-def test_samples_of_other_protocols_are_passed_by():
+def test_samples_of_other_protocols_are_skipped():
     sampled = pl.concat([SAMPLED, samples((3, 1), protocol="q")])
     around = pl.concat([neighbors((3, 1, 5, TOP)), neighbors((3, 1, 5, TOP), protocol="q")])
     arrays = build(sampled=sampled, around=around)
@@ -239,9 +239,9 @@ def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
         ({"clock": CLOCK.reverse()}, "highd/a: the entries on the clock are not sorted"),
         ({"sampled": samples((3, 3))}, "1 of 1 samples have no entry or not 2 ticks of history .*vehicle 3 at tick 3"),
         ({"sampled": samples((3, 4))}, "not 2 ticks of history on the clock, for example vehicle 3 at tick 4"),
-        ({"sampled": samples((9, 1))}, "vehicle 9 at tick 1; make the samples anew"),
+        ({"sampled": samples((9, 1))}, "vehicle 9 at tick 1; make the samples again"),
         ({"vehicles": VEHICLES.head(1)}, "highd/a: expected every vehicle .*, got 2 runs of others, .* vehicle 3"),
-        ({"around": neighbors((3, 2, 5, TOP))}, "name a sample that is not there, for example vehicle 3 at tick 2"),
+        ({"around": neighbors((3, 2, 5, TOP))}, "name a missing sample, for example vehicle 3 at tick 2"),
         ({"around": neighbors((3, 1, 5, 77))}, "1 neighbors have no entry on the clock, for example vehicle 77"),
         (
             {"split": blocks((0, 1, 50, None, None, "train"), (1, 38, 60, None, None, "eval"))},
