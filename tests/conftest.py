@@ -7,8 +7,8 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import chdir
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
@@ -18,6 +18,9 @@ from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
 
 SERVER_START_S = 120.0
+
+# Two workers on two cores: more threads than one would only spin and wait for each other. Commands inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
 settings.register_profile("tracklake", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -45,14 +48,17 @@ class Command:
     environment: dict[str, str]
     own_server: dict[str, str] = field(default_factory=dict)
 
-    def here(self, *arguments: str | Path, **extra: str) -> Finished:
-        """The same in this process, which spares imports: where neither the process nor Prefect is what is tested."""
+    def here(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
+        """The same in this process, which spares imports: where neither the process nor Prefect is what is tested.
+
+        What runs flows needs the fixture `prefect_here`, too.
+        """
         from typer.testing import CliRunner
 
         from tracklake.pipeline.cli.app import app
 
         with chdir(self.folder), mock.patch.dict(os.environ, {**self.environment, **extra}, clear=True):
-            done = CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False)
+            done = CliRunner().invoke(app, [str(each) for each in arguments], input=stdin, catch_exceptions=False)
         return Finished(done.exit_code, done.stdout, done.stderr)
 
     @property
@@ -137,9 +143,9 @@ def command(
     return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_address}, alone)
 
 
-@pytest.fixture(scope="module")
-def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The same server for this process: for flows, and for what `command.here` does that needs them."""
+@contextmanager
+def use_server(address: str, results: Path) -> Iterator[None]:
+    """Let this process's flows use that server."""
     from prefect.settings import (
         PREFECT_API_URL,
         PREFECT_LOGGING_TO_API_ENABLED,
@@ -148,11 +154,18 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
     )
 
     here = {
-        PREFECT_API_URL: prefect_address,
-        PREFECT_RESULTS_LOCAL_STORAGE_PATH: tmp_path_factory.mktemp("results"),
+        PREFECT_API_URL: address,
+        PREFECT_RESULTS_LOCAL_STORAGE_PATH: results,
         PREFECT_LOGGING_TO_API_ENABLED: False,  # or it would log to a server that has ended
     }
     with temporary_settings(here):
+        yield
+
+
+@pytest.fixture(scope="module")
+def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The same server for this process: for flows, and for what `command.here` does that needs them."""
+    with use_server(prefect_address, tmp_path_factory.mktemp("results")):
         yield
 
 
@@ -160,7 +173,7 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
 def sample(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default sample, shortened, with its truth.parquet."""
     folder = tmp_path_factory.mktemp("generated") / "sample"
-    done = command("sample", "--out", folder, *SAMPLE, "--quiet")
+    done = command.here("sample", "--out", folder, *SAMPLE, "--quiet")
     assert done.code == 0, done.err
     return folder
 
@@ -174,27 +187,35 @@ class Lake:
 
 
 @pytest.fixture(scope="session")
-def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Lake:
-    root = tmp_path_factory.mktemp("lakes") / "lake"
-    done = command.alone("run", sample, "--lake", root, "--json")
-    assert done.code == 0, done.err
-    return Lake(root, json.loads(done.out))
+def make_lake(command: Command, prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Lake]:
+    """Make a lake of raw files by `tracklake run` in this process."""
+
+    def make(source: Path) -> Lake:
+        root = tmp_path_factory.mktemp("lakes") / "lake"
+        with use_server(prefect_address, tmp_path_factory.mktemp("results")):
+            done = command.here("run", source, "--lake", root, "--json")
+        assert done.code == 0, done.err
+        return Lake(root, json.loads(done.out))
+
+    return make
 
 
 @pytest.fixture(scope="session")
-def excerpts_lake(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Lake:
+def lake(make_lake: Callable[..., Lake], sample: Path) -> Lake:
+    return make_lake(sample)
+
+
+@pytest.fixture(scope="session")
+def excerpts_lake(make_lake: Callable[..., Lake]) -> Lake:
     """Likewise of the real NGSIM excerpts, where they are at hand."""
     if not EXCERPTS.is_dir():
         pytest.skip(f"the NGSIM excerpts are not at {EXCERPTS}")
-    root = tmp_path_factory.mktemp("lakes") / "lake"
-    done = command("run", EXCERPTS, "--lake", root, "--json")
-    assert done.code == 0, done.err
-    return Lake(root, json.loads(done.out))
+    return make_lake(EXCERPTS)
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what uses the shared lakes on one worker, so that each is made once."""
+    """Keep what uses Prefect's server or the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"sample", "lake", "excerpts_lake"} & set(getattr(item, "fixturenames", ())):
+        if {"prefect_address", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.xdist_group("lake"))
