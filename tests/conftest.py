@@ -23,7 +23,7 @@ SERVER_START_S = 120.0
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
-settings.register_profile("tracklake", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("tracklake", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("tracklake")
 
 

@@ -1,7 +1,6 @@
 """What Prefect adds: tasks that are seen, retries on I/O, results cached by content, deployments."""
 
 import json
-import os
 import shutil
 import sqlite3
 import time
@@ -12,8 +11,10 @@ from pathlib import Path
 import httpx
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL
+from prefect.client.schemas.sorting import ArtifactSort
+from prefect.settings import PREFECT_API_URL, temporary_settings
 from prefect.testing.utilities import prefect_test_harness
+from small_recordings import KINDS, write_highd
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import connect, load
@@ -22,27 +23,24 @@ from tracklake.pipeline.orchestration import flows
 from tracklake.pipeline.sources import SourceError
 
 pytestmark = [
-    pytest.mark.xdist_group("lake"),
+    pytest.mark.usefixtures("prefect_here"),
     # Prefect's own, from the server it starts in this process.
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"] = str(tmp_path_factory.mktemp("results"))
-    with prefect_test_harness(server_startup_timeout=120):
+@pytest.fixture
+def server():
+    """A server that records tasks, which the tests' own does not, to spare time."""
+    with temporary_settings(restore_defaults={PREFECT_API_URL}), prefect_test_harness(server_startup_timeout=120):
         yield PREFECT_API_URL.value()
-    del os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]
 
 
 @pytest.fixture
-def raw(sample, tmp_path) -> Path:
-    folder = tmp_path / "raw"
-    folder.mkdir()
-    for kind in ("recordingMeta", "tracksMeta", "tracks"):
-        shutil.copy(sample / f"04_{kind}.csv", folder)
-    return folder
+def raw(tmp_path) -> Path:
+    """One small recording."""
+    write_highd(tmp_path / "raw", "04")
+    return tmp_path / "raw"
 
 
 @pytest.fixture
@@ -84,7 +82,6 @@ def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server
     assert wanted <= seen
 
 
-@pytest.mark.usefixtures("server")
 def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypatch):
     tries: Counter = Counter()
     real = ingest.build
@@ -111,7 +108,6 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
     assert tries["hopeless"] == 1
 
 
-@pytest.mark.usefixtures("server")
 def test_what_a_killed_run_had_finished_is_taken_from_the_cache(raw, tmp_path, calls):
     root = tmp_path / "lake"
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
@@ -138,7 +134,8 @@ def artifacts_of(root: Path) -> dict[str, list]:
     """The artifacts of a lake's runs by key, without the lake's name and id at its end, oldest first."""
     ending = f"-lake-{load(root).lake_id[:8]}"
     with get_client(sync_client=True) as client:
-        found = sorted(client.read_artifacts(), key=lambda artifact: artifact.created)
+        latest = client.read_artifacts(sort=ArtifactSort.CREATED_DESC)  # 200 of them
+        found = sorted(latest, key=lambda artifact: artifact.created)
     made: dict[str, list] = {}
     for artifact in found:
         if artifact.key.endswith(ending):
@@ -146,8 +143,11 @@ def artifacts_of(root: Path) -> dict[str, list]:
     return made
 
 
-@pytest.mark.usefixtures("server")
-def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
+def test_the_report_is_seen_as_artifacts_of_the_run(sample, tmp_path):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    for kind in KINDS:
+        shutil.copy(sample / f"04_{kind}.csv", raw)
     root = tmp_path / "odd [x](y) \u00e9" / "Lake"
     outcome = flows.run(str(root), str(raw))
     assert outcome["failed"] == []
@@ -186,7 +186,6 @@ def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
     assert {len(made) for made in artifacts_of(root).values()} == {2}
 
 
-@pytest.mark.usefixtures("server")
 @pytest.mark.parametrize(
     ("failure", "is_ours"),
     [
@@ -226,11 +225,11 @@ def test_the_embedded_server_takes_the_artifacts_too(command, raw, tmp_path):
     assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
 
 
-def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):
+def test_serve_offers_the_flows_as_deployments(command, tmp_path):
     alone = command.alone("serve")
     assert alone.code == 1
     assert "PREFECT_API_URL" in alone.err
-    process = replace(command, folder=tmp_path).start("serve", PREFECT_API_URL=server)
+    process = replace(command, folder=tmp_path).start("serve")
     try:
         names: set[str] = set()
         limit = time.monotonic() + 60

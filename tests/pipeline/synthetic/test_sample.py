@@ -10,7 +10,7 @@ from tracklake.pipeline import synthetic as sample
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 
-MINUTES = 0.25
+MINUTES = 0.2
 
 
 @pytest.fixture(scope="module")
