@@ -3,12 +3,14 @@
 import http.client
 import json
 import os
+import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
@@ -108,18 +110,28 @@ def is_served(port: int) -> bool:
         connection.close()
 
 
+@dataclass(frozen=True)
+class Server:
+    """A Prefect server: where it is, for PREFECT_API_URL, and an empty database as it makes one, in seconds."""
+
+    address: str
+    empty_database: Path
+
+
 @pytest.fixture(scope="session")
-def prefect_address(clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where a Prefect server is, for PREFECT_API_URL."""
+def prefect_server(clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     home = tmp_path_factory.mktemp("server")
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    arguments = ("server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-services", "--no-ui")
+    arguments = ("server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui", "--analytics-off")
+    # Of its services what records tasks, and nothing that looks for work again and again.
+    services = {"PREFECT__SERVER_EPHEMERAL": "1"}
+    services |= {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in ("TRIGGERS", "EVENT_PERSISTER")}
     with (home / "log").open("w") as log:
         server = subprocess.Popen(
-            [sys.executable, "-m", "prefect", *arguments, "--analytics-off"],
-            env={**clean_environment, "PREFECT_HOME": str(home), "DO_NOT_TRACK": "1"},
+            [sys.executable, "-m", "prefect", *arguments],
+            env={**clean_environment, **services, "PREFECT_HOME": str(home), "DO_NOT_TRACK": "1"},
             stdout=log,
             stderr=subprocess.STDOUT,
         )
@@ -129,18 +141,37 @@ def prefect_address(clean_environment: dict[str, str], tmp_path_factory: pytest.
             assert server.poll() is None, (home / "log").read_text()
             assert time.monotonic() < limit, (home / "log").read_text()
             time.sleep(0.1)
-        yield f"http://127.0.0.1:{port}/api"
+        with closing(sqlite3.connect(home / "prefect.db")) as made, closing(sqlite3.connect(home / "empty.db")) as copy:
+            made.backup(copy)
+        yield Server(f"http://127.0.0.1:{port}/api", home / "empty.db")
     finally:
         server.terminate()
         server.wait(timeout=30)
 
 
 @pytest.fixture(scope="session")
+def prefect_address(prefect_server: Server) -> str:
+    """Where a Prefect server is, for PREFECT_API_URL."""
+    return prefect_server.address
+
+
+@pytest.fixture
+def prefect_home(prefect_server: Server, tmp_path: Path) -> Path:
+    """A folder for PREFECT_HOME in which a server need not make its database first."""
+    home = tmp_path / "prefect"
+    home.mkdir()
+    shutil.copy(prefect_server.empty_database, home / "prefect.db")
+    return home
+
+
+@pytest.fixture(scope="session")
 def command(
-    clean_environment: dict[str, str], prefect_address: str, tmp_path_factory: pytest.TempPathFactory
+    clean_environment: dict[str, str], prefect_server: Server, tmp_path_factory: pytest.TempPathFactory
 ) -> Command:
-    alone = {**clean_environment, "PREFECT_HOME": str(tmp_path_factory.mktemp("prefect"))}
-    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_address}, alone)
+    home = tmp_path_factory.mktemp("prefect")
+    shutil.copy(prefect_server.empty_database, home / "prefect.db")
+    alone = {**clean_environment, "PREFECT_HOME": str(home)}
+    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_server.address}, alone)
 
 
 @contextmanager
@@ -217,5 +248,5 @@ def excerpts_lake(make_lake: Callable[..., Lake]) -> Lake:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep what uses Prefect's server or the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"prefect_address", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
+        if {"prefect_server", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.xdist_group("lake"))

@@ -11,9 +11,8 @@ from pathlib import Path
 import httpx
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.sorting import ArtifactSort
-from prefect.settings import PREFECT_API_URL, temporary_settings
-from prefect.testing.utilities import prefect_test_harness
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
+from prefect.client.schemas.sorting import ArtifactSort, FlowRunSort
 from small_recordings import KINDS, write_highd
 
 from tracklake.pipeline.ingest import ingest
@@ -27,13 +26,6 @@ pytestmark = [
     # Prefect's own, from the server it starts in this process.
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
-
-
-@pytest.fixture
-def server():
-    """A server that records tasks, which the tests' own does not, to spare time."""
-    with temporary_settings(restore_defaults={PREFECT_API_URL}), prefect_test_harness(server_startup_timeout=120):
-        yield PREFECT_API_URL.value()
 
 
 @pytest.fixture
@@ -57,11 +49,12 @@ def calls(monkeypatch) -> Counter:
     return counted
 
 
-def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server, command, raw, tmp_path):
-    done = command("run", raw, "--lake", tmp_path / "lake", "--json", PREFECT_API_URL=server)
+def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(command, raw, tmp_path):
+    done = command("run", raw, "--lake", tmp_path / "lake", "--json")
     assert done.code == 0, done.err
     with get_client(sync_client=True) as client:
-        runs = [run for run in client.read_flow_runs() if run.parameters.get("lake") == str(tmp_path / "lake")]
+        latest = client.read_flow_runs(sort=FlowRunSort.START_TIME_DESC)  # 200 of them
+        runs = [run for run in latest if run.parameters.get("lake") == str(tmp_path / "lake")]
         assert [run.state.name for run in runs] == ["Completed"]
         wanted = {
             "ingest 04",
@@ -77,7 +70,8 @@ def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server
         limit = time.monotonic() + 20
         seen: set[str] = set()
         while not wanted <= seen and time.monotonic() < limit:  # task runs are recorded by events, a little later
-            seen = {task.name for task in client.read_task_runs(limit=200) if task.flow_run_id == runs[0].id}
+            own = FlowRunFilter(id=FlowRunFilterId(any_=[runs[0].id]))
+            seen = {task.name for task in client.read_task_runs(flow_run_filter=own)}
             time.sleep(0.2)
     assert wanted <= seen
 
@@ -214,12 +208,11 @@ def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lak
         assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
 
 
-def test_the_embedded_server_takes_the_artifacts_too(command, raw, tmp_path):
-    home = tmp_path / "prefect"
-    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(home))
+def test_the_embedded_server_takes_the_artifacts_too(command, raw, prefect_home, tmp_path):
+    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(prefect_home))
     assert done.code == 0, done.err
     assert "artifacts" not in done.out
-    with sqlite3.connect(f"file:{home / 'prefect.db'}?mode=ro", uri=True) as database:
+    with sqlite3.connect(f"file:{prefect_home / 'prefect.db'}?mode=ro", uri=True) as database:
         keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
     database.close()
     assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
@@ -245,7 +238,7 @@ def test_serve_offers_the_flows_as_deployments(command, tmp_path):
 
 def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
     process = command.alone.start("ingest", raw, "--lake", tmp_path / "lake", "--quiet")
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 120
     while not (tmp_path / "lake" / "manifest.json").exists() and time.monotonic() < limit:
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")

@@ -14,7 +14,6 @@ from small_recordings import write_highd
 from tracklake.pipeline.lake import connect, is_intact, load
 from tracklake.schemas import TABLES
 
-
 pytestmark = pytest.mark.usefixtures("prefect_here")
 
 
