@@ -3,12 +3,14 @@
 import http.client
 import json
 import os
+import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import chdir
+from collections.abc import Callable, Iterator
+from contextlib import chdir, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
@@ -19,8 +21,11 @@ from lake_sources import EXCERPTS, SAMPLE
 
 SERVER_START_S = 120.0
 
+# Two workers on two cores: more threads than one would only spin and wait for each other. Commands inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
-settings.register_profile("tracklake", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("tracklake", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("tracklake")
 
 
@@ -45,14 +50,17 @@ class Command:
     environment: dict[str, str]
     own_server: dict[str, str] = field(default_factory=dict)
 
-    def here(self, *arguments: str | Path, **extra: str) -> Finished:
-        """The same in this process, which spares imports: where neither the process nor Prefect is what is tested."""
+    def here(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
+        """The same in this process, which spares imports: where neither the process nor Prefect is what is tested.
+
+        What runs flows needs the fixture `prefect_here`, too.
+        """
         from typer.testing import CliRunner
 
         from tracklake.pipeline.cli.app import app
 
         with chdir(self.folder), mock.patch.dict(os.environ, {**self.environment, **extra}, clear=True):
-            done = CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False)
+            done = CliRunner().invoke(app, [str(each) for each in arguments], input=stdin, catch_exceptions=False)
         return Finished(done.exit_code, done.stdout, done.stderr)
 
     @property
@@ -102,18 +110,28 @@ def is_served(port: int) -> bool:
         connection.close()
 
 
+@dataclass(frozen=True)
+class Server:
+    """A Prefect server: where it is, for PREFECT_API_URL, and an empty database as it makes one, in seconds."""
+
+    address: str
+    empty_database: Path
+
+
 @pytest.fixture(scope="session")
-def prefect_address(clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where a Prefect server is, for PREFECT_API_URL."""
+def prefect_server(clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     home = tmp_path_factory.mktemp("server")
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    arguments = ("server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-services", "--no-ui")
+    arguments = ("server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui", "--analytics-off")
+    # Of its services what records tasks, and nothing that looks for work again and again.
+    services = {"PREFECT__SERVER_EPHEMERAL": "1"}
+    services |= {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in ("TRIGGERS", "EVENT_PERSISTER")}
     with (home / "log").open("w") as log:
         server = subprocess.Popen(
-            [sys.executable, "-m", "prefect", *arguments, "--analytics-off"],
-            env={**clean_environment, "PREFECT_HOME": str(home), "DO_NOT_TRACK": "1"},
+            [sys.executable, "-m", "prefect", *arguments],
+            env={**clean_environment, **services, "PREFECT_HOME": str(home), "DO_NOT_TRACK": "1"},
             stdout=log,
             stderr=subprocess.STDOUT,
         )
@@ -123,23 +141,42 @@ def prefect_address(clean_environment: dict[str, str], tmp_path_factory: pytest.
             assert server.poll() is None, (home / "log").read_text()
             assert time.monotonic() < limit, (home / "log").read_text()
             time.sleep(0.1)
-        yield f"http://127.0.0.1:{port}/api"
+        with closing(sqlite3.connect(home / "prefect.db")) as made, closing(sqlite3.connect(home / "empty.db")) as copy:
+            made.backup(copy)
+        yield Server(f"http://127.0.0.1:{port}/api", home / "empty.db")
     finally:
         server.terminate()
         server.wait(timeout=30)
 
 
 @pytest.fixture(scope="session")
+def prefect_address(prefect_server: Server) -> str:
+    """Where a Prefect server is, for PREFECT_API_URL."""
+    return prefect_server.address
+
+
+@pytest.fixture
+def prefect_home(prefect_server: Server, tmp_path: Path) -> Path:
+    """A folder for PREFECT_HOME in which a server need not make its database first."""
+    home = tmp_path / "prefect"
+    home.mkdir()
+    shutil.copy(prefect_server.empty_database, home / "prefect.db")
+    return home
+
+
+@pytest.fixture(scope="session")
 def command(
-    clean_environment: dict[str, str], prefect_address: str, tmp_path_factory: pytest.TempPathFactory
+    clean_environment: dict[str, str], prefect_server: Server, tmp_path_factory: pytest.TempPathFactory
 ) -> Command:
-    alone = {**clean_environment, "PREFECT_HOME": str(tmp_path_factory.mktemp("prefect"))}
-    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_address}, alone)
+    home = tmp_path_factory.mktemp("prefect")
+    shutil.copy(prefect_server.empty_database, home / "prefect.db")
+    alone = {**clean_environment, "PREFECT_HOME": str(home)}
+    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_server.address}, alone)
 
 
-@pytest.fixture(scope="module")
-def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The same server for this process: for flows, and for what `command.here` does that needs them."""
+@contextmanager
+def use_server(address: str, results: Path) -> Iterator[None]:
+    """Let this process's flows use that server."""
     from prefect.settings import (
         PREFECT_API_URL,
         PREFECT_LOGGING_TO_API_ENABLED,
@@ -148,11 +185,18 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
     )
 
     here = {
-        PREFECT_API_URL: prefect_address,
-        PREFECT_RESULTS_LOCAL_STORAGE_PATH: tmp_path_factory.mktemp("results"),
+        PREFECT_API_URL: address,
+        PREFECT_RESULTS_LOCAL_STORAGE_PATH: results,
         PREFECT_LOGGING_TO_API_ENABLED: False,  # or it would log to a server that has ended
     }
     with temporary_settings(here):
+        yield
+
+
+@pytest.fixture(scope="module")
+def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The same server for this process: for flows, and for what `command.here` does that needs them."""
+    with use_server(prefect_address, tmp_path_factory.mktemp("results")):
         yield
 
 
@@ -160,7 +204,7 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
 def sample(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default sample, shortened, with its truth.parquet."""
     folder = tmp_path_factory.mktemp("generated") / "sample"
-    done = command("sample", "--out", folder, *SAMPLE, "--quiet")
+    done = command.here("sample", "--out", folder, *SAMPLE, "--quiet")
     assert done.code == 0, done.err
     return folder
 
@@ -174,27 +218,35 @@ class Lake:
 
 
 @pytest.fixture(scope="session")
-def lake(command: Command, sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Lake:
-    root = tmp_path_factory.mktemp("lakes") / "lake"
-    done = command.alone("run", sample, "--lake", root, "--json")
-    assert done.code == 0, done.err
-    return Lake(root, json.loads(done.out))
+def make_lake(command: Command, prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Lake]:
+    """Make a lake of raw files by `tracklake run` in this process."""
+
+    def make(source: Path) -> Lake:
+        root = tmp_path_factory.mktemp("lakes") / "lake"
+        with use_server(prefect_address, tmp_path_factory.mktemp("results")):
+            done = command.here("run", source, "--lake", root, "--json")
+        assert done.code == 0, done.err
+        return Lake(root, json.loads(done.out))
+
+    return make
 
 
 @pytest.fixture(scope="session")
-def excerpts_lake(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Lake:
+def lake(make_lake: Callable[..., Lake], sample: Path) -> Lake:
+    return make_lake(sample)
+
+
+@pytest.fixture(scope="session")
+def excerpts_lake(make_lake: Callable[..., Lake]) -> Lake:
     """Likewise of the real NGSIM excerpts, where they are at hand."""
     if not EXCERPTS.is_dir():
         pytest.skip(f"the NGSIM excerpts are not at {EXCERPTS}")
-    root = tmp_path_factory.mktemp("lakes") / "lake"
-    done = command("run", EXCERPTS, "--lake", root, "--json")
-    assert done.code == 0, done.err
-    return Lake(root, json.loads(done.out))
+    return make_lake(EXCERPTS)
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what uses the shared lakes on one worker, so that each is made once."""
+    """Keep what uses Prefect's server or the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"sample", "lake", "excerpts_lake"} & set(getattr(item, "fixturenames", ())):
+        if {"prefect_server", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.xdist_group("lake"))

@@ -1,10 +1,12 @@
 """Lakes in memory: DuckDB views named and shaped like the catalog's, over hand-made Polars frames."""
 
+import json
 from collections.abc import Callable, Iterator
 
 import duckdb
 import polars as pl
 import pytest
+import vl_convert
 
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.quality_reports.pages.report import Report, build_report
@@ -18,6 +20,25 @@ JOINED = {
     VEHICLES.name: (VEHICLE_STARTS.name, ("dataset", "subset", "vehicle_id")),
     SUBSETS.name: (SUBSET_STATUS.name, ("dataset", "subset")),
 }
+
+
+convert = vl_convert.vegalite_to_svg
+converted: dict[str, str] = {}
+"""SVGs by the specification they were made of: many tests draw the same charts, at half a second each."""
+
+
+@pytest.fixture(autouse=True)
+def convert_once(request, monkeypatch) -> None:
+    """Convert every chart once, but where a test compares what is drawn twice."""
+
+    def look_up(spec: dict) -> str:
+        key = json.dumps(spec, sort_keys=True)
+        if key not in converted:
+            converted[key] = convert(spec)
+        return converted[key]
+
+    if "same_bytes" not in request.node.name:
+        monkeypatch.setattr(vl_convert, "vegalite_to_svg", look_up)
 
 
 @pytest.fixture(scope="module")

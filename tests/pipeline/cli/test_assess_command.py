@@ -77,7 +77,7 @@ def test_repair_assess_says_what_the_lake_and_the_report_hold(command, lake):
             FROM start_assessments JOIN subsets USING (dataset, subset) WHERE estimator = 'regression'
             """
         ).fetchone()
-    done = command("repair", "--assess", "--lake", lake.root)
+    done = command.here("repair", "--assess", "--lake", lake.root)
     assert done.code == 0, done.err
     up_to_date, ours, others = done.out.splitlines()
     assert up_to_date == "nothing to do: the lake is up to date"

@@ -31,7 +31,7 @@ def test_a_file_that_is_no_recording(command, tmp_path, name, content, words):
     source = tmp_path / name
     if content is not None:
         source.write_bytes(content)
-    done = command("ingest", source, "--lake", tmp_path / "lake")
+    done = command.here("ingest", source, "--lake", tmp_path / "lake")
     assert done.code == FAILED
     assert all(word in done.err for word in words), done.err
     assert "Traceback" not in done.err
@@ -110,7 +110,7 @@ def test_a_highd_recording_whose_files_do_not_belong_together(command, tmp_path,
 
 
 def test_wrong_usage(command, tmp_path):
-    assert command("bogus").code == USAGE
+    assert command.here("bogus").code == USAGE
     assert command.here("run", tmp_path, "--bogus").code == USAGE
     assert command.here("ingest").code == USAGE
     assert command.here("ingest", tmp_path, "--dataset", "ngsin").code == USAGE

@@ -35,7 +35,7 @@ def test_a_copy_is_said_to_be_equal(command, lake, copied):
     assert "Nothing differs" in page.read_text()
     # Nor does it matter that the other has no report.
     shutil.rmtree(copied / "reports")
-    done = command("report", "--lake", lake.root, "--compare", copied, "--json")
+    done = command.here("report", "--lake", lake.root, "--compare", copied, "--json")
     compared = json.loads(done.out)["comparison"]
     (lake.root / "reports" / "compare.html").unlink()  # the lake is the session's
     assert (done.code, compared["equal"]) == (0, True)
@@ -72,7 +72,7 @@ def test_another_threshold_changes_its_findings_only(command, lake, copied):
     assert compared["files"]["changed"] == compared["samples"]["changed"] == compared["evaluation"]["changed"] == []
     assert compared["evaluation"]["same"] == 5, "horizons"
     # People get the same on the terminal, and the page.
-    done = command("report", "--lake", copied, "--compare", lake.root, **THRESHOLD)
+    done = command.here("report", "--lake", copied, "--compare", lake.root, **THRESHOLD)
     subset, counts = max(expected.items(), key=lambda item: item[1][1][2])  # more vehicles, so more of all
     (line,) = (line for line in done.out.splitlines() if line.split()[:2] == ["high_acceleration", subset])
     assert line.split()[2:] == [

@@ -6,13 +6,13 @@ import pytest
 from lake_sources import EXCERPTS
 
 pytestmark = [
-    pytest.mark.xdist_group("lake"),
+    pytest.mark.usefixtures("prefect_here"),
     pytest.mark.skipif(not EXCERPTS.is_dir(), reason=f"the NGSIM excerpts are not at {EXCERPTS}"),
 ]
 
 
 def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
-    done = command("run", EXCERPTS / "socrata_head_10000.csv", "--lake", tmp_path / "lake")
+    done = command.here("run", EXCERPTS / "socrata_head_10000.csv", "--lake", tmp_path / "lake")
     assert done.code == 0, done.err
     assert "repair, samples, split and tensors were left out for peachtree-1245-north" in done.out
     assert "10,000 entries" in done.out

@@ -8,7 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from tracklake.pipeline.cli import generated_sample
 from tracklake.pipeline.lake import connect
+from tracklake.pipeline.synthetic import SampleSummary
+
+pytestmark = pytest.mark.usefixtures("prefect_here")
 
 HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
 BASE = 1_118_846_978_900  # us-101-0750
@@ -30,7 +34,6 @@ def count(lake) -> int:
         return connection.sql("SELECT count(*) FROM tracks").fetchall()[0][0]
 
 
-@pytest.mark.usefixtures("prefect_here")
 def test_a_second_part_of_a_recording_does_not_replace_the_first(command, tmp_path):
     lake, raw = tmp_path / "lake", tmp_path / "raw"
     first, second = write_part(raw / "a.csv", range(1, 3)), write_part(raw / "b.csv", range(3, 6))
@@ -49,16 +52,26 @@ def test_a_second_part_of_a_recording_does_not_replace_the_first(command, tmp_pa
     assert count(lake) == 20
 
 
-def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path):
-    raw = write_part(tmp_path / "raw" / "a.csv", range(1, 3))
-    assert command("ingest", raw, "--lake", tmp_path / "lake").code == 0
-    done = command("run", "--lake", tmp_path / "lake", "--minutes", "0.1")
-    assert done.code == 1
-    assert "holds recordings that are not this generated sample (a.csv)" in done.err
+def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path, monkeypatch):
+    asked = []
+
+    def generate(out, minutes, seed, _terminal):
+        asked.append((minutes, seed))
+        write_part(out / "truth.parquet", range(0))
+        write_part(out / "b.csv", range(1, 3))
+        return SampleSummary((), rows=20, recordings=1, seconds=0.0)
+
+    monkeypatch.setattr(generated_sample, "write_generated", generate)
+    raw = write_part(tmp_path / "raw" / "a.csv", range(3, 5))
+    assert command.here("ingest", raw, "--lake", tmp_path / "lake").code == 0
+    for options in ([], [], ["--minutes", "0.1"]):  # made, found, asked for otherwise
+        done = command.here("run", "--lake", tmp_path / "lake", *options)
+        assert done.code == 1
+        assert "holds recordings that are not this generated sample (a.csv)" in done.err
+    assert asked == [(None, None), (0.1, None)]
     assert count(tmp_path / "lake") == 20
 
 
-@pytest.mark.usefixtures("prefect_here")
 def test_stages_refuse_what_was_made_with_other_settings(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)
@@ -77,15 +90,14 @@ def test_stages_refuse_what_was_made_with_other_settings(command, lake, tmp_path
     assert "another protocol" in other.err
 
 
-@pytest.mark.usefixtures("prefect_here")
 def test_evaluate_skips_a_run_that_was_made_for_other_tensors(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)
-    assert command("train", "lstm", "--lake", copy, "--seconds", "0.5", "--name", "old").code == 0
+    assert command.here("train", "lstm", "--lake", copy, "--seconds", "0.5", "--name", "old").code == 0
     full = {"TRACKLAKE_MIN_FUTURE_S": "5"}
     for stage in ("samples", "split", "tensors"):
         assert command.here(stage, "--lake", copy, **full).code == 0
-    done = command("evaluate", "--lake", copy, **full)
+    done = command.here("evaluate", "--lake", copy, **full)
     assert done.code == 0, done.err
     assert "constant-velocity " in done.out
     assert "skipped: " in done.err
@@ -132,7 +144,7 @@ def test_linked_folders_are_followed_once(command, tmp_path):
     source.mkdir()
     (source / "link").symlink_to(tmp_path / "disk")
     (tmp_path / "disk" / "loop").symlink_to(source)
-    assert command("ingest", source, "--lake", tmp_path / "lake").code == 0
+    assert command.here("ingest", source, "--lake", tmp_path / "lake").code == 0
     assert count(tmp_path / "lake") == 20
 
 

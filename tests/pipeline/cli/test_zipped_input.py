@@ -3,6 +3,8 @@
 import json
 import zipfile
 
+import pytest
+
 from tracklake.pipeline.lake import connect
 from tracklake.schemas import REJECTS, TRACKS, VEHICLES
 
@@ -13,6 +15,7 @@ ORDERS = (
 )
 
 
+@pytest.mark.usefixtures("prefect_here")
 def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, sample, lake, tmp_path):
     with zipfile.ZipFile(tmp_path / "download.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("sample/Readme.pdf", b"%PDF")
@@ -20,7 +23,7 @@ def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, s
             if path.suffix in (".csv", ".txt"):
                 archive.write(path, f"sample/data/{path.name}")
     arguments = ("ingest", tmp_path / "download.zip", "--lake", tmp_path / "lake", "--json")
-    done = command(*arguments)
+    done = command.here(*arguments)
     assert done.code == 0, done.err
     with connect(lake.root) as plain, connect(tmp_path / "lake") as zipped:
         for table, order in ORDERS:
@@ -34,6 +37,6 @@ def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, s
         assert [file for (file,) in zipped.sql(files).fetchall()] == [
             f"download.zip/sample/data/{file}" for (file,) in plain.sql(files).fetchall()
         ]
-    again = command(*arguments)
+    again = command.here(*arguments)
     assert again.code == 0, again.err
     assert json.loads(again.out)["built"] == {}

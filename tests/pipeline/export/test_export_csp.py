@@ -279,17 +279,17 @@ def test_the_same_lake_gives_the_same_bytes_and_a_card_with_the_counts(ngsim, tm
 
 
 def test_the_command(command, lake, tmp_path):
-    done = command("export", "csp", "--lake", lake.root, "--out", tmp_path / "out", "--json")
+    done = command.here("export", "csp", "--lake", lake.root, "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.err
     told = json.loads(done.out)
     assert [file["name"] for file in told["files"]] == list(FILES)
     for file in told["files"]:
         assert loadmat(tmp_path / "out" / file["name"])["traj"].shape == (file["samples"], 47)
-    again = command("export", "csp", "--lake", lake.root, "--out", tmp_path / "out")
+    again = command.here("export", "csp", "--lake", lake.root, "--out", tmp_path / "out")
     assert (again.code, again.out) == (1, "")
     assert "--force" in again.err
-    clean = command("export", "csp", "--lake", lake.root, "--out", tmp_path / "clean", "--clean", "--full-future")
+    clean = command.here("export", "csp", "--lake", lake.root, "--out", tmp_path / "clean", "--clean", "--full-future")
     assert clean.code == 0, clean.err
     assert "TrainSet.mat" in clean.out
     assert "would_be_neighbor" in clean.out
-    assert command("export", "csp", "--out", tmp_path / "x", "--dataset", "kitti").code == 2
+    assert command.here("export", "csp", "--out", tmp_path / "x", "--dataset", "kitti").code == 2

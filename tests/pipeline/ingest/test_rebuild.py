@@ -16,15 +16,16 @@ from small_recordings import ENTRIES, write_highd
 from tracklake.pipeline.lake import LakeError, connect, load, open_for_writing
 from tracklake.schemas import SCHEMA_VERSION
 
-pytestmark = pytest.mark.xdist_group("rebuild")
+pytestmark = pytest.mark.usefixtures("prefect_here")
 
 
 @pytest.fixture(scope="module")
-def made(command, tmp_path_factory) -> Path:
+def made(command, prefect_here, tmp_path_factory) -> Path:
+    del prefect_here
     folder = tmp_path_factory.mktemp("made")
     for number in ("01", "02"):
         write_highd(folder / "my raw", number, speed_mps=28.0 + int(number))
-    done = command("ingest", folder / "my raw", "--lake", folder / "lake", "--json")
+    done = command.here("ingest", folder / "my raw", "--lake", folder / "lake", "--json")
     assert done.code == 0, done.err
     return folder
 
@@ -70,7 +71,6 @@ def test_every_command_refuses_it_with_the_command_that_rebuilds_it(command, mad
     assert (old / "manifest.json").read_bytes() == before
 
 
-@pytest.mark.usefixtures("prefect_here")
 def test_it_is_rebuilt_by_that_command_under_its_readers(command, made, old, monkeypatch):
     lake_id = json.loads((old / "manifest.json").read_text())["lake_id"]
     standing = set(old.glob("*/**/*.parquet"))
@@ -82,7 +82,7 @@ def test_it_is_rebuilt_by_that_command_under_its_readers(command, made, old, mon
         before = reader.execute(question).fetchone()
         assert before[0] == 2 * ENTRIES
         line = f"tracklake ingest '{made / 'my raw'}' --lake {old} --rebuild --json"
-        done = command(*shlex.split(line)[1:])
+        done = command.here(*shlex.split(line)[1:])
         assert done.code == 0, done.err
         write_highd(old.parent / "more", "03")
         assert command.here("ingest", old.parent / "more", "--lake", old, "--quiet").code == 0
@@ -121,7 +121,7 @@ def test_a_rebuild_killed_in_the_middle_goes_on(command, made, old):
     process.communicate()
     begun = load(old)
     assert begun.commits
-    done = command(*command_line, "--json")
+    done = command.here(*command_line, "--json")
     assert done.code == 0, done.err
     assert json.loads(done.out)["built"].get("ingest", 0) == 3 - len(begun.commits)
     assert load(old).lake_id == begun.lake_id
@@ -133,7 +133,6 @@ def average_x(root: Path) -> float:
         return lake.sql("SELECT avg(x_m) FROM tracks WHERE subset = '01-upper'").fetchone()[0]
 
 
-@pytest.mark.usefixtures("prefect_here")
 def test_a_lake_of_this_version_is_redone_as_well_whatever_became_of_its_files(command, made, tmp_path):
     root = tmp_path / "lake"
     shutil.copytree(made / "lake", root)

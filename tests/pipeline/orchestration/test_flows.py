@@ -1,7 +1,6 @@
 """What Prefect adds: tasks that are seen, retries on I/O, deployments; and that it caches nothing."""
 
 import json
-import os
 import shutil
 import sqlite3
 import time
@@ -13,9 +12,10 @@ from unittest.mock import Mock
 import httpx
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.settings import PREFECT_API_URL
-from prefect.testing.utilities import prefect_test_harness
-from small_recordings import write_highd
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
+from prefect.client.schemas.sorting import ArtifactSort, FlowRunSort
+from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
+from small_recordings import KINDS, write_highd
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import connect, load, open_for_writing
@@ -24,27 +24,17 @@ from tracklake.pipeline.orchestration import flows, run_plan
 from tracklake.pipeline.sources import SourceError
 
 pytestmark = [
-    pytest.mark.xdist_group("lake"),
+    pytest.mark.usefixtures("prefect_here"),
     # Prefect's own, from the server it starts in this process.
     pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"] = str(tmp_path_factory.mktemp("results"))
-    with prefect_test_harness(server_startup_timeout=120):
-        yield PREFECT_API_URL.value()
-    del os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]
-
-
 @pytest.fixture
-def raw(sample, tmp_path) -> Path:
-    folder = tmp_path / "raw"
-    folder.mkdir()
-    for kind in ("recordingMeta", "tracksMeta", "tracks"):
-        shutil.copy(sample / f"04_{kind}.csv", folder)
-    return folder
+def raw(tmp_path) -> Path:
+    """One small recording."""
+    write_highd(tmp_path / "raw", "04")
+    return tmp_path / "raw"
 
 
 @pytest.fixture
@@ -61,11 +51,12 @@ def calls(monkeypatch) -> Counter:
     return counted
 
 
-def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server, command, raw, tmp_path):
-    done = command("run", raw, "--lake", tmp_path / "lake", "--json", PREFECT_API_URL=server)
+def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(command, raw, tmp_path):
+    done = command("run", raw, "--lake", tmp_path / "lake", "--json")
     assert done.code == 0, done.err
     with get_client(sync_client=True) as client:
-        runs = [run for run in client.read_flow_runs() if run.parameters.get("lake") == str(tmp_path / "lake")]
+        latest = client.read_flow_runs(sort=FlowRunSort.START_TIME_DESC)  # 200 of them
+        runs = [run for run in latest if run.parameters.get("lake") == str(tmp_path / "lake")]
         assert [run.state.name for run in runs] == ["Completed"]
         wanted = {
             "ingest 04",
@@ -81,12 +72,12 @@ def test_runs_and_tasks_are_seen_by_the_server_that_prefect_api_url_names(server
         limit = time.monotonic() + 20
         seen: set[str] = set()
         while not wanted <= seen and time.monotonic() < limit:  # task runs are recorded by events, a little later
-            seen = {task.name for task in client.read_task_runs(limit=200) if task.flow_run_id == runs[0].id}
+            own = FlowRunFilter(id=FlowRunFilterId(any_=[runs[0].id]))
+            seen = {task.name for task in client.read_task_runs(flow_run_filter=own)}
             time.sleep(0.2)
     assert wanted <= seen
 
 
-@pytest.mark.usefixtures("server")
 def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypatch):
     tries: Counter = Counter()
     real = ingest.build
@@ -113,8 +104,7 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
     assert tries["hopeless"] == 1
 
 
-def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(server, raw, tmp_path, calls):
-    del server
+def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(raw, tmp_path, calls):
     root = tmp_path / "lake"
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     finished = load(root)
@@ -138,7 +128,7 @@ def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(server
         file.write("\n")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 4}
-    assert list(Path(os.environ["PREFECT_RESULTS_LOCAL_STORAGE_PATH"]).iterdir()) == []
+    assert list(Path(PREFECT_RESULTS_LOCAL_STORAGE_PATH.value()).iterdir()) == []
 
 
 @pytest.fixture
@@ -200,7 +190,8 @@ def artifacts_of(root: Path) -> dict[str, list]:
     """The artifacts of a lake's runs by key, without the lake's name and id at its end, oldest first."""
     ending = f"-lake-{load(root).lake_id[:8]}"
     with get_client(sync_client=True) as client:
-        found = sorted(client.read_artifacts(), key=lambda artifact: artifact.created)
+        latest = client.read_artifacts(sort=ArtifactSort.CREATED_DESC)  # 200 of them
+        found = sorted(latest, key=lambda artifact: artifact.created)
     made: dict[str, list] = {}
     for artifact in found:
         if artifact.key.endswith(ending):
@@ -208,8 +199,11 @@ def artifacts_of(root: Path) -> dict[str, list]:
     return made
 
 
-@pytest.mark.usefixtures("server")
-def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
+def test_the_report_is_seen_as_artifacts_of_the_run(sample, tmp_path):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    for kind in KINDS:
+        shutil.copy(sample / f"04_{kind}.csv", raw)
     root = tmp_path / "odd [x](y) \u00e9" / "Lake"
     result = flows.run(str(root), str(raw))
     assert result["failed"] == []
@@ -248,7 +242,6 @@ def test_the_report_is_seen_as_artifacts_of_the_run(raw, tmp_path):
     assert {len(made) for made in artifacts_of(root).values()} == {2}
 
 
-@pytest.mark.usefixtures("server")
 @pytest.mark.parametrize(
     ("failure", "is_ours"),
     [
@@ -277,22 +270,21 @@ def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lak
         assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
 
 
-def test_the_embedded_server_takes_the_artifacts_too(command, raw, tmp_path):
-    home = tmp_path / "prefect"
-    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(home))
+def test_the_embedded_server_takes_the_artifacts_too(command, raw, prefect_home, tmp_path):
+    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(prefect_home))
     assert done.code == 0, done.err
     assert "artifacts" not in done.out
-    with sqlite3.connect(f"file:{home / 'prefect.db'}?mode=ro", uri=True) as database:
+    with sqlite3.connect(f"file:{prefect_home / 'prefect.db'}?mode=ro", uri=True) as database:
         keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
     database.close()
     assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
 
 
-def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):
+def test_serve_offers_the_flows_as_deployments(command, tmp_path):
     alone = command.alone("serve")
     assert alone.code == 1
     assert "PREFECT_API_URL" in alone.err
-    process = replace(command, folder=tmp_path).start("serve", PREFECT_API_URL=server)
+    process = replace(command, folder=tmp_path).start("serve")
     try:
         names: set[str] = set()
         limit = time.monotonic() + 60
@@ -308,7 +300,7 @@ def test_serve_offers_the_flows_as_deployments(server, command, tmp_path):
 
 def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
     process = command.alone.start("ingest", raw, "--lake", tmp_path / "lake", "--quiet")
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 120
     while not (tmp_path / "lake" / "manifest.json").exists() and time.monotonic() < limit:
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")

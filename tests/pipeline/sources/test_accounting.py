@@ -86,7 +86,7 @@ def damage(data, edits, *, header):
 
 
 @given(name=st.sampled_from(sorted(NGSIM_FILES)), edits=edits())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_no_damage_to_an_ngsim_file_crashes_or_loses_a_row(tmp_path_factory, name, edits):
     header = name not in ("no header", "text")
     data = damage(NGSIM_FILES[name], edits, header=header)
@@ -116,7 +116,7 @@ def test_no_damage_to_an_ngsim_file_crashes_or_loses_a_row(tmp_path_factory, nam
 
 
 @given(kind=st.sampled_from([0, 1, 2, 2, 2]), edits=edits())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_no_damage_to_a_highd_file_crashes_or_loses_a_row(tmp_path_factory, kind, edits):
     folder = tmp_path_factory.mktemp("fuzz")
     paths = write_recording(folder, tracks=TRACKS * 2)
@@ -154,7 +154,7 @@ rows = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 1), values, values),
 
 
 @given(rows=rows)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=35, deadline=None)
 def test_repetitions_against_a_loop(rows):
     frame = pl.DataFrame(
         [(*row, 0, line) for line, row in enumerate(rows, start=1)],

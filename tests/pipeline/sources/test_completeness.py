@@ -182,7 +182,7 @@ def recordings(draw):
     return vehicles, order, lost
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(recordings(), st.integers(0, 3))
 def test_found_and_missing_rows_add_up_to_the_announced_ones(recording, repeated):
     vehicles, order, lost = recording

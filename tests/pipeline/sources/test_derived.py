@@ -139,7 +139,7 @@ KEY = ["a", "b"]
 
 
 @given(files=st.lists(st.tuples(entries, st.sets(st.sampled_from("cd"))), min_size=1, max_size=3))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_against_a_loop(files):
     schema = {**dict.fromkeys("abcd", pl.Int32), FILE: pl.Int64, "line": pl.Int64}
     blank = [

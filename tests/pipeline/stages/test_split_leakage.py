@@ -170,7 +170,7 @@ def run(scene, split):
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000), kind=st.sampled_from(["whole", "by id", "in time"]))
 def test_counts_equal_a_loop_over_entries_samples_and_neighbors(seed, kind):
     scene, split = make_scene(seed), make_split(kind, seed)

@@ -11,7 +11,7 @@ from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, 
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
 
-MINUTES = 0.25
+MINUTES = 0.2
 
 
 @pytest.fixture(scope="module")

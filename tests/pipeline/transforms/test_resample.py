@@ -134,7 +134,7 @@ def gappy_tracks(draw):
     return first_frame, entries
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(gappy_tracks(), st.sampled_from([(25.0, 10), (25.0, 5), (10.0, 10), (10.0, 5), (10.0, 4), (25.0, 8)]))
 def test_agrees_with_a_loop_over_ticks(recording, rates):
     first_frame, entries = recording
@@ -166,7 +166,7 @@ def test_columns_that_are_left_out_are_left_out():
     assert_frame_equal(part, full.drop("speed_mps", "lane"))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(1, 6), max_size=12), st.integers(1, 9))
 def test_runs_are_cut_whole_and_in_order(lengths, rows):
     values = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)

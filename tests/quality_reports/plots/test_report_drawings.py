@@ -36,7 +36,7 @@ def read_png(content: bytes) -> tuple[dict[bytes, bytes], np.ndarray]:
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_a_png_holds_the_palette_entries(height, width, seed):
     indices = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
     chunks, read = read_png(encode_png(indices))
@@ -103,7 +103,7 @@ ENTRIES = st.lists(
 
 
 @given(ENTRIES)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_cells_hold_the_mean_speed_of_their_entries(open_lake, entries):
     rows = [
         {"vehicle_id": number, "frame": round(time_s * 10), "lane": lane, "time_s": time_s, "x_m": x_m, "speed_mps": v}

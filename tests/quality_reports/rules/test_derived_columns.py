@@ -198,7 +198,7 @@ def test_trace_leads_to_what_is_stored():
     )  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=35, deadline=None)
 @given(
     st.lists(
         st.tuples(*[st.sampled_from([-(2**31), -1, 0, 3, 2**31 - 1]) | st.integers(-9, 9)] * 2, st.integers()),

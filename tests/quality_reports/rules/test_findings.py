@@ -87,7 +87,7 @@ def random_tracks(draw) -> pl.DataFrame:
     return tracks(rows)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(random_tracks())
 def test_findings_equal_a_literal_loop(frame):
     findings = FINDINGS.validate(find(frame, RECORDED), where="01-upper")

@@ -140,7 +140,7 @@ def random_scenes(draw) -> tuple[dict, Surface]:
     return entries, surface
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(random_scenes())
 def test_every_rule_finds_what_the_slow_loop_finds(drawn):
     entries, surface = drawn

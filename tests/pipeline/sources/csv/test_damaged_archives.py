@@ -86,7 +86,7 @@ def undamaged(tmp_path_factory):
     )
 )
 @example(edits=[(0, None)])
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_no_damage_to_an_archive_crashes_or_changes_a_row(undamaged, tmp_path_factory, edits):
     folder = tmp_path_factory.mktemp("fuzz")
     path = write(folder / "damaged.zip", damage(NGSIM_ARCHIVE, edits))

@@ -238,7 +238,7 @@ def slow_squeeze(data):
 
 
 @given(st.text(alphabet=" \t\r\nab", max_size=60))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=35, deadline=None)
 def test_squeezing_against_splitting_and_joining(text):
     assert squeeze_blanks(text.encode()) == slow_squeeze(text.encode())
 
@@ -279,7 +279,7 @@ def edits():
 @given(edits=edits(), chunk_bytes=st.sampled_from([1, 20, 100, 1 << 20]), comma=st.booleans())
 @example(edits=[(3, "insert", b'"'), (60, "insert", b'"')], chunk_bytes=1, comma=True)
 @example(edits=[(5, "insert", b"\r")], chunk_bytes=1 << 20, comma=False)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=105, deadline=None)
 def test_no_damage_crashes_or_loses_a_line(tmp_path_factory, edits, chunk_bytes, comma):
     good = GOOD * 3 if comma else b" 1 a  2\t3.5 \r\n\t2 b 4 5\n3 c 6 7\n" * 3
     data = mutate(good, edits)

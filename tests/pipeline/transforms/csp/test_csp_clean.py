@@ -64,7 +64,7 @@ def test_a_later_run_gets_an_id_that_no_vehicle_had():
 
 
 @given(recordings(), st.sampled_from([None, 6]), st.booleans())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_future):
     """Of vehicles without gaps, in one part, with nobody missing around them."""
     frames = {vehicle: [row[1] for row in rows if row[0] == vehicle] for vehicle, *_ in rows}
@@ -82,7 +82,7 @@ def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_f
 
 
 @given(recordings())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_every_entry_is_a_sample_or_counted(rows):
     found = clean(rows, blocks=(("train", 0, 25), ("val", 40, 60), ("eval", 70, 75, 1, 20), ("eval", 76, 90)))
     counted = sum(found.left_out.values()) + sum(dropped(found).values())

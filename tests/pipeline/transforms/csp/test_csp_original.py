@@ -90,7 +90,7 @@ def recordings(draw):
 
 
 @given(recordings(), st.sampled_from([None, 6]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @example(drive(1, [7]), None)  # one vehicle, one frame
 @example(drive(3, range(5)) + drive(4, range(9)), None)  # shorter than any window
 @example(drive(1, range(40)) + drive(2, range(40), lane=3) + drive(7, range(40)), None)  # side by side, one even inside

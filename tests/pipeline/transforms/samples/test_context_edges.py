@@ -118,7 +118,7 @@ def draw_from(entries, protocol, frame_rate_hz, *, early=(), findings=()):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.data(), st.sampled_from(RATES))
 def test_agrees_with_loops_over_entries(scene, data, rates):
     entries = data.draw(SCENES[scene])

@@ -278,7 +278,7 @@ def traffic(draw_from):
     return entries
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     traffic(),
     st.sets(st.sampled_from([0, 1, 2]), max_size=1),

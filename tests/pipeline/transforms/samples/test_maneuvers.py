@@ -126,7 +126,7 @@ RUNS = st.lists(
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(RUNS, st.sampled_from([1, 2]))
 def test_agrees_with_a_loop_over_entries(runs, rate_hz):
     """x_m are sums of tenths of a metre, compared as fractions."""

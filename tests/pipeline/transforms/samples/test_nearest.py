@@ -88,7 +88,7 @@ ENTRIES = st.lists(
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(ENTRIES, st.integers(1, 12), st.sampled_from([1, 4, 1 << 13]), st.data())
 def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_blocks(entries, k, block_rows, data):
     """Millimetres, in any order of rows."""

@@ -215,7 +215,7 @@ ENTRIES = st.lists(
 ).map(sorted)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(ENTRIES, st.randoms(use_true_random=False), st.sampled_from([1, 3, 1 << 14]))
 def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_chunks(entries, random, chunk_rows):
     expected, collisions, crowded_out = slow_neighbors(entries)

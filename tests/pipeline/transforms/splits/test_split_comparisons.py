@@ -43,7 +43,7 @@ def test_the_highest_id_decides_and_not_the_count():
     assert found.relaxations == {}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(ids=st.lists(st.one_of(st.integers(1, 300), st.just(2**31 - 1)), min_size=1, max_size=40, unique=True))
 def test_ids_stand_in_the_part_of_their_share_of_the_highest(ids):
     ids = sorted(ids)

@@ -74,7 +74,7 @@ SUBSETS = st.lists(
 ).map(lambda rows: [(f"{position:02d}", *row) for position, row in enumerate(rows)])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     rows=SUBSETS,
     wanted=st.sampled_from(
@@ -112,7 +112,7 @@ def test_search_and_exhaustion_find_the_optimum_of_a_literal_enumeration(monkeyp
     assert got[2] == pytest.approx(best[2], abs=2e-8)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(rows=SUBSETS, seed=st.integers(0, 99))
 def test_row_order_does_not_matter(rows, seed):
     shuffled = rows.copy()
@@ -162,7 +162,7 @@ def test_the_search_comes_near_the_exhaustive_optimum_where_it_can_be_known(monk
     assert verdicts[0][2] - 1e-8 <= verdicts[1][2] <= verdicts[0][2] + 1e-3
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(rows=SUBSETS, validation=st.booleans())
 def test_the_search_breaks_no_constraint_that_can_be_met(rows, validation):
     shares = SHARES[validation]

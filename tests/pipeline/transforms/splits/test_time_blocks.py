@@ -44,7 +44,7 @@ def test_borders_by_hand():
     assert found["c"] == [(0, 5, 1004)]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     first=st.integers(0, 2**31 - 40_000),
     length=st.integers(1, 30_000),

@@ -166,7 +166,7 @@ def test_no_window_begins_before_the_recording():
     assert set(found["first_missing_frame"]) == {10}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 14), st.integers(0, 11))
 def test_what_was_cut_off_tells_nothing_of_itself(seed, vehicles, changed):
     """A vehicle that waited before the cut, recording other speeds, is estimated the same; only the truth differs."""
@@ -194,7 +194,7 @@ def test_what_was_cut_off_tells_nothing_of_itself(seed, vehicles, changed):
     assert set(two["first_true_frame"]) == {frame - 200}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 16), st.floats(0, 8), st.integers(-(10**6), 10**6))
 def test_properties(seed, vehicles, cutoff_m, shift):
     """Counts that fit together, whatever the frames are called and however high the ids are."""

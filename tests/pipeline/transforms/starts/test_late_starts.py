@@ -76,7 +76,7 @@ def test_cutoff(start_x_m, cutoff_m):
     assert find_cutoff(np.array(start_x_m)) == cutoff_m
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=35, deadline=None)
 @given(st.lists(st.integers(-40, 400).map(lambda quarters: quarters / 4), min_size=1, max_size=30))
 def test_cutoff_agrees_with_trying_one_after_the_other(start_x_m):
     c = 0.0

@@ -54,7 +54,7 @@ def repair(tracks, *, first_frame=0, frame_rate_hz=10.0, on_ramp_lanes=()):
     return starts, cutoffs.row(0, named=True), MISSING_STARTS.validate(missing, where="test")
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(scenes(), st.sampled_from([(), (0,), (7,)]))
 def test_every_vehicle_is_classified_once_and_every_late_start_has_a_window(tracks, on_ramp_lanes):
     starts, cutoffs, missing = repair(tracks, on_ramp_lanes=on_ramp_lanes)
@@ -76,7 +76,7 @@ def test_every_vehicle_is_classified_once_and_every_late_start_has_a_window(trac
     assert (missing["references"] <= whole.height).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(scenes())
 def test_whatever_drives_by_can_be_assessed(tracks):
     starts, cutoffs, _ = repair(tracks)
@@ -94,7 +94,7 @@ def test_whatever_drives_by_can_be_assessed(tracks):
         assert found == [each for each in reached if each[1]]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(scenes(), st.integers(0, 4))
 def test_would_be_neighbors_agree_with_a_loop(tracks, first_frame):
     _, _, missing = repair(tracks, first_frame=-first_frame)
@@ -114,7 +114,7 @@ def test_would_be_neighbors_agree_with_a_loop(tracks, first_frame):
     assert near.tolist() == expected
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(ids, st.integers(0, 500), starts_m, lanes, speeds)
 def test_one_vehicle_in_one_frame(vehicle, frame, x_m, lane, speed_mps):
     """It cannot be late: its own start makes the cut-off. With one entry it is fully tracked, but reaches nothing."""
@@ -125,7 +125,7 @@ def test_one_vehicle_in_one_frame(vehicle, frame, x_m, lane, speed_mps):
     assert starts["early"].to_list() == [False], "nobody came before it"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 7), st.integers(1, 40), st.integers(12, 60))
 def test_side_by_side_each_is_the_others_reference(lane, metres, frames_before):
     """Two start together at 0 m in neighboring lanes at 1 m a frame; a third is first seen between them, late.
@@ -144,7 +144,7 @@ def test_side_by_side_each_is_the_others_reference(lane, metres, frames_before):
     assert row["first_missing_frame"] in {max(0, 20 + frames_before - metres - k) for k in (2, 3, 4)}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 60), st.integers(1, 30))
 def test_a_vehicle_that_leaves_and_returns_is_late_by_its_first_entry_only(away, back_m):
     """Seen first at the entrance, it is not late however far on it returns; with the gap it is no reference."""
@@ -155,7 +155,7 @@ def test_a_vehicle_that_leaves_and_returns_is_late_by_its_first_entry_only(away,
     assert starts.select("starts_late", "fully_tracked").rows() == [(False, False), (False, True)]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(lanes, lanes)
 def test_lane_0_is_a_lane_and_an_unknown_one_may_be_any(start_lane, lane):
     missing = pl.DataFrame(
@@ -173,7 +173,7 @@ def test_lane_0_is_a_lane_and_an_unknown_one_may_be_any(start_lane, lane):
     assert near.tolist() == [start_lane is None or lane is None or abs(start_lane - lane) <= 1]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.integers(-50, 400), st.integers(1, 4000)), min_size=10, max_size=40))
 def test_the_fit_solves_the_normal_equations(points):
     """Sums over the points by hand, of integers exactly; r2 is the squared correlation."""

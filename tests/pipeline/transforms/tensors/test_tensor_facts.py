@@ -73,7 +73,7 @@ def test_no_entries_and_no_findings():
     assert mark([(4, 0), (4, 9)], []) == [0, 0]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     entries=st.sets(st.tuples(IDS, st.integers(0, 8)), max_size=12),
     findings=st.lists(st.tuples(IDS, st.sampled_from(SEVERITIES), st.integers(0, 28), st.integers(0, 9)), max_size=6),
@@ -102,7 +102,7 @@ def test_every_frame_of_every_finding_counts_where_it_should(entries, findings, 
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     sizes=st.dictionaries(
         IDS, st.tuples(st.none() | st.floats(0, 100, width=32), st.none() | st.floats(0, 20, width=32))

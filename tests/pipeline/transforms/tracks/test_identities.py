@@ -175,7 +175,7 @@ rows = st.lists(
 
 
 @given(rows=rows, one_way=st.booleans(), data=st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=70, deadline=None)
 def test_every_entry_has_one_vehicle_and_the_order_of_rows_is_irrelevant(rows, one_way, data):
     found = identify(rows, one_way=one_way)
     entries = found.entries

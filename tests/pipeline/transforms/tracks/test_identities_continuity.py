@@ -165,7 +165,7 @@ def absent_for(data, frames):
     rate=st.sampled_from([1, 3]),
     data=st.data(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_twins_in_lanes_of_their_own_are_found_again(lanes, rate, data):
     """Constant speeds, one lane each, any frames missing: what was put together comes apart the same way.
 
@@ -185,7 +185,7 @@ def test_twins_in_lanes_of_their_own_are_found_again(lanes, rate, data):
         max_size=8,
     )
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=35, deadline=None)
 def test_one_entry_a_frame_is_one_vehicle_unless_an_absence_cannot_be(steps):
     frame, x_m = 1, 1000.0
     rows, broken = [entry(5, frame, x_m)], False

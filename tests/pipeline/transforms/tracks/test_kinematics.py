@@ -125,7 +125,7 @@ tracks_of_vehicles = st.dictionaries(
 
 
 @given(tracks=tracks_of_vehicles, gap=st.integers(0, 30), rate=st.sampled_from([10.0, 20.0, 25.0, 30.0]))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_against_a_slow_loop(tracks, gap, rate):
     whole = {number: number**2 / 16 for number in range(30) if number != gap}
     check({**tracks, 9: whole}, rate)

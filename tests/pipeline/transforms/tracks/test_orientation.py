@@ -54,7 +54,7 @@ number = st.integers(-400, 400).map(float)
 
 
 @given(rows=st.lists(st.tuples(number, number, number, number, number), min_size=1, max_size=6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_picture_turned_by_half_gives_the_same_tracks_on_the_other_carriageway(rows):
     """Turning the image by 180 degrees about (0, 0) turns the lower carriageway into an upper one."""
     length, width = 4.0, 2.0
