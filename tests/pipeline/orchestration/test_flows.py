@@ -156,7 +156,6 @@ def ingest_as_a_command(root: Path, source: Path, **settings) -> run_plan.RunRes
     return run_plan.conclude_idle(request, plan) if plan.is_idle else flows.execute(request, plan)
 
 
-@pytest.mark.usefixtures("server")
 def test_a_command_searches_the_source_once_and_compares_it_with_the_lake_once(raw, tmp_path, searches):
     root = tmp_path / "lake"
     cases = [({}, 1), ({}, 0), ({}, 1), ({"rebuild": True}, 2)]
@@ -172,7 +171,6 @@ def test_a_command_searches_the_source_once_and_compares_it_with_the_lake_once(r
     assert count_calls(searches) == (1, 1)
 
 
-@pytest.mark.usefixtures("server")
 def test_a_lake_that_changed_since_it_was_planned_is_planned_again(raw, tmp_path, searches):
     request = run_plan.RunRequest(str(tmp_path / "lake"), ("ingest",), str(raw))
     flows.ingest_files(str(tmp_path / "lake"), str(raw))

@@ -1,0 +1,116 @@
+"""A lake as one object: SQL, tables and tensors."""
+
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import polars as pl
+
+from tracklake.pipeline.lake.errors import LakeError
+from tracklake.pipeline.lake.files import TABLE_BY_NAME, TENSORS, scan
+from tracklake.pipeline.lake.manifest import MANIFEST, load
+from tracklake.pipeline.lake.query import LakeConnection, LakeResult, Parameters, connect
+
+if TYPE_CHECKING:
+    from tracklake.training.data.tensor_folder import TensorFolder
+
+
+class Lake:
+    """A lake opened for reading; what a writer commits later is seen by the next call.
+
+    Args:
+        path: folder of the lake.
+
+    Raises:
+        LakeMissingError: no lake in this folder.
+        LakeError: the lake is damaged or of another version.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path).resolve()
+        self._connection: LakeConnection | None = None
+        self._state: tuple[int, int] | None = None
+        load(self.path)
+
+    def sql(self, query: str, parameters: Parameters | None = None) -> LakeResult:
+        """Run one SELECT over the tables and macros.
+
+        Args:
+            query: SQL text, for example `"FROM track('02-lower', 21)"`.
+            parameters: values of `$name` or `?` placeholders.
+
+        Returns:
+            The result; `.pl()` fetches it as a Polars DataFrame, `.fetchall()` as tuples.
+
+        Raises:
+            QueryError: the statement is no SELECT, or DuckDB refuses it.
+        """
+        status = (self.path / MANIFEST).stat()
+        state = (status.st_mtime_ns, status.st_ino)
+        if self._connection is None or state != self._state:
+            self.close()
+            self._connection, self._state = connect(self.path), state
+        return self._connection.sql(query, parameters)
+
+    def table(self, name: str) -> pl.LazyFrame:
+        """Scan a stored table with Polars.
+
+        Args:
+            name: table name, see docs/tables.md; SQL views may add columns of other tables to it.
+
+        Raises:
+            LakeError: no table of this name.
+        """
+        if name not in TABLE_BY_NAME:
+            near = get_close_matches(name, TABLE_BY_NAME, n=1) or sorted(TABLE_BY_NAME)
+            raise LakeError(f"no table {name!r}: expected {' or '.join(near)}. docs/tables.md lists all tables.")
+        return scan(self.path, load(self.path), TABLE_BY_NAME[name])
+
+    def subsets(self) -> pl.DataFrame:
+        """Return one row per subset, with size, flow and whether it is excluded."""
+        return self.sql("FROM subsets ORDER BY dataset, subset").pl()
+
+    def tensors(self) -> "TensorFolder":
+        """Open the training tensors, memory-mapped.
+
+        Raises:
+            LakeError: the lake has no tensors.
+            TensorError: the folder is damaged or of another version.
+        """
+        from tracklake.training.data.tensor_folder import TensorFolder
+
+        paths = [made.info["path"] for made in load(self.path).of_stage(TENSORS) if made.info["path"] is not None]
+        if not paths:
+            raise LakeError(
+                f"{self.path}: the lake has no tensors. Run `tracklake tensors`; it needs freeway recordings with "
+                "lanes."
+            )
+        return TensorFolder.open(self.path / paths[0])
+
+    def close(self) -> None:
+        """Close the SQL session; the next query opens a new one."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def __enter__(self) -> Self:
+        """Use the lake in a `with` block."""
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        """Close the SQL session at the end of a `with` block."""
+        self.close()
+
+    def __repr__(self) -> str:
+        """Show the folder."""
+        return f"Lake({str(self.path)!r})"
+
+
+def open_lake(path: str | Path) -> Lake:
+    """Open the lake in a folder for reading.
+
+    Raises:
+        LakeMissingError: no lake in this folder.
+        LakeError: the lake is damaged or of another version.
+    """
+    return Lake(path)

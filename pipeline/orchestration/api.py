@@ -1,0 +1,66 @@
+"""The pipeline as a Python function."""
+
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.lake import LakeError, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.orchestration.run_plan import (
+    ALL_STEPS,
+    RunRequest,
+    RunResult,
+    conclude_idle,
+    plan_run,
+    survey_source,
+)
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources import SourceError
+
+
+def run(
+    source: str | Path,
+    *,
+    lake: str | Path = "lake",
+    dataset: str | None = None,
+    replace: bool = False,
+    prune: bool = False,
+    rebuild: bool = False,
+    **settings: Any,  # noqa: ANN401  (settings are of several types)
+) -> RunResult:
+    """Run the whole pipeline, from raw files to report and tensors, as `tracklake run SOURCE` does.
+
+    Args:
+        source: a raw file, or a folder of them.
+        lake: folder of the lake; it is created if missing.
+        dataset: read the source as this dataset only (ngsim or highd); None: detect it.
+        replace: whether files of the source may replace other files of the same recording.
+        prune: whether to remove recordings whose files once stood in the source and are missing now.
+        rebuild: whether to make the lake again from the raw files.
+        settings: settings by name, see docs/settings.md; they override tracklake.toml and the environment.
+
+    Returns:
+        What was built, refused, skipped and removed, and notes.
+
+    Raises:
+        SourceError: nothing in the source can be used.
+        LakeError: the lake is damaged, of another version, or another process writes to it; or a stage failed.
+        pydantic.ValidationError: a setting is invalid.
+    """
+    chosen = Settings(lake=Path(lake), **settings)
+    plain = chosen.model_dump(mode="json", exclude_unset=True)
+    place, where = str(Path(lake).absolute()), str(Path(source).absolute())
+    request = RunRequest(place, ALL_STEPS, where, dataset, plain, replace, prune, rebuild)
+    request.check()
+    refuse_foreign(request.root, rebuild=rebuild)
+    discovery = survey_source(request)
+    if not discovery.units:
+        raise SourceError("\n".join(discovery.refusals) or f"{source}: no raw files")
+    plan = plan_run(request, discovery)
+    if plan.is_idle:
+        return conclude_idle(request, plan)
+    refuse_if_busy(request.root, rebuild=rebuild)
+    from tracklake.pipeline.orchestration.flows import execute  # Prefect takes seconds to import
+
+    result = execute(request, plan)
+    if result.failed:
+        raise LakeError("\n".join(result.failed))
+    return result
