@@ -94,7 +94,7 @@ class Connection(Protocol):
     """Connection to a lake: DuckDB's own, or the lake's read-only one."""
 
     def execute(self, statement: str, parameters: Mapping[str, Any] = ..., /) -> Result:
-        """Run a statement."""
+        """Run one of the report's SQL statements."""
         ...
 
 

@@ -102,7 +102,7 @@ class Lake:
         self.close()
 
     def __repr__(self) -> str:
-        """Show the folder."""
+        """Show the folder of the lake."""
         return f"Lake({str(self.path)!r})"
 
 

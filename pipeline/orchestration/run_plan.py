@@ -47,7 +47,7 @@ class RunRequest:
 
     @property
     def root(self) -> Path:
-        """The lake's folder."""
+        """Path of the folder of the lake."""
         return Path(self.lake)
 
     @property

@@ -10,7 +10,7 @@ from itertools import pairwise
 from statistics import median
 
 Key = tuple[int, int]
-"""(vehicle, frame)."""
+"""Key of an entry: vehicle and frame."""
 
 HIGH_ACCELERATION_MPS2 = 3.05
 LOW_SPEED_MPS = 1.52

@@ -40,7 +40,7 @@ class Scene:
 
     @property
     def height(self) -> int:
-        """Number of entries."""
+        """Number of entries in the subset."""
         return self.tracks.height
 
     @cached_property

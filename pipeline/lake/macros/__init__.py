@@ -16,7 +16,7 @@ from importlib.resources import files
 
 @dataclass(frozen=True)
 class Macro:
-    """A table macro.
+    """One table macro of the catalog.
 
     Args:
         name: how it is called.

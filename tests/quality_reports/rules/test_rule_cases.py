@@ -2,37 +2,13 @@
 
 import polars as pl
 import pytest
+from rule_scenes import lay_out
 
 from tracklake.quality_reports.rules.derived import prepare
-from tracklake.quality_reports.rules.evaluate import tracks_needed
 from tracklake.quality_reports.rules.findings import find
 from tracklake.quality_reports.rules.markdown import write_rules
 from tracklake.quality_reports.rules.registry import RULES
-from tracklake.quality_reports.rules.rule import Case
-from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
 from tracklake.schemas import TRACKS, VEHICLES
-
-
-def lay_out(case: Case) -> Scene:
-    """The subset that a case describes, with what it leaves out."""
-    height = len(next(iter(case.entries.values())))
-    usual = {
-        "dataset": ["highd"] * height, "subset": ["01-upper"] * height, "vehicle_id": list(range(1, height + 1)),
-        "frame": [1] * height, "x_m": [0.0] * height, "y_m": [0.0] * height, "lane": [1] * height,
-        "speed_mps": [20.0] * height, "accel_mps2": [0.0] * height, "length_m": [4.0] * height,
-        "width_m": [2.0] * height, "class": ["car"] * height,
-    }  # fmt: skip
-    said = usual | {name: list(values) for name, values in case.entries.items()}
-    tracks = {name: said.get(name, [None] * height) for name in tracks_needed()}
-    vehicles = {name: said[name] for name in ("vehicle_id", *VEHICLE_COLUMNS)}
-    return Scene(
-        pl.DataFrame(tracks, schema={name: TRACKS.dtypes[name] for name in tracks}),
-        pl.DataFrame(vehicles, schema={name: VEHICLES.dtypes[name] for name in vehicles})
-        .unique("vehicle_id")
-        .sort("vehicle_id"),
-        case.frame_rate_hz,
-        case.lane_markings_m,
-    )
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
