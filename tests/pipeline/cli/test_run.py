@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import duckdb
@@ -260,16 +261,17 @@ def test_sql_is_read_only_and_says_what_is_wrong(command, lake):
     assert "tracks, vehicles" in wrong.err
 
 
-def test_a_model_trains_and_every_run_is_evaluated(command, lake):
-    trained = command.here("train", "lstm", "--lake", lake.root, "--steps", "60", "--json")
+def test_a_model_trains_and_every_run_is_evaluated(command, lake, tmp_path):
+    root = shutil.copytree(lake.root, tmp_path / "lake")  # the shared one stays as the pipeline left it
+    trained = command.here("train", "lstm", "--lake", root, "--steps", "60", "--json")
     assert trained.code == 0, trained.err
     metrics = json.loads(trained.out)
     assert metrics["phases"][0]["loss_last"] < metrics["phases"][0]["loss_first"]
-    scored = command.here("evaluate", "--lake", lake.root)
+    scored = command.here("evaluate", "--lake", root)
     assert scored.code == 0, scored.err
     for shown in ("constant-velocity ", "lstm ", *(f"{seconds} s" for seconds in range(1, 6))):
         assert shown in scored.out
-    table = pl.read_csv(lake.root / "evaluations" / "csp.csv").filter(origin="measured")
+    table = pl.read_csv(root / "evaluations" / "csp.csv").filter(origin="measured")
     assert set(table["model"]) == {"constant-velocity", "lstm"}
 
 
