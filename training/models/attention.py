@@ -25,7 +25,7 @@ VEHICLE_HEAD_WIDTH, LANE_HEAD_WIDTH = 8, 32
 EPSILON = 1e-6
 """Epsilon of the layer normalisation."""
 PLACE_SCALE_M, SPEED_SCALE_MPS, DEVIATION_SCALE_M = (50.0, 5.0), (15.0, 1.0), (5.0, 1.0)
-"""Divisors of last positions, velocities and deviations from constant velocity, along and across the road."""
+"""Divisors of last positions, of velocities and of deviations from constant velocity, along and across the road."""
 SIZE_SCALE_M, LANE_SCALE_M = (5.0, 2.0), 4.0
 """Divisors of a vehicle's length and width, and of a lane's offset and width, in m."""
 
@@ -128,9 +128,8 @@ class SceneAttention(Network):
       RMSE at 5 s is then 3.00 and 3.17 m as against 2.95 and 3.03 m with 0.7 kept, NLL 0.73 and 0.74 as against 0.70
       and 0.73 nats; constant velocity has 3.43 m. `dropout` = 0.3 is the other reading.
 
-    Differences: positions are given as last position, velocity and deviations (`describe_vehicles`), and
-    means are counted from every vehicle's own constant velocity unless `residual` is False; an untrained network then
-    predicts constant velocity.
+    Differences: positions are given as last position, velocity and deviations (`describe_vehicles`), and means are
+    counted from every vehicle's own constant velocity unless `residual` is False; an untrained network predicts it.
 
     Args:
         hidden: width of the hidden layers in the vehicle embedding and before the output; 0: none.
