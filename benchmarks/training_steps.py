@@ -9,7 +9,7 @@ seconds, after ten that do not count:
 - batches: gathered as the training loop does; or sample by sample, by a torch Dataset and a DataLoader that fills
   arrays row by row, as the reference implementation's does (`benchmarks/reference_loader.py`);
 - step: `plain`, by PyTorch's layers; `plain, kept`, the same where the process keeps freed memory as the training
-  loop does; `sparse, kept`, without the grid's empty cells, which is the step that trains (`models.social_grid`).
+  loop does; `sparse, kept`, without the grid's empty cells, which is the step that trains (`models.social_pooling`).
 
 With a model that reads scenes only the gathered batches are measured. The share of data is the part of a step's time in
 which it waits for its batch. Processor time is that of all threads.

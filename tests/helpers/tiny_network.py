@@ -10,10 +10,9 @@ import torch
 from tensor_tables import TINY, drive, sample_everything, split_row, write
 from torch import nn
 
-from tracklake.training.models import MODELS, Model
+from tracklake.training.models import MODELS, Model, Phase, Recipe
 from tracklake.training.models.network import Network, mean_squared_distance, to_numpy
 from tracklake.training.models.prediction import Prediction
-from tracklake.training.models.recipes import Phase, Recipe
 
 PARTS = pl.concat([split_row("a", "train"), split_row("b", "eval"), split_row("c", "val")])
 RECIPE = Recipe(phases=(Phase("mse", 2), Phase("distance", 1)), batch_size=32, learning_rate=0.01)

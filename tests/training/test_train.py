@@ -17,9 +17,8 @@ from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import evaluate
-from tracklake.training.models import MODELS
+from tracklake.training.models import MODELS, Phase, Recipe
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.models.recipes import Phase, Recipe
 from tracklake.training.train import DivergedError, TrainConfig, train
 
 FEW = TrainConfig(steps=9, log_steps=2)

@@ -1,16 +1,16 @@
-"""The registry of models: their names, inputs, parameters and recipes."""
+"""The registry of models: their names, inputs, parameters and recipes of training."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import accumulate
 from typing import Any, Literal
 from typing import Protocol as Interface
 
 from tracklake.schemas.errors import MissingExtraError, UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.models.prediction import Prediction
-from tracklake.training.models.recipes import Phase, Recipe
 
 Reads = Literal["grid", "scene"]
 """Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
@@ -25,6 +25,46 @@ class Predictor(Interface):
 
 
 @dataclass(frozen=True)
+class Phase:
+    """Epochs (passes over the training part, or over as many samples as an epoch takes) with one loss, by its name."""
+
+    loss: str
+    epochs: int
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A model's own settings of training.
+
+    Args:
+        phases: one after the other; where a time budget is given, they share it in proportion to their epochs.
+        batch_size: samples per step.
+        learning_rate: highest learning rate of the optimiser.
+        optimizer: `adam`, or `adamw` (decoupled weight decay).
+        schedule: course of the learning rate: `constant`, or `cosine` after a short warm-up.
+        max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
+    """
+
+    phases: tuple[Phase, ...]
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    optimizer: Literal["adam", "adamw"] = "adam"
+    schedule: Literal["constant", "cosine"] = "constant"
+    max_gradient_norm: float = 10.0
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs of all phases together."""
+        return sum(phase.epochs for phase in self.phases)
+
+    def phase_at(self, spent: float, budget: float) -> Phase:
+        """Return the phase after a part of a budget is spent, both in whole steps or both in seconds."""
+        ends = accumulate(phase.epochs for phase in self.phases)  # whole numbers: no step falls into the wrong phase
+        left = (phase for phase, end in zip(self.phases, ends, strict=True) if spent * self.epochs < end * budget)
+        return next(left, self.phases[-1])
+
+
+@dataclass(frozen=True)
 class Model:
     """One entry of the registry.
 
@@ -33,9 +73,8 @@ class Model:
         meaning: one line for the documentation.
         source: publication; empty where the model is ours.
         module: module of `training.models`, imported only when the model is built.
-        builder: class in the module; called with the protocol, and the parameters as keywords.
+        builder: class in the module; takes the protocol, and the parameters as keywords.
         parameters: the model's own parameters with their defaults.
-        reads: kind of input.
         recipe: how a torch network is trained; None where the model needs no training.
     """
 
@@ -54,12 +93,7 @@ class Model:
         return self.recipe is not None
 
     def build(self, protocol: Protocol, **parameters: Any) -> Any:  # noqa: ANN401  (a Predictor; where it learns, an nn.Module too)
-        """Build the model for a protocol.
-
-        Raises:
-            UsageError: the model has no parameter of a name.
-            MissingExtraError: torch is needed and not installed.
-        """
+        """Build the model; raises UsageError on an unknown parameter, MissingExtraError where torch is missing."""
         unknown = sorted(set(parameters) - set(self.parameters))
         if unknown:
             known = ", ".join(self.parameters) or "none"
@@ -71,134 +105,106 @@ class Model:
 
 
 DEO = "Deo and Trivedi 2018, Convolutional Social Pooling for Vehicle Trajectory Prediction (CVPR workshops)"
+BAR_SHALOM = "Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2"
+SCHUBERT = "Schubert, Richter and Wanielik 2008, Comparison and evaluation of advanced motion models"
 KIM = "Kim et al. 2020, Multi-Head Attention based Probabilistic Vehicle Trajectory Prediction (IEEE IV)"
 CHOI = "Choi et al. 2021, random-forest lane change and LSTM encoder-decoder on an occupancy grid"
 
 _SQUARED = (Phase("mse", 8),)
-_CONVOLUTIONAL = Recipe(phases=(Phase("mse", 5), Phase("nll", 3)))
-_ATTENTION = Recipe(phases=(Phase("both", 8),))
+_CONVOLUTIONAL = Recipe((Phase("mse", 5), Phase("nll", 3)))
+_RESIDUAL = {"residual": True}
+_ATTENTION = {"hidden": 128, "dropout": 0.7, "nll_weight": 1.0, "distance_weight": 1.0, **_RESIDUAL}
 
-MODELS = {
-    model.name: model
-    for model in (
+_MODELS = (
+    Model(
+        "constant-velocity",
+        "continues with the velocity of the last 0.2 s",
+        "",
+        "constant_velocity",
+        "ConstantVelocity",
+    ),
+    Model(
+        "kalman-cv",
+        "Kalman filter over the history with constant velocity and white-noise acceleration",
+        BAR_SHALOM,
+        "constant_velocity",
+        "KalmanConstantVelocity",
+    ),
+    Model("ctrv", "constant turn rate and velocity", SCHUBERT, "ctrv", "ConstantTurnRate"),
+    Model(
+        "lstm",
+        "small LSTM encoder-decoder on the deviation from constant velocity",
+        "",
+        "lstms",
+        "DeviationLstm",
+        {"hidden": 48},
+        recipe=Recipe(_SQUARED, learning_rate=4e-3, optimizer="adamw", schedule="cosine", max_gradient_norm=5.0),
+    ),
+    Model(
+        "v-lstm",
+        "vanilla LSTM: convolutional social pooling's encoder and decoder without the neighbors",
+        DEO,
+        "social_pooling",
+        "VanillaLstm",
+        _RESIDUAL,
+        recipe=_CONVOLUTIONAL,
+    ),
+    Model(
+        "stacked-lstm",
+        "two stacked LSTM layers over the history and a linear layer to all positions ahead",
+        CHOI,
+        "lstms",
+        "StackedLstm",
+        _RESIDUAL,
+        recipe=Recipe(_SQUARED),
+    ),
+    Model(
+        "lstm-encoder-decoder",
+        "256-unit embedding, two stacked LSTM layers of 256 in encoder and decoder, 256-unit output layer",
+        CHOI,
+        "lstms",
+        "EncoderDecoder",
+        _RESIDUAL,
+        recipe=Recipe(_SQUARED, batch_size=100),
+    ),
+    *(
         Model(
-            "constant-velocity",
-            "continues with the velocity of the last 0.2 s",
-            "",
-            module="constant_velocity",
-            builder="ConstantVelocity",
-        ),
-        Model(
-            "kalman-cv",
-            "Kalman filter over the history with constant velocity and white-noise acceleration",
-            "Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2",
-            module="kalman",
-            builder="KalmanConstantVelocity",
-        ),
-        Model(
-            "ctrv",
-            "constant turn rate and velocity",
-            "Schubert, Richter and Wanielik 2008, Comparison and evaluation of advanced motion models",
-            module="ctrv",
-            builder="ConstantTurnRate",
-        ),
-        Model(
-            "lstm",
-            "small LSTM encoder-decoder on the deviation from constant velocity",
-            "",
-            module="lstm",
-            builder="DeviationLstm",
-            parameters={"hidden": 48},
-            recipe=Recipe(
-                phases=_SQUARED, learning_rate=4e-3, optimizer="adamw", schedule="cosine", max_gradient_norm=5.0
-            ),
-        ),
-        Model(
-            "v-lstm",
-            "vanilla LSTM: convolutional social pooling's encoder and decoder without the neighbors",
+            name,
+            f"convolutional social pooling{words}",
             DEO,
-            module="vanilla_lstm",
-            builder="VanillaLstm",
-            parameters={"residual": True},
+            "social_pooling",
+            "SocialPooling",
+            {"maneuvers": bool(words), **_RESIDUAL},
             recipe=_CONVOLUTIONAL,
-        ),
+        )
+        for name, words in (("cs-lstm", ""), ("cs-lstm-m", " with maneuvers"))
+    ),
+    *(
         Model(
-            "stacked-lstm",
-            "two stacked LSTM layers over the history and a linear layer to all positions ahead",
-            CHOI,
-            module="stacked_lstm",
-            builder="StackedLstm",
-            parameters={"residual": True},
-            recipe=Recipe(phases=_SQUARED),
-        ),
-        Model(
-            "lstm-encoder-decoder",
-            "256-unit embedding, two stacked LSTM layers of 256 in encoder and decoder, 256-unit output layer",
-            CHOI,
-            module="encoder_decoder",
-            builder="EncoderDecoder",
-            parameters={"residual": True},
-            recipe=Recipe(phases=_SQUARED, batch_size=100),
-        ),
-        Model(
-            "cs-lstm",
-            "convolutional social pooling",
-            DEO,
-            module="social_pooling",
-            builder="SocialPooling",
-            parameters={"maneuvers": False, "residual": True},
-            recipe=_CONVOLUTIONAL,
-        ),
-        Model(
-            "cs-lstm-m",
-            "convolutional social pooling with maneuvers",
-            DEO,
-            module="social_pooling",
-            builder="SocialPooling",
-            parameters={"maneuvers": True, "residual": True},
-            recipe=_CONVOLUTIONAL,
-        ),
-        *(
-            Model(
-                f"attention-h{heads}",
-                f"vehicle and lane attention with {heads} heads, all vehicles of a scene at once",
-                KIM,
-                module="attention",
-                builder="SceneAttention",
-                parameters={
-                    "heads": heads,
-                    "hidden": 128,
-                    "dropout": 0.7,
-                    "nll_weight": 1.0,
-                    "distance_weight": 1.0,
-                    "residual": True,
-                },
-                reads="scene",
-                recipe=_ATTENTION,
-            )
-            for heads in (2, 4, 8)
-        ),
-    )
-}
+            f"attention-h{heads}",
+            f"vehicle and lane attention with {heads} heads, all vehicles of a scene at once",
+            KIM,
+            "attention",
+            "SceneAttention",
+            {"heads": heads, **_ATTENTION},
+            reads="scene",
+            recipe=Recipe((Phase("both", 8),)),
+        )
+        for heads in (2, 4, 8)
+    ),
+)
+MODELS = {model.name: model for model in _MODELS}
 
 
 def find_model(name: str) -> Model:
-    """Return the model of a name.
-
-    Raises:
-        UsageError: no model has the name.
-    """
+    """Return the model of a name; raises UsageError where there is none."""
     if name not in MODELS:
         raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}")
     return MODELS[name]
 
 
 def require_torch(model: str) -> None:
-    """Refuse to go on without torch, with the command that installs it.
-
-    Raises:
-        MissingExtraError: torch is not installed.
-    """
+    """Raise MissingExtraError, with the command that installs torch, where torch is missing."""
     if find_spec("torch") is None:
         raise MissingExtraError(
             f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"'

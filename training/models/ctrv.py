@@ -18,19 +18,16 @@ LEAST_SPEED_MPS = 2.0
 class ConstantTurnRate:
     """Continues with the last speed and yaw rate.
 
-    Speed and heading are those of the last 0.2 s, as in the model `constant-velocity`: without a turn the two predict
-    the same. The yaw rate is the angle between the displacements of the last second and the second before, per second.
-    Recorded positions are noisy, and the noise of an acceleration across the road got from three positions so far apart
-    falls with the square of the time between them: sqrt(6) x 0.1 m / (1 s)^2 = 0.24 m/s2, which is 3 m after 5 s;
-    over half a second it would be 12 m. Below 2 m/s the direction of a displacement of 2 m shows no turn.
+    Speed and heading are those of the last 0.2 s, as in `constant-velocity`. The yaw rate is the angle between the
+    displacements of the last second and the second before, per second; noise of 0.1 m then makes an acceleration across
+    the road of sqrt(6) x 0.1 m / (1 s)^2 = 0.24 m/s2, 3 m after 5 s (over half a second it would be 12 m).
 
-    Every chord of a circle of the same duration is the one before, turned, so that a position ahead follows from the
-    last chord d of duration s without any heading: at time t it is t sinc(w t / 2) / (s sinc(w s / 2)) times d, turned
+    From the last chord d of duration s, the position at time t is t sinc(w t / 2) / (s sinc(w s / 2)) times d, turned
     by w (t + s) / 2, where w is the yaw rate and sinc(a) = sin(a) / a. This is the closed form of Schubert, Richter and
     Wanielik 2008, written so that w = 0 is no special case.
 
-    On the public excerpt of US-101 it is worse than constant velocity (after 5 s the RMSE is 18 % larger): on a freeway
-    vehicles hardly turn, and the turn in their positions is mostly noise.
+    On the public excerpt of US-101 its RMSE after 5 s is 18 % larger than constant velocity's: on a freeway vehicles
+    hardly turn, and the turn in their positions is mostly noise.
     """
 
     def __init__(self, protocol: Protocol) -> None:

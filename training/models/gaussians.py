@@ -1,12 +1,10 @@
 """Bivariate normal densities of positions, read from five numbers of a network, and their likelihood.
 
 A negative log likelihood here is the negative logarithm of the density in nats, with every constant, of positions in
-metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`. In training and in
-evaluation (`training.evaluation.densities`, which also mixes alternatives) it is the same. The code published with
-convolutional social pooling differs in two places, neither repeated here: the branch of its test that mixes
-maneuvers halves the second axis's square and the term between the axes twice, and what it subtracts to turn a density
-per square foot into one per square metre is 0.516, the decimal logarithm of 3.2808, where it should be 2 ln 3.2808 =
-2.376.
+metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`, in training as in
+evaluation (`training.evaluation.densities`). The code published with convolutional social pooling differs in two
+places: where its test mixes maneuvers, the second axis's square and the term between the axes are halved twice; and to
+turn a density per square foot into one per square metre it subtracts 0.516 = lg 3.2808 instead of 2 ln 3.2808 = 2.376.
 """
 
 import math
@@ -24,25 +22,16 @@ Gaussian = tuple[Tensor, Tensor, Tensor]
 """Mean (..., F, 2) in m, sigma (..., F, 2) in m, and rho (..., F)."""
 
 SIGMA_LIMITS_M = (0.01, 1000.0)
-"""Least and largest standard deviation, in m. Positions are recorded to the centimetre: a narrower density would
-describe their rounding, and that of a vehicle at a standstill would have no bound."""
-
+"""Least and largest standard deviation, in m; positions are recorded to the centimetre."""
 CORRELATION_LIMIT = 0.999
 """Largest absolute correlation; beyond it 1 - rho^2 loses its digits in single precision."""
 
 
 def to_gaussian(raw: Tensor) -> Gaussian:
-    """Read five numbers as a bivariate normal density.
+    """Read five numbers (..., 5) as mean (..., 2) in m, sigma (..., 2) in m, and rho (...) of a density.
 
     As published (Graves 2013, and convolutional social pooling's code): two means, the logarithms of 1 / sigma, and rho
-    before its tanh. Beyond SIGMA_LIMITS_M and CORRELATION_LIMIT the value stays at the limit; the gradient passes where
-    a step against it leads back inside, so that nothing is stuck there.
-
-    Args:
-        raw: (..., 5).
-
-    Returns:
-        mean (..., 2) in m, sigma (..., 2) in m, and rho (...).
+    before its tanh. Values stay within SIGMA_LIMITS_M and CORRELATION_LIMIT (`keep_within`).
     """
     least, most = SIGMA_LIMITS_M
     log_precision = keep_within(raw[..., 2:4], -math.log(most), -math.log(least))
@@ -51,29 +40,20 @@ def to_gaussian(raw: Tensor) -> Gaussian:
 
 
 def gaussian_nll(mean: Tensor, sigma: Tensor, rho: Tensor, future: Tensor, mask: Tensor) -> Tensor:
-    """Return () the mean negative log density in nats over the known positions; 0 where none is known.
+    """Return () the mean negative log density in nats of futures (..., F, 2) in m where `mask` (..., F) is True.
 
-    Args:
-        mean: (..., F, 2) in m.
-        sigma: (..., F, 2) in m, above 0.
-        rho: (..., F) within (-1, 1).
-        future: (..., F, 2) in m; masked positions are ignored.
-        mask: (..., F) True where the position is known.
+    It is 0 where no position is known. Masked positions are ignored.
     """
     away = torch.where(mask[..., None], future - mean, 0.0) / sigma
-    nll = torch.where(mask, -_log_density(away, sigma, rho), 0.0)
-    return nll.sum() / mask.sum().clamp(min=1)
+    along, across = away[..., 0], away[..., 1]
+    rest = (1 - rho) * (1 + rho)
+    distance = (along**2 + across**2 - 2 * rho * along * across) / rest
+    log_density = -0.5 * (distance + torch.log(rest)) - torch.log(sigma).sum(dim=-1) - math.log(2 * math.pi)
+    return torch.where(mask, -log_density, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 def to_density(mean: Tensor, sigma: Tensor, rho: Tensor, weight: Tensor | None = None) -> Density:
-    """Convert tensors to the density of a prediction.
-
-    Args:
-        mean: (B, A, F, 2) in m; without weights (B, F, 2), of the one alternative.
-        sigma: standard deviations of the same shape.
-        rho: correlations of the same shape but for the last axis.
-        weight: (B, A) probabilities of the alternatives.
-    """
+    """Convert mean and sigma (B, A, F, 2), rho (B, A, F) and weight (B, A); without weights, there is no axis A."""
     if weight is None:
         weight, mean, sigma, rho = mean.new_ones((len(mean), 1)), mean[:, None], sigma[:, None], rho[:, None]
     return Density(*(to_numpy(part) for part in (weight, mean, sigma, rho)))
@@ -83,14 +63,6 @@ def keep_within(value: Tensor, low: float, high: float) -> Tensor:
     """Clamp values; the gradient is dropped only where a step against it would lead further out."""
     clamp: Callable[..., Tensor] = _Within.apply
     return clamp(value, low, high)
-
-
-def _log_density(away: Tensor, sigma: Tensor, rho: Tensor) -> Tensor:
-    """Return the log density (...) of distances in standard deviations (..., 2)."""
-    along, across = away[..., 0], away[..., 1]
-    rest = (1 - rho) * (1 + rho)
-    distance = (along**2 + across**2 - 2 * rho * along * across) / rest
-    return -0.5 * (distance + torch.log(rest)) - torch.log(sigma).sum(dim=-1) - math.log(2 * math.pi)
 
 
 class _Within(Function):

@@ -14,34 +14,20 @@ from tracklake.training.models import Reads
 
 NEAREST = 10
 """Most vehicles around the ego in a scene (Kim et al. 2020 train with the nearest ten)."""
+Inputs = tuple[Observed[Any] | ObservedScene[Any], Truth[Any]]
 
 
-def read_samples(
-    folder: TensorFolder, samples: npt.ArrayLike, reads: Reads, *, nearest: int = NEAREST
-) -> tuple[Observed[Any] | ObservedScene[Any], Truth[Any]]:
-    """Read samples by their numbers (B,), in any order, as NumPy arrays.
+def read_samples(folder: TensorFolder, samples: npt.ArrayLike, reads: Reads, *, nearest: int = NEAREST) -> Inputs:
+    """Read samples by their numbers (B,) in any order, 0 <= number < S (else IndexError), as NumPy arrays.
 
-    Args:
-        folder: tensors to read from.
-        samples: numbers of samples.
-        reads: `grid` or `scene`.
-        nearest: most vehicles around the ego of a scene; V = 1 + nearest.
-
-    Raises:
-        IndexError: a number is below 0 or not below S.
+    A scene has V = 1 + nearest vehicles.
     """
-    if reads == "grid":
-        return part_batch(folder.gather(samples))
-    return gather_nearest(folder, samples, nearest=nearest)
+    return part_batch(folder.gather(samples)) if reads == "grid" else gather_nearest(folder, samples, nearest=nearest)
 
 
-def read_on_device(
-    folder: DeviceFolder, samples: Array, reads: Reads
-) -> tuple[Observed[Any] | ObservedScene[Any], Truth[Any]]:
+def read_on_device(folder: DeviceFolder, samples: Array, reads: Reads) -> Inputs:
     """Read samples by their numbers (B,) int64 on a device, as tensors there; otherwise as `read_samples`."""
-    if reads == "grid":
-        return part_batch(gather_samples(folder, samples))
-    return gather_vehicles(folder, samples, NEAREST)
+    return part_batch(gather_samples(folder, samples)) if reads == "grid" else gather_vehicles(folder, samples, NEAREST)
 
 
 def truth_of_ego(truth: Truth[Any]) -> Truth[Any]:

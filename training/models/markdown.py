@@ -24,12 +24,10 @@ def write_models() -> str:
 def _describe(model: Model) -> str:
     """Return the section of one model."""
     lines = [f"## {model.name}", "", f"{model.meaning[0].upper()}{model.meaning[1:]}.", ""]
-    lines.append(f"- source: {model.source or 'ours'}")
-    lines.append(f"- reads: {'the grid' if model.reads == 'grid' else 'the scene'}")
+    lines += [f"- source: {model.source or 'ours'}", f"- reads: the {model.reads}"]
     if model.parameters:
         lines.append(f"- parameters: {', '.join(f'`{name}` = {value}' for name, value in model.parameters.items())}")
-    recipe = model.recipe
-    if recipe is not None:
+    if (recipe := model.recipe) is not None:
         phases = ", then ".join(f"{phase.epochs} epochs of `{phase.loss}`" for phase in recipe.phases)
         lines.append(
             f"- recipe: {phases}; batches of {recipe.batch_size}, {recipe.optimizer} at {recipe.learning_rate:g} "

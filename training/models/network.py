@@ -1,4 +1,4 @@
-"""The interface of the torch networks that the training loop trains, and their way to a prediction."""
+"""The interface of the torch networks, what residual networks add to, and what their losses share."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -8,7 +8,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.models.constant_velocity import extrapolate, velocity_ticks
 from tracklake.training.models.prediction import Prediction
 
 Result = TypeVar("Result")
@@ -23,15 +25,12 @@ class Network(nn.Module):
         return next(self.parameters()).device
 
     def loss(self, observed: Any, truth: Truth[Tensor], phase: str) -> Tensor:  # noqa: ANN401  (Observed or ObservedScene of tensors)
-        """Return () the loss over all B samples.
+        """Return () the loss over all B samples; raises ValueError on a phase that is no loss of the network.
 
         Args:
             observed: `Observed` or `ObservedScene`, as the registry's `reads` says.
             truth: futures and maneuvers; no other method of a model gets them.
             phase: the recipe's `Phase.loss`.
-
-        Raises:
-            ValueError: no such phase.
         """
         raise NotImplementedError
 
@@ -44,12 +43,7 @@ class Network(nn.Module):
         return self.infer(observed, self.predict_tensors)
 
     def infer(self, observed: Any, function: Callable[[Any], Result]) -> Result:  # noqa: ANN401  (as above)
-        """Call a function with tensors on the weights' device, without gradients and in evaluation mode.
-
-        Args:
-            observed: `Observed` or `ObservedScene` of NumPy arrays.
-            function: called with the same of tensors.
-        """
+        """Call a function with NumPy inputs as tensors on the weights' device, in evaluation mode without gradients."""
         trained = self.training
         self.eval()
         try:
@@ -72,12 +66,28 @@ class PlaceNetwork(Network):
         return Prediction(position_m=to_numpy(self(observed.history)))
 
 
-def check_phase(phase: str, *known: str) -> None:
-    """Refuse a loss that a model does not have.
+class Straight(nn.Module):
+    """The fixed positions that a network's outputs are added to; nothing in it is learned.
 
-    Raises:
-        ValueError: no such phase.
+    Residual: constant velocity, so that a network is left with braking, accelerating and changing lanes, and an error
+    of 1 % of the distance driven costs it nothing. Otherwise the sample's last position, as published.
     """
+
+    def __init__(self, protocol: Protocol, *, residual: bool) -> None:
+        super().__init__()
+        self.ticks = velocity_ticks(protocol)
+        steps = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)
+        self.steps: Tensor
+        self.register_buffer("steps", steps if residual else torch.zeros_like(steps), persistent=False)
+
+    def forward(self, history: Tensor) -> Tensor:
+        """Return (..., F, 2) in m relative to the last position of histories (..., H, 2)."""
+        positions: Tensor = extrapolate(history, self.ticks, self.steps)
+        return positions
+
+
+def check_phase(phase: str, *known: str) -> None:
+    """Raise ValueError where a model has no loss of a phase."""
     if phase not in known:
         raise ValueError(f"unknown phase `{phase}` of training: expected one of {', '.join(known)}")
 

@@ -1,4 +1,4 @@
-"""Convolutional social pooling, with and without maneuvers (Deo and Trivedi 2018)."""
+"""Convolutional social pooling, with and without maneuvers, and without neighbors (Deo and Trivedi 2018)."""
 
 import torch
 from torch import Tensor, nn
@@ -8,15 +8,52 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
-from tracklake.training.models.network import Network, check_phase, mean_squared_distance, to_numpy
+from tracklake.training.models.network import Network, Straight, check_phase, mean_squared_distance, to_numpy
 from tracklake.training.models.prediction import Prediction
-from tracklake.training.models.social_grid import fill_grid, pool_densely, pool_sparsely
-from tracklake.training.models.straight import Straight
 
 SLOPE = 0.1
 """Slope of the leaky ReLUs where the input is negative."""
-
+ROWS, COLUMNS = 13, 3
+"""Rows of the grid along the road (0 hindmost), and its columns: left, own and right lane."""
+KERNEL = 3
+"""Rows of the grid that each convolution's kernel covers."""
 LATERAL, LONGITUDINAL = len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS)
+
+
+class VanillaLstm(Network):
+    """Embeds H positions in m (32), encodes them (LSTM, 64), embeds that (32), and unrolls F steps (LSTM, 128).
+
+    Every step gets the same encoding and puts out the five numbers of a bivariate normal density
+    (`training.models.gaussians`). Sizes and activations are those of convolutional social pooling (Deo and Trivedi
+    2018), without the social tensor and its layers.
+    """
+
+    def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
+        super().__init__()
+        self.steps = protocol.horizon_ticks
+        self.straight = Straight(protocol, residual=residual)
+        self.embedding = nn.Linear(2, 32)
+        self.encoder = nn.LSTM(32, 64, batch_first=True)
+        self.dynamics = nn.Linear(64, 32)
+        self.decoder = nn.LSTM(32, 128, batch_first=True)
+        self.out = nn.Linear(128, 5)
+
+    def forward(self, history: Tensor) -> Gaussian:
+        """Return the density after a history (B, H, 2): mean (B, F, 2) relative to the last position, sigma, rho."""
+        _, (state, _) = self.encoder(leaky_relu(self.embedding(history), SLOPE))
+        encoding = leaky_relu(self.dynamics(state[-1]), SLOPE)  # (B, 32)
+        decoded, _ = self.decoder(encoding[:, None, :].expand(-1, self.steps, -1))  # (B, F, 128)
+        mean, sigma, rho = to_gaussian(self.out(decoded))
+        return self.straight(history) + mean, sigma, rho
+
+    def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
+        """Return () in phase `mse` the mean squared distance in m2, in phase `nll` the mean NLL in nats."""
+        return _find_loss(self(observed.history), truth, phase)
+
+    def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
+        """Return the means and their density, of one alternative."""
+        mean, sigma, rho = self(observed.history)
+        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
 
 
 class SocialPooling(Network):
@@ -24,15 +61,13 @@ class SocialPooling(Network):
 
     Layers, sizes and names of the weights are those of the published code: positions in m are embedded (32) and encoded
     by one LSTM for all vehicles (64). The neighbors' last hidden states are put into a 13 x 3 grid, which passes a
-    3 x 3 convolution (64), a 3 x 1 convolution (16) and a max pool of 2 rows (see `training.models.social_grid`): 80
-    numbers. The vehicle's own last state is embedded (32). Both together, 112 numbers, are the input of the decoder
-    (LSTM, 128) at every step; each step puts out the five numbers of a bivariate normal density
-    (`training.models.gaussians`).
+    3 x 3 convolution (64), a 3 x 1 convolution (16) and a max pool of 2 rows: 80 numbers. The vehicle's own last state
+    is embedded (32). Both together, 112 numbers, are the input of the decoder (LSTM, 128) at every step; each step puts
+    out the five numbers of a bivariate normal density (`training.models.gaussians`).
 
     With maneuvers, two heads give the probabilities of the 3 lateral and 2 longitudinal maneuvers from the 112 numbers,
-    and the decoder also gets one maneuver of each kind, one-hot: in training the true one, which only `loss` knows; in
-    prediction all six combinations, whose weights are the products of the probabilities. Alternative
-    2 * lateral + longitudinal, positions in LATERAL_MANEUVERS and LONGITUDINAL_MANEUVERS.
+    and the decoder also gets one of each kind, one-hot: in training the true one; in prediction all six combinations
+    (2 * lateral + longitudinal), whose weights are the products of the probabilities.
 
     Differences from the published code: metres, with the axis along the road first; a neighbor with a short history is
     encoded with its earliest known position repeated, where the published reader leaves its cell empty; the
@@ -71,13 +106,50 @@ class SocialPooling(Network):
         positions = torch.cat([observed.history, observed.neighbor_history]).transpose(0, 1)  # (H, B + K, 2)
         _, (hidden, _) = self.enc_lstm(leaky_relu(self.ip_emb(positions), SLOPE))
         own, neighbors = hidden[-1][:samples], hidden[-1][samples:]  # (B, 64), (K, 64)
-        sample, cell = observed.neighbor_sample.long(), observed.neighbor_cell.long()
-        if self.sparse:
-            social = pool_sparsely(self.soc_conv, self.conv_3x1, SLOPE, neighbors, sample, cell, samples)
-        else:
-            grid = fill_grid(neighbors, sample, cell, samples)
-            social = pool_densely(self.soc_conv, self.conv_3x1, self.soc_maxpool, SLOPE, grid)
+        pool = self._pool_sparsely if self.sparse else self._pool_densely
+        social = pool(neighbors, observed.neighbor_sample.long(), observed.neighbor_cell.long(), samples)
         return torch.cat([social, leaky_relu(self.dyn_emb(own), SLOPE)], dim=1)
+
+    def _pool_densely(self, states: Tensor, sample: Tensor, cell: Tensor, samples: int) -> Tensor:
+        """Return (B, 80) of neighbors' states (K, 64), positions in the batch (K,), and cells 13 * column + row (K,).
+
+        Rows along the road are the image's height and lanes its width, as published: the 3 x 3 convolution sees three
+        rows of all three lanes, and leaves one column.
+        """
+        grid = states.new_zeros(samples * ROWS * COLUMNS, states.shape[1])
+        grid = grid.index_copy(0, sample * ROWS * COLUMNS + cell, states)  # zeros in empty cells
+        grid = grid.view(samples, COLUMNS, ROWS, states.shape[1]).permute(0, 3, 2, 1)  # (B, 64, 13, 3)
+        features = leaky_relu(self.conv_3x1(leaky_relu(self.soc_conv(grid), SLOPE)), SLOPE)  # (B, 16, 9, 1)
+        pooled: Tensor = self.soc_maxpool(features)  # (B, 16, 5, 1)
+        return pooled.flatten(start_dim=1)
+
+    def _pool_sparsely(self, states: Tensor, sample: Tensor, cell: Tensor, samples: int) -> Tensor:
+        """Compute `_pool_densely` from occupied cells only, a quarter of all or fewer: 15 % less time per step.
+
+        A neighbor in row r enters the outputs r - 2, r - 1 and r of the first convolution; those below 0 and above 10
+        do not exist and are dropped.
+        """
+        column, row = cell // ROWS, cell % ROWS
+        by_column = torch.argsort(column, stable=True)
+        counts = torch.bincount(column, minlength=COLUMNS).tolist()
+        weight, bias = self.soc_conv.parameters()
+        depth = self.soc_conv.out_channels
+        kernels = weight.permute(3, 1, 2, 0).reshape(COLUMNS, -1, KERNEL * depth)  # one for each column
+        parts = [part @ kernel for part, kernel in zip(torch.split(states[by_column], counts), kernels, strict=True)]
+
+        span = ROWS + KERNEL - 1  # outputs -2 to 12
+        output = (sample * span + row + KERNEL - 1)[by_column]  # where the kernel's row 0 adds to: the output r
+        target = output[:, None] - torch.arange(KERNEL, device=cell.device)
+        features = bias.expand(samples * span, depth).index_add(0, target.flatten(), torch.cat(parts).view(-1, depth))
+        features = leaky_relu(features.view(samples, span, depth)[:, KERNEL - 1 : ROWS], SLOPE)  # (B, 11, 64)
+
+        height = ROWS - 2 * (KERNEL - 1)  # 9
+        windows = torch.cat([features[:, at : at + height] for at in range(KERNEL)], dim=2)  # (B, 9, 3 * 64)
+        weight, bias = self.conv_3x1.parameters()
+        kernel = weight[..., 0].permute(2, 1, 0).flatten(end_dim=1)  # (3 * 64, 16)
+        features = leaky_relu(windows @ kernel + bias, SLOPE)
+        pairs = torch.maximum(features[:, 1::2], features[:, 2::2])  # the pool's padding leaves row 0 by itself
+        return torch.cat([features[:, :1], pairs], dim=1).transpose(1, 2).flatten(start_dim=1)
 
     def decode(self, encoding: Tensor) -> Tensor:
         """Return the raw numbers (N, F, 5) of encodings (N, 112), with maneuvers (N, 117)."""
@@ -88,23 +160,17 @@ class SocialPooling(Network):
     def loss(self, observed: Observed[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
         """Return () in phase `mse` the mean squared distance in m2, in phase `nll` the mean NLL in nats.
 
-        With maneuvers both are those of the true one's density, and `nll` adds the mean cross-entropies in nats of the
-        lateral and the longitudinal maneuver.
+        With maneuvers both are the true one's, and `nll` adds the mean cross-entropies of both kinds in nats.
         """
-        check_phase(phase, "mse", "nll")
         encoding = self.encode(observed)
         lateral, longitudinal = truth.lateral.long(), truth.longitudinal.long()
         decoded = encoding
         if self.maneuvers:
             decoded = torch.cat([encoding, _encode_maneuvers(lateral, longitudinal, encoding)], dim=1)
-        mean, sigma, rho = self._to_gaussian(self.decode(decoded), observed.history)
-        if phase == "mse":
-            return mean_squared_distance(mean, truth.future, truth.future_mask)
-        loss = gaussian_nll(mean, sigma, rho, truth.future, truth.future_mask)
-        if self.maneuvers:
-            heads = (self.op_lat(encoding), lateral), (self.op_lon(encoding), longitudinal)
-            for logits, true in heads:
-                loss = loss + cross_entropy(logits, true, reduction="sum") / max(len(true), 1)
+        loss = _find_loss(self._to_gaussian(self.decode(decoded), observed.history), truth, phase)
+        if self.maneuvers and phase == "nll":
+            for head, true in ((self.op_lat, lateral), (self.op_lon, longitudinal)):
+                loss = loss + cross_entropy(head(encoding), true, reduction="sum") / max(len(true), 1)
         return loss
 
     def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
@@ -117,10 +183,8 @@ class SocialPooling(Network):
         weight = (lateral[:, :, None] * longitudinal[:, None, :]).flatten(start_dim=1)  # (B, 6)
         alternative = torch.arange(LATERAL * LONGITUDINAL, device=encoding.device)
         chosen = _encode_maneuvers(alternative // LONGITUDINAL, alternative % LONGITUDINAL, encoding)  # (6, 5)
-        decoded = torch.cat(
-            [encoding.repeat_interleave(len(chosen), dim=0), chosen.repeat(len(encoding), 1)], dim=1
-        )  # (B * 6, 117)
-        raw = torch.unflatten(self.decode(decoded), 0, (len(encoding), len(chosen)))  # (B, 6, F, 5)
+        pairs = encoding.repeat_interleave(len(chosen), dim=0), chosen.repeat(len(encoding), 1)
+        raw = torch.unflatten(self.decode(torch.cat(pairs, dim=1)), 0, (len(encoding), len(chosen)))  # (B, 6, F, 5)
         mean, sigma, rho = self._to_gaussian(raw, observed.history[:, None])
         likeliest = mean[torch.arange(len(mean), device=mean.device), weight.argmax(dim=1)]
         density = to_density(mean, sigma, rho, weight)
@@ -132,7 +196,14 @@ class SocialPooling(Network):
         return self.straight(history) + mean, sigma, rho
 
 
+def _find_loss(gaussian: Gaussian, truth: Truth[Tensor], phase: str) -> Tensor:
+    """Return () the mean squared distance in m2 (`mse`) or the mean NLL in nats (`nll`) of a density."""
+    check_phase(phase, "mse", "nll")
+    if phase == "mse":
+        return mean_squared_distance(gaussian[0], truth.future, truth.future_mask)
+    return gaussian_nll(*gaussian, truth.future, truth.future_mask)
+
+
 def _encode_maneuvers(lateral: Tensor, longitudinal: Tensor, like: Tensor) -> Tensor:
     """Return (N, 5) one-hot maneuvers, 3 lateral and 2 longitudinal, of their positions (N,), (N,)."""
-    both = one_hot(lateral, LATERAL), one_hot(longitudinal, LONGITUDINAL)
-    return torch.cat(both, dim=1).to(like.dtype)
+    return torch.cat([one_hot(lateral, LATERAL), one_hot(longitudinal, LONGITUDINAL)], dim=1).to(like.dtype)

@@ -10,8 +10,7 @@ import numpy as np
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Model
-from tracklake.training.models.recipes import Recipe
+from tracklake.training.models import Model, Recipe
 from tracklake.training.runs.run_folder import describe_run
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ NUMBERS = ("seconds", "learning_rate", "max_gradient_norm", "checkpoint_s")
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a training; those left out are the model's recipe (`training.models.recipes`).
+    """Settings of a training; those left out are the model's recipe (`training.models.Recipe`).
 
     At most one of `seconds`, `steps` and `epochs` is given. The recipe's phases share it in proportion to their epochs.
 

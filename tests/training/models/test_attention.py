@@ -14,9 +14,8 @@ from wandering_scenes import change, pad, reorder, wander
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
-from tracklake.training.models.attention_layers import MultiHeadAttention
+from tracklake.training.models.attention import MultiHeadAttention, describe_vehicles
 from tracklake.training.models.constant_velocity import velocity_ticks
-from tracklake.training.models.scene_features import describe_vehicles
 
 H, F = CSP.history_ticks, CSP.horizon_ticks
 TEN_HZ = replace(CSP, rate_hz=10)
@@ -290,7 +289,7 @@ def test_gradients_are_finite_where_a_prediction_hits_and_where_nothing_is_known
 
 
 def test_dropout_is_of_what_is_added_and_only_in_training():
-    layer = MultiHeadAttention(16, 16, heads=2, head_width=8, dropout=1.0, epsilon=1e-6)
+    layer = MultiHeadAttention(16, 16, heads=2, head_width=8, dropout=1.0)
     rows, present = torch.randn(3, 4, 16, generator=torch.Generator().manual_seed(1)), torch.ones(3, 4, dtype=bool)
     dropped, _ = layer(rows, rows, present)
     spread = rows.var(dim=-1, correction=0, keepdim=True)

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
-from tracklake.training.models.straight import Straight
+from tracklake.training.models.network import Straight
 
 LONE = ("lstm", "v-lstm", "stacked-lstm", "lstm-encoder-decoder")
 RESIDUAL = tuple(name for name in LONE if "residual" in MODELS[name].parameters)

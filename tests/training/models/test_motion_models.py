@@ -13,8 +13,8 @@ from scipy.stats import multivariate_normal
 
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
+from tracklake.training.models.constant_velocity import ACCELERATION_M2PS3, MEASUREMENT_M, KalmanConstantVelocity
 from tracklake.training.models.ctrv import ConstantTurnRate
-from tracklake.training.models.kalman import ACCELERATION_M2PS3, MEASUREMENT_M, KalmanConstantVelocity
 
 PROTOCOLS = (CSP, TWO_SECONDS)
 UNTAUGHT = [name for name, model in MODELS.items() if not model.learns]
