@@ -18,14 +18,20 @@ from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Model, Predictor, find_model, require_torch
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.checkpoint import read_checkpoint, refuse_other_run, restore, save_checkpoint
+from tracklake.training.runs.checkpoint import (
+    CHECKPOINT_FILE,
+    claim_folder,
+    read_checkpoint,
+    refuse_other_run,
+    refuse_wrong_start,
+    restore,
+    save_checkpoint,
+)
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
 from tracklake.training.runs.loader import Read, load_batches, make_reader
-from tracklake.training.runs.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, open_log
 from tracklake.training.runs.memory import keep_freed_memory
+from tracklake.training.runs.progress import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, TrainingState, open_log
 from tracklake.training.runs.run_folder import describe_run, save_run
-from tracklake.training.runs.state import TrainingState
-from tracklake.training.runs.unfinished import CHECKPOINT_FILE, claim_folder, refuse_wrong_start
 
 if TYPE_CHECKING:
     import torch
@@ -71,8 +77,7 @@ def train(
             logs are in a hidden folder beside it.
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
         progress: called after every step.
-        resume: True: resume from the checkpoint; False: start over, whatever there is; None: start, unless there is a
-            checkpoint, which would be lost.
+        resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
 
     Returns:
         Content of `metrics.json`: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
@@ -97,7 +102,8 @@ def train(
         checkpoint = unfinished / CHECKPOINT_FILE
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
         plan = make_plan(entry, folder, config or started_with)
-        run = plan.describe()
+        settings = vars(plan.config) | {"parameters": dict(plan.config.parameters)}
+        run = describe_run(model, plan.parameters, settings, folder, plan.recipe)
         if stored:
             refuse_other_run(checkpoint, stored["run"], run)
         else:
@@ -155,7 +161,7 @@ def _fit(
                 if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
                 phase = plan.recipe.phase_at(spent, plan.budget)
-                if not state.phases or state.phases[-1][0] != phase.loss:
+                if not state.phases or state.phase != phase.loss:
                     _log_steps(plan, state, optimizer, log_steps)  # a row is of one phase
                     state.begin_phase(phase.loss)
                 _take_step(plan, state, network, optimizer, batches, spent)
@@ -224,7 +230,7 @@ def _take_step(
     state.reading_s += time.perf_counter() - start
     for group in optimizer.param_groups:
         group["lr"] = plan.learning_rate(spent)
-    loss = network.loss(observed, truth, state.phases[-1][0])
+    loss = network.loss(observed, truth, state.phase)
     optimizer.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(network.parameters(), plan.recipe.max_gradient_norm)
@@ -256,7 +262,7 @@ def _isolate_torch(plan: Plan) -> Iterator[None]:
 def _hold_interrupts() -> Iterator[list[int]]:
     """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second Ctrl-C does not wait.
 
-    Where the process handles the signal itself, or this is not the main thread, it is left as it is.
+    Left to the process where it handles the signal itself, or outside the main thread.
     """
     pressed: list[int] = []
 
@@ -282,7 +288,7 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
     """Return the loss, or raise DivergedError where it is not finite."""
     if not math.isfinite(loss):
         raise DivergedError(
-            f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phases[-1][0]}`: train with a learning "
+            f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phase}`: train with a learning "
             f"rate below {plan.recipe.learning_rate:g} (`--set learning_rate=...`), and check the tensors' positions"
         )
     return loss
@@ -290,7 +296,7 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
 
 def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read) -> Row:
     """Validate where there is patience, keep the weights if they are the best, and return a row of epochs.csv."""
-    epoch, phase = (state.step - 1) // plan.epoch_steps, state.phases[-1][0]
+    epoch, phase = (state.step - 1) // plan.epoch_steps, state.phase
     losses = state.losses[max(epoch * plan.epoch_steps, state.phases[-1][1]) :]  # of one phase, to be comparable
     row: Row = {"epoch": epoch, "step": state.step, "phase": phase, "seconds": round(state.elapsed_s, 3)}
     row |= {"loss": sum(losses) / len(losses), "validation_loss": None, "best": None}
@@ -329,7 +335,7 @@ def _log_steps(
         return
     state.logged = (state.step, state.samples, state.stepping_s, state.reading_s)
     took_s = state.stepping_s - stepping_s
-    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phases[-1][0]}
+    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phase}
     row |= {"seconds": round(state.elapsed_s, 3), "loss": sum(state.losses[step:]) / (state.step - step)}
     row |= {"learning_rate": optimizer.param_groups[0]["lr"]}
     row |= {"samples_per_s": round((state.samples - samples) / took_s, 1)}
@@ -337,24 +343,17 @@ def _log_steps(
 
 
 def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:
-    """Describe a finished training for `metrics.json`, without its evaluation.
-
-    Returns:
-        model; train_samples, in the part; weights, number of learned numbers; seconds, of the loop; steps;
-        samples_seen, in all steps; samples_per_s and data_share, of the steps' time (reading included) and the share of
-        it that reading took; phases (loss, steps, and loss_first and loss_last, its mean over their first and last
-        twentieth); best (epoch and validation_loss of the weights that were kept; null without patience).
-    """
+    """Describe a finished training for `metrics.json`, without its evaluation."""
     best = {"epoch": state.best_epoch, "validation_loss": state.best_loss}
     return {
         "model": plan.entry.name,
-        "train_samples": len(plan.train),
+        "train_samples": len(plan.train),  # in the part
         "weights": sum(weight.numel() for weight in network.parameters()),
-        "seconds": round(state.elapsed_s, 3),
+        "seconds": round(state.elapsed_s, 3),  # in the loop
         "steps": state.step,
-        "samples_seen": state.samples,
-        "samples_per_s": round(state.samples / state.stepping_s, 1),
+        "samples_seen": state.samples,  # in all steps
+        "samples_per_s": round(state.samples / state.stepping_s, 1),  # reading included
         "data_share": round(state.reading_s / state.stepping_s, 4),
         "phases": state.describe_phases(),
-        "best": best if state.best_loss is not None else None,
+        "best": best if state.best_loss is not None else None,  # of the weights that were kept; null without patience
     }

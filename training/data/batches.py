@@ -1,8 +1,27 @@
-"""Batches of samples and of whole scenes: names, shapes, units and order of their arrays."""
+"""Batches of samples and of whole scenes: names, shapes, units and order of their arrays, and how they are gathered."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from tracklake.training.data.namespaces import Array
+import numpy as np
+import numpy.typing as npt
+
+from tracklake.schemas.arrays import Bytes, Integers
+from tracklake.training.data.positions import (
+    Array,
+    Folder,
+    cast,
+    expand_groups,
+    find_runs,
+    locate_rows,
+    read_future,
+    read_history,
+    to_absolute,
+    to_relative,
+)
+
+if TYPE_CHECKING:
+    from tracklake.training.data.tensor_folder import TensorFolder
 
 
 @dataclass(frozen=True)
@@ -98,3 +117,79 @@ class SceneBatch:
     def __len__(self) -> int:
         """Return the number of scenes, B."""
         return len(self.scene)
+
+
+def gather_samples(folder: Folder, sample: Array, *, absolute: bool = False) -> Batch:
+    """Read samples by their numbers (B,) int64, in any order; the arrays are of the folder's kind and device."""
+    row = cast(folder.sample_row[sample], "int64")
+    pair, owner = expand_groups(folder.neighbor_offset, sample)
+    neighbor_row = cast(folder.neighbor_row[pair], "int64")
+    history, _ = read_history(folder, row, row + 1 - folder.protocol.history_ticks)  # complete by definition
+    future, future_mask = read_future(folder, row, row + cast(folder.sample_future[sample], "int64"))
+    neighbor_first = neighbor_row + 1 - cast(folder.neighbor_known[pair], "int64")
+    neighbor_history, neighbor_mask = read_history(folder, neighbor_row, neighbor_first)
+    if absolute:
+        history, future = to_absolute(folder, history, row), to_absolute(folder, future, row)
+        neighbor_history = to_absolute(folder, neighbor_history, neighbor_row)
+    else:
+        origin = folder.position_m[row]
+        history, future = to_relative(folder, history, origin), to_relative(folder, future, origin)
+        neighbor_history = to_relative(folder, neighbor_history, origin[owner])
+    return Batch(
+        sample=sample,
+        history=history,
+        future=future,
+        future_mask=future_mask,
+        neighbor_history=neighbor_history,
+        neighbor_mask=neighbor_mask,
+        neighbor_sample=owner,
+        neighbor_cell=folder.neighbor_cell[pair],
+        lateral=folder.sample_lateral[sample],
+        longitudinal=folder.sample_longitudinal[sample],
+        origin=locate_rows(folder, row),
+        absolute=absolute,
+    )
+
+
+def gather_scenes(folder: "TensorFolder", scene: Integers, *, absolute: bool = False) -> SceneBatch:
+    """Read scenes by their numbers (B,), in any order."""
+    member, vehicle_scene = expand_groups(folder.scene_offset, scene)
+    row, sample = folder.scene_row[member].astype(np.int64), folder.scene_sample[member]
+    run = find_runs(folder, row)
+    history, history_mask = read_history(folder, row, folder.run_first_row[run])
+    future, future_mask = read_future(folder, row, folder.run_first_row[run + 1] - 1)
+    if absolute:
+        history, future = to_absolute(folder, history, row), to_absolute(folder, future, row)
+    else:
+        stored = folder.position_m[row]
+        history, future = to_relative(folder, history, stored), to_relative(folder, future, stored)
+    origin, subset = locate_rows(folder, row), folder.run_subset[run]
+    lane, lanes = folder.lane[row], folder.lanes
+    known_lane = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
+    return SceneBatch(
+        scene=scene,
+        vehicle_scene=vehicle_scene,
+        vehicle_id=folder.run_vehicle_id[run],
+        sample=sample,
+        history=history,
+        history_mask=history_mask,
+        future=future,
+        future_mask=future_mask,
+        lateral=_read_maneuvers(folder.sample_lateral, sample),
+        longitudinal=_read_maneuvers(folder.sample_longitudinal, sample),
+        origin=origin,
+        speed_mps=folder.speed_mps[row],
+        lane=lane,
+        lane_offset_m=(origin[:, 1] - lanes.centre_m[subset, known_lane]).astype(np.float32),
+        lane_width_m=lanes.lane_width_m[subset, known_lane].astype(np.float32),
+        has_left=lane > 1,
+        has_right=(lane > 0) & (lane < lanes.last[subset]),
+        absolute=absolute,
+    )
+
+
+def _read_maneuvers(values: Bytes, sample: npt.NDArray[np.int32]) -> npt.NDArray[np.int8]:
+    """Return (V,) the maneuvers of vehicles that are samples, -1 for the others."""
+    found = np.full(len(sample), -1, dtype=np.int8)
+    found[sample >= 0] = values[sample[sample >= 0]]
+    return found

@@ -6,15 +6,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from tracklake.training.data.namespaces import Array, cast, count_from, find_namespace, take_columns
 from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.data.positions import (
+    Array,
     Folder,
+    cast,
     check_numbers,
+    count_from,
+    find_namespace,
     find_runs,
     locate_rows,
     read_future,
     read_history,
+    take_columns,
     to_relative,
 )
 
@@ -39,15 +43,10 @@ class NearestVehicles:
 def gather_nearest(
     folder: "TensorFolder", samples: npt.ArrayLike, *, nearest: int
 ) -> tuple[ObservedScene[Any], Truth[Any]]:
-    """Read samples (egos) with the vehicles nearest to them, as NumPy arrays.
+    """Read samples (egos, by their numbers (B,)) with the `nearest` vehicles around them, as NumPy arrays.
 
     Every vehicle of the scene counts, sample or not: whether it is one depends on its future. The nearest are those
     with the smallest distance between front centres; of two equally far the smaller id comes first.
-
-    Args:
-        folder: tensors to read from.
-        samples: (B,) numbers of samples, in any order.
-        nearest: most vehicles around the ego; V = 1 + nearest.
 
     Returns:
         What may be seen, and the truth, of every vehicle: `future` (B, V, F, 2) is relative to the EGO's last position;
@@ -89,13 +88,7 @@ def gather_vehicles(folder: Folder, sample: Array, nearest: int) -> tuple[Observ
 
 
 def find_nearest(folder: Folder, sample: Array, nearest: int) -> NearestVehicles:
-    """Find the ego and the vehicles nearest to it; the order of equal distances is that of the ids.
-
-    Args:
-        folder: tensors to read from.
-        sample: (B,) int64 numbers of samples.
-        nearest: most vehicles around the ego.
-    """
+    """Find the egos of samples (B,) int64 and the vehicles nearest to them; equal distances are ordered by id."""
     xp = find_namespace(sample)
     scene = cast(folder.scene_of_sample[sample], "int64")
     begin = folder.scene_offset[scene]

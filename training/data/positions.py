@@ -1,19 +1,62 @@
-"""Positions of rows and their histories and futures, read by indexing: NumPy arrays or torch tensors."""
+"""Positions of rows and their histories and futures, read by one gather for NumPy arrays and torch tensors."""
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Integers
-from tracklake.training.data.namespaces import Array, cast, count_from, find_namespace
+from tracklake.schemas.arrays import Integers, expand_ranges
 
 if TYPE_CHECKING:
-    from tracklake.training.data.device_folder import DeviceFolder
-    from tracklake.training.data.tensor_folder import TensorFolder
+    from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 
+Array = Any
+"""A NumPy array or a torch tensor; the arguments and results of one call are all of the same kind."""
 Folder: TypeAlias = "TensorFolder | DeviceFolder"
 """Holder of the arrays of a tensor folder, all NumPy's or all torch's."""
+
+
+def find_namespace(array: Array) -> Any:  # noqa: ANN401  (the module numpy or torch)
+    """Return the module whose functions take an array: numpy or torch."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def cast(array: Array, dtype: str) -> Array:
+    """Convert an array to a dtype by its name, which both libraries share."""
+    return array.astype(dtype) if isinstance(array, np.ndarray) else array.to(getattr(find_namespace(array), dtype))
+
+
+def count_from(first: int, end: int, like: Array) -> Array:
+    """Return first, first + 1, ... end - 1 where another array is: in memory or on its device."""
+    if isinstance(like, np.ndarray):
+        return np.arange(first, end)
+    return find_namespace(like).arange(first, end, device=like.device)
+
+
+def take_columns(array: Array, columns: Array) -> Array:
+    """Return (B, C) chosen columns of each row: those numbered by `columns` (B, C)."""
+    if isinstance(array, np.ndarray):
+        return np.take_along_axis(array, columns, axis=1)
+    return array.gather(1, columns)
+
+
+def expand_groups(offset: Array, groups: Array) -> tuple[Array, Array]:
+    """List the members of ragged groups (B,), of which group g has the members offset[g] to offset[g + 1] - 1.
+
+    Returns:
+        (K,) members, in the order of `groups`; and (K,) positions in `groups`, increasing.
+    """
+    first = offset[groups]
+    count = offset[groups + 1] - first
+    if isinstance(count, np.ndarray):
+        return expand_ranges(first, count)
+    owner = find_namespace(count).repeat_interleave(count)
+    before = count.cumsum(0) - count
+    return count_from(0, len(owner), owner) + (first - before)[owner], owner
 
 
 def check_numbers(numbers: npt.ArrayLike, count: int, what: str) -> Integers:
@@ -34,12 +77,7 @@ def find_runs(folder: Folder, row: Array) -> Array:
 
 
 def read_history(folder: Folder, row: Array, first: Array) -> tuple[Array, Array]:
-    """Read the positions of the H ticks up to rows.
-
-    Args:
-        folder: tensors to read from.
-        row: (...) rows of the last ticks.
-        first: (...) the first row known of each; ticks before it repeat its position.
+    """Read the positions of the H ticks up to rows (...); ticks before the `first` known rows repeat their position.
 
     Returns:
         (..., H, 2) positions as stored, and (..., H) True where the position is known.
@@ -49,12 +87,7 @@ def read_history(folder: Folder, row: Array, first: Array) -> tuple[Array, Array
 
 
 def read_future(folder: Folder, row: Array, last: Array) -> tuple[Array, Array]:
-    """Read the positions of the F ticks after rows.
-
-    Args:
-        folder: tensors to read from.
-        row: (...) rows of the ticks before them.
-        last: (...) the last row known of each; ticks after it repeat its position.
+    """Read the positions of the F ticks after rows (...); ticks after the `last` known rows repeat their position.
 
     Returns:
         (..., F, 2) positions as stored, and (..., F) True where the position is known.

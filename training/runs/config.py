@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -12,7 +12,6 @@ from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Model
 from tracklake.training.models.recipes import Recipe
-from tracklake.training.runs.run_folder import describe_run
 
 if TYPE_CHECKING:
     import torch
@@ -40,7 +39,7 @@ class TrainConfig:
         epochs: epochs of all phases together. None of the three = the recipe's epochs.
         samples_per_epoch: most samples of an epoch; each epoch draws its own.
         patience: epochs without a smaller loss on the part `val` after which the last phase ends; the weights with the
-            smallest loss are kept. Phases before it run their length, as their loss does not judge a model.
+            smallest loss are kept. Earlier phases run their length: their loss does not judge a model.
         batch_size: samples per step.
         learning_rate: highest learning rate of the optimiser.
         optimizer: `adam` or `adamw`.
@@ -48,10 +47,10 @@ class TrainConfig:
         max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
         parameters: parameters of the model.
         seed: seed of the weights, of the order of samples, and of dropout.
-        threads: threads of torch; None = its own choice. For networks this small a second one gains little on an idle
-            machine, and on a busy one the threads wait for each other: a step takes ten times as long.
-        device: `cpu`; or `cuda`, where batches are gathered from tensors that are there as a whole. There the seed does
-            not decide the weights bit for bit, as threads add up some sums (of pooled neighbors, for one) in any order.
+        threads: threads of torch; None = its own choice. For networks this small more gain little on an idle machine,
+            and wait for each other on a busy one: a step takes ten times as long.
+        device: `cpu`; or `cuda`, with all tensors there. There threads add up some sums in any order, so that the seed
+            does not decide the weights bit for bit.
         log_steps: steps between two rows of course.csv.
         checkpoint_s: most seconds between two checkpoints; there is also one at the end of an epoch that took a while.
     """
@@ -74,11 +73,7 @@ class TrainConfig:
     checkpoint_s: float = 60.0
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot train anything.
-
-        Raises:
-            UsageError: names the value.
-        """
+        """Raise UsageError for a value that cannot train anything."""
         for own in fields(self):
             value = getattr(self, own.name)
             if own.name in WHOLE_NUMBERS and not isinstance(value, int | None):
@@ -104,14 +99,10 @@ class Plan:
     """Constants of a training loop, which follow from model, tensor folder and settings.
 
     Args:
-        entry: the model.
-        folder: tensors to train on.
-        config: settings.
         recipe: the model's recipe with the changes of the settings.
         parameters: keywords of the model's `build`.
         train: (n,) numbers of the samples to train on.
         val: (v,) numbers of the samples to validate with.
-        device: device of the network.
     """
 
     entry: Model
@@ -155,11 +146,6 @@ class Plan:
         share = spent / self.budget
         return self.recipe.learning_rate * min(1.0, share / 0.02 + 0.05) * 0.5 * (1.0 + math.cos(math.pi * share))
 
-    def describe(self) -> dict[str, Any]:
-        """Describe model, settings and data, for `config.json` and checkpoints."""
-        settings = asdict(self.config) | {"parameters": dict(self.config.parameters)}
-        return describe_run(self.entry.name, self.parameters, settings, self.folder, asdict(self.recipe))
-
 
 def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
     """Combine model, tensor folder and settings.
@@ -185,9 +171,7 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
         )
     if config.device != "cpu" and not (config.device == "cuda" and torch.cuda.is_available()):
         raise TracklakeError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
-    device = (
-        torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device(config.device)
-    )
+    device = torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device("cpu")
     given = {name: value for name in RECIPE_SETTINGS if (value := getattr(config, name)) is not None}
     recipe = replace(entry.recipe, **given)
     return Plan(entry, folder, config, recipe, {**entry.parameters, **config.parameters}, train, val, device)

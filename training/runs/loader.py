@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from tracklake.schemas.arrays import Integers
-from tracklake.training.data.device_folder import DeviceFolder
-from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.models import Reads
 from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.runs.config import Plan

@@ -2,9 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.metadata import distributions, version
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,8 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, find_model, require_torch
-from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file
-from tracklake.training.runs.unfinished import is_unfinished
+from tracklake.training.models.recipes import Recipe
+from tracklake.training.runs.checkpoint import DamagedFileError, is_unfinished, load_weights, read_torch_file
 
 if TYPE_CHECKING:
     from torch import nn
@@ -39,25 +40,8 @@ class StaleRunError(TracklakeError):
     """A run cannot be evaluated on these tensors: it was trained for others, is unfinished, or is damaged."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """A trained run, ready to predict.
-
-    Args:
-        config: content of `config.json`.
-        predictor: the model with the trained weights.
-    """
-
-    config: dict[str, Any]
-    predictor: Predictor
-
-
 def describe_run(
-    model: str,
-    parameters: dict[str, Any],
-    config: dict[str, Any],
-    folder: TensorFolder,
-    recipe: dict[str, Any] | None = None,
+    model: str, parameters: dict[str, Any], config: dict[str, Any], folder: TensorFolder, recipe: Recipe | None = None
 ) -> dict[str, Any]:
     """Return the content of `config.json` without the versions; a model without recipe does not learn."""
     run = {
@@ -65,7 +49,7 @@ def describe_run(
         "model": model,
         "parameters": parameters,
         "training": config,
-        "recipe": recipe,
+        "recipe": recipe and asdict(recipe),
         "protocol": folder.index["protocol"],
         "split": folder.split,
         "train_subsets": sorted(folder.subsets_of("train")),
@@ -82,15 +66,10 @@ def digest_tensors(folder: TensorFolder) -> str:
 
     A training resumes on tensors of the same digest only; finished runs are evaluated without it.
     """
-
-    def list_chunks() -> Iterator[Any]:
-        yield json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
-        for array in ARRAYS:
-            data = folder.arrays[array.name].reshape(-1).view(np.uint8)
-            for first in range(0, len(data), HASHED_BYTES):
-                yield data[first : first + HASHED_BYTES]
-
-    return hash_chunks(list_chunks(), 12)
+    flat = (folder.arrays[array.name].reshape(-1).view(np.uint8) for array in ARRAYS)
+    pieces = (data[first : first + HASHED_BYTES] for data in flat for first in range(0, len(data), HASHED_BYTES))
+    index = json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
+    return hash_chunks(chain([index], pieces), 12)
 
 
 def find_versions() -> dict[str, str | None]:
@@ -99,11 +78,7 @@ def find_versions() -> dict[str, str | None]:
 
 
 def save_run(
-    out: Path,
-    config: dict[str, Any],
-    metrics: dict[str, Any],
-    network: "nn.Module | None",
-    logs: Iterable[Path] = (),
+    out: Path, config: dict[str, Any], metrics: dict[str, Any], network: "nn.Module | None", logs: Iterable[Path] = ()
 ) -> None:
     """Write a run's folder under a hidden name and rename it when it is whole; a run of that name is replaced.
 
@@ -127,20 +102,18 @@ def save_run(
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
         recorded = config | {"versions": find_versions()}
         (aside / "config.json").write_text(json.dumps(recorded, indent=1, allow_nan=False), encoding="utf-8")
+        old = aside.with_suffix(".old")
         if out.exists():
-            # A folder cannot be renamed over a full one.
-            old = aside.with_suffix(".old")
-            out.rename(old)
-            aside.rename(out)
+            out.rename(old)  # a folder cannot be renamed over a full one
+        aside.rename(out)
+        if old.exists():
             shutil.rmtree(old)
-        else:
-            aside.rename(out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def load_run(path: Path, protocol: Protocol) -> Run:
-    """Load a trained run for tensors of a protocol.
+def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]:
+    """Load a trained run for tensors of a protocol: its config, and the model with the trained weights.
 
     Raises:
         StaleRunError: the run is of another version, was trained for another protocol, is of a model or has parameters
@@ -166,7 +139,7 @@ def load_run(path: Path, protocol: Protocol) -> Run:
         except DamagedFileError as damaged:
             raise StaleRunError(str(damaged)) from None
         predictor.eval()
-    return Run(config=config, predictor=predictor)
+    return config, predictor
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -203,13 +176,8 @@ def refuse_unfinished(path: Path) -> None:
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:
     """Refuse to evaluate a run on data that it was trained on.
 
-    The split may have changed since the run was trained. Then no subset of the part may be one that the run was trained
-    on, or that its weights were chosen by (`patience`); otherwise the split itself keeps the parts apart.
-
-    Args:
-        config: content of the run's `config.json`.
-        folder: tensors to evaluate on.
-        part: part to evaluate.
+    Where the split has changed since, no subset of the part may be one that the run was trained on, or that its weights
+    were chosen by (`patience`); otherwise the split itself keeps the parts apart.
 
     Raises:
         StaleRunError: names the subsets.

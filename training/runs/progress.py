@@ -1,10 +1,54 @@
-"""The progress of a training between two steps, apart from weights and optimiser."""
+"""Progress of a training between two steps, and its logs as CSV."""
 
+import csv
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from tracklake.training.runs.logs import Row
+Row = dict[str, float | int | str | None]
+
+COURSE_FILE = "course.csv"
+COURSE = {
+    "step": "optimiser steps done",
+    "epoch": "epoch of the last of them, from 0",
+    "phase": "the recipe's loss",
+    "seconds": "time since the training began, without interruptions",
+    "loss": "mean over the steps since the row before",
+    "learning_rate": "learning rate of the last step",
+    "samples_per_s": "samples a second over the steps since the row before",
+    "data_share": "share of the time of those steps that reading batches took",
+}
+"""Columns of course.csv and their meanings."""
+
+EPOCHS_FILE = "epochs.csv"
+EPOCHS = {
+    "epoch": "from 0; the last one may be shorter than the others",
+    "step": "optimiser steps done by its end",
+    "phase": "the recipe's loss in its last step",
+    "seconds": "as in course.csv, before validating",
+    "loss": "mean over its steps of that phase",
+    "validation_loss": "the same loss over the part `val`; empty where it is not measured",
+    "best": "1 where that is the smallest of its phase so far, else 0; empty where it is not measured",
+}
+"""Columns of epochs.csv and their meanings."""
+
+
+@contextmanager
+def open_log(path: Path, columns: dict[str, str], rows: list[Row]) -> Iterator[Callable[[Row], None]]:
+    """Write known rows to a CSV file and yield a function that adds one to the file, at once, and to `rows`."""
+    with path.open("w", encoding="utf-8", newline="", buffering=1) as stream:
+        writer = csv.DictWriter(stream, list(columns), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+        def write_row(row: Row) -> None:
+            rows.append(row)
+            writer.writerow(row)
+
+        yield write_row
 
 
 @dataclass
@@ -45,11 +89,23 @@ class TrainingState:
     best_weights: dict[str, Any] | None = None
     stale_epochs: int = 0
 
+    @property
+    def phase(self) -> str:
+        """Loss of the present phase."""
+        return self.phases[-1][0]
+
     def begin_phase(self, loss: str) -> None:
         """Begin a phase with another loss, which is not compared with the one before."""
         self.phases.append((loss, self.step))
         self.smooth_loss = math.nan
         self.best_loss = self.best_epoch = self.best_weights = None
+
+    def count_step(self, loss: float, samples: int) -> None:
+        """Count one more step with its loss and number of samples."""
+        self.step += 1
+        self.samples += samples
+        self.losses.append(loss)
+        self.smooth_loss = loss if math.isnan(self.smooth_loss) else 0.98 * self.smooth_loss + 0.02 * loss
 
     def describe_phases(self) -> list[dict[str, Any]]:
         """Describe each phase: loss, steps, and the loss's mean over their first and last twentieth."""
@@ -61,10 +117,3 @@ class TrainingState:
             means = {"loss_first": sum(losses[:some]) / some, "loss_last": sum(losses[-some:]) / some}
             phases.append({"loss": loss, "steps": len(losses), **means})
         return phases
-
-    def count_step(self, loss: float, samples: int) -> None:
-        """Count one more step with its loss and number of samples."""
-        self.step += 1
-        self.samples += samples
-        self.losses.append(loss)
-        self.smooth_loss = loss if math.isnan(self.smooth_loss) else 0.98 * self.smooth_loss + 0.02 * loss
