@@ -11,12 +11,14 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.observed import FutureInputError
-from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.evaluation.guard import refuse_future
-from tracklake.training.models import Model, Predictor, find_model, require_torch
+from tracklake.training.models import Model, Predictor, Reads, find_model, require_torch
+from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
@@ -28,7 +30,6 @@ from tracklake.training.runs.checkpoint import (
     save_checkpoint,
 )
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
-from tracklake.training.runs.loader import Read, load_batches, make_reader
 from tracklake.training.runs.memory import keep_freed_memory
 from tracklake.training.runs.progress import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, TrainingState, open_log
 from tracklake.training.runs.run_folder import describe_run, save_run
@@ -42,6 +43,9 @@ __all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]
 
 Progress = Callable[[float, float], None]
 """Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss."""
+
+Read = Callable[[Integers], tuple[Any, Any]]
+"""Reads samples by their numbers (B,): what may be seen of them and the truth, as tensors on the device."""
 
 VALIDATION_BATCH = 1024
 """Samples in a batch of validation."""
@@ -84,11 +88,11 @@ def train(
         where the split has no evaluation part).
 
     Raises:
-        UnfinishedError: there is a checkpoint and `resume` is None; there is none and it is True; it is of a training
-            with other settings or data; or another process is training the run.
+        UnfinishedError: `resume` does not fit the checkpoint or its absence; it is of a training with other settings or
+            data; or another process is training the run.
         DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
-        FutureInputError: the model sees what comes after the tick at which it predicts; raised before the first step
-            where it does so untrained, else after the last. No checkpoint is left.
+        FutureInputError: the model, untrained or trained, sees what comes after the tick at which it predicts. No
+            checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
         TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
     """
@@ -147,7 +151,7 @@ def _fit(
         network, optimizer, state = _start(plan, checkpoint, stored)
         save = partial(save_checkpoint, checkpoint, run, network, optimizer, state, plan.device)
         read = make_reader(plan.folder, plan.entry.reads, plan.device)
-        batches = load_batches(plan, read, state.step)
+        batches = _load_batches(plan, read, state.step)
         with (
             _hold_interrupts() as interrupted,
             open_log(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
@@ -237,6 +241,40 @@ def _take_step(
     optimizer.step()
     state.count_step(_require_finite(loss.item(), plan, state), samples)
     state.stepping_s += time.perf_counter() - start
+
+
+def _load_batches(plan: Plan, read: Read, step: int) -> Iterator[tuple[int, Any, Any]]:
+    """Yield the batches from a step on, without end: number of samples, what may be seen of them, and the truth."""
+    size = plan.recipe.batch_size
+    epoch, done = divmod(step, plan.epoch_steps)
+    while True:
+        order = plan.draw_epoch(epoch)
+        for first in range(done * size, len(order), size):
+            samples = order[first : first + size]
+            yield len(samples), *read(samples)
+        epoch, done = epoch + 1, 0
+
+
+def make_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
+    """Return the function that reads batches: from the mapped folder on a CPU, else from a copy on the device."""
+    import torch
+
+    if device.type != "cpu":
+        return make_device_reader(folder, reads, device)
+
+    def read(samples: Integers) -> tuple[Any, Any]:
+        observed, truth = read_samples(folder, samples, reads)
+        return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
+
+    return read
+
+
+def make_device_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
+    """Return the function that reads batches from arrays that stand on a device as a whole."""
+    import torch
+
+    copied = DeviceFolder(folder, device)
+    return lambda samples: read_on_device(copied, torch.from_numpy(samples).to(device), reads)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,11 @@ AGAIN = "run `tracklake tensors` again"
 
 class TensorError(TracklakeError):
     """A tensor folder is absent, unfinished or not what its index says."""
+
+    @classmethod
+    def at(cls, where: Path | str, problem: str) -> Self:
+        """Name the place and the problem, and what to do."""
+        return cls(f"{where}: {problem}; {AGAIN}")
 
 
 KINDS: dict[str, TypeAdapter[Any]] = {
@@ -56,10 +61,10 @@ def read_index(path: Path) -> dict[str, Any]:
     try:
         index = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as broken:
-        raise TensorError(f"{file}: not readable as JSON ({broken}); {AGAIN}") from broken
+        raise TensorError.at(file, f"not readable as JSON ({broken})") from broken
     if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
         found = index.get("version") if isinstance(index, dict) else type(index).__name__
-        raise TensorError(f"{file}: expected version {TENSORS_VERSION} of tensors, got {found}; {AGAIN}")
+        raise TensorError.at(file, f"expected version {TENSORS_VERSION} of tensors, got {found}")
     _check_keys(file, index)
     _check_storage(file, index)
     return index
@@ -76,7 +81,7 @@ def _check_keys(file: Path, index: Mapping[str, Any]) -> None:
     missing += [f"sizes: {letter}" for letter in letters if letter not in index.get("sizes", letters)]
     missing += [f"samples_by_part: {part}" for part in PARTS if part not in index.get("samples_by_part", PARTS)]
     if missing:
-        raise TensorError(f"{file}: lacks {', '.join(missing[:5])}; {AGAIN}")
+        raise TensorError.at(file, f"lacks {', '.join(missing[:5])}")
 
 
 def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mapping[str, str]) -> None:
@@ -85,21 +90,19 @@ def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mappin
             if key in found:
                 KINDS[kind].validate_python(found[key], strict=True)
         except ValidationError:
-            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {str(found[key])[:60]}; {AGAIN}") from None
+            raise TensorError.at(file, f"`{where}{key}`: expected {kind}, got {str(found[key])[:60]}") from None
 
 
 def _check_storage(file: Path, index: dict[str, Any]) -> None:
     """Refuse rounding errors beyond half a step, as centres or steps are then not those of the arrays."""
     storage, errors = index["storage"], index["max_error_m"]
     if storage not in POSITION_STORAGES:
-        raise TensorError(f"{file}: expected storage {' or '.join(POSITION_STORAGES)}, got {storage!r}; {AGAIN}")
+        raise TensorError.at(file, f"expected storage {' or '.join(POSITION_STORAGES)}, got {storage!r}")
     for axis, error, step in zip(("along", "across"), errors, STEPS_M.get(storage, (0.0, 0.0)), strict=True):
         most = step / 2 + 1e-3  # float32 rounds as well: 0.5 mm at 8 km
         if error > most:
-            raise TensorError(
-                f"{file}: expected a rounding error {axis} the road of at most {most:g} m for {storage}, got {error}; "
-                f"{AGAIN}"
-            )
+            expected = f"a rounding error {axis} the road of at most {most:g} m for {storage}"
+            raise TensorError.at(file, f"expected {expected}, got {error}")
 
 
 def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
@@ -116,12 +119,12 @@ def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
     }
     known = {field.name for field in fields(Protocol)}
     if set(parameters) != known:
-        raise TensorError(
-            f"{file}: expected a protocol of {', '.join(sorted(known))}, got {', '.join(sorted(parameters))}; {AGAIN}"
+        raise TensorError.at(
+            file, f"expected a protocol of {', '.join(sorted(known))}, got {', '.join(sorted(parameters))}"
         )
     protocol = Protocol(**parameters)
     if protocol.digest != digest:
-        raise TensorError(f"{file}: the protocol's digest is {digest}, its parameters give {protocol.digest}; {AGAIN}")
+        raise TensorError.at(file, f"the protocol's digest is {digest}, its parameters give {protocol.digest}")
     return protocol
 
 
@@ -139,14 +142,12 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
         try:
             mapped = np.lib.format.open_memmap(file, mode="r")
         except (OSError, ValueError) as broken:
-            raise TensorError(f"{file}: cannot be read ({broken}); {AGAIN}") from broken
+            raise TensorError.at(file, f"cannot be read ({broken})") from broken
         if (mapped.dtype, mapped.shape) != (dtype, shape):
-            raise TensorError(
-                f"{file}: expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}; {AGAIN}"
-            )
+            raise TensorError.at(file, f"expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}")
         size, wanted = file.stat().st_size, mapped.offset + mapped.nbytes
         if size != wanted:
-            raise TensorError(f"{file}: expected {wanted:,} bytes, got {size:,}; {AGAIN}")
+            raise TensorError.at(file, f"expected {wanted:,} bytes, got {size:,}")
         arrays[array.name] = mapped.view(np.ndarray)  # indexing np.memmap itself runs Python code for every result
     _check_values(path, index, arrays)
     return arrays
@@ -162,27 +163,21 @@ def _check_values(path: Path, index: Mapping[str, Any], arrays: Mapping[str, npt
             continue
         what, offset, end = f"{path}: array `{array.name}`", arrays[array.name], index["sizes"][array.counts]
         if (offset[0], offset[-1]) != (0, end):
-            raise TensorError(f"{what}: expected offsets from 0 to {end}, got {offset[0]} to {offset[-1]}; {AGAIN}")
+            raise TensorError.at(what, f"expected offsets from 0 to {end}, got {offset[0]} to {offset[-1]}")
         falls = offset[1:] < offset[:-1]
         if falls.any():
             at = int(falls.argmax())
             falling = f"{offset[at + 1]} after {offset[at]} at {at + 1}"
-            raise TensorError(f"{what}: expected offsets that never fall, got {falling}; {AGAIN}")
+            raise TensorError.at(what, f"expected offsets that never fall, got {falling}")
     subset, last = arrays["run_subset"], len(index["subsets"]) - 1
     if len(subset) and (subset.min() < 0 or subset.max() > last):
-        raise TensorError(
-            f"{path}: array `run_subset`: expected 0 to {last}, the index's subsets, got {subset.min()} to "
-            f"{subset.max()}; {AGAIN}"
-        )
+        found = f"{subset.min()} to {subset.max()}"
+        raise TensorError.at(path, f"array `run_subset`: expected 0 to {last}, the index's subsets, got {found}")
     part, what = arrays["sample_part"], f"{path}: array `sample_part`"
     for number, name in enumerate(PARTS):
         expected, got = index["samples_by_part"][name], np.count_nonzero(part == number)
         if got != expected:
-            raise TensorError(
-                f"{what}: expected {expected:,} samples of {name}, as the index counts, got {got:,}; {AGAIN}"
-            )
+            raise TensorError.at(what, f"expected {expected:,} samples of {name}, as the index counts, got {got:,}")
     others = np.count_nonzero(part >= len(PARTS))
     if others:
-        raise TensorError(
-            f"{what}: expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no part); {AGAIN}"
-        )
+        raise TensorError.at(what, f"expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no part)")

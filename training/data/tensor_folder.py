@@ -13,9 +13,9 @@ from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import PARTS, SEVERITIES
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS, NOMINAL_LANE_M, STEPS_M
-from tracklake.training.data.batches import Batch, SceneBatch, gather_samples, gather_scenes
-from tracklake.training.data.checks import AGAIN, TensorError, map_arrays, read_index, read_protocol
-from tracklake.training.data.positions import check_numbers, find_runs
+from tracklake.training.data.batches import Batch, SceneBatch
+from tracklake.training.data.checks import TensorError, map_arrays, read_index, read_protocol
+from tracklake.training.data.gathers import check_numbers, find_runs, gather_samples, gather_scenes
 
 if TYPE_CHECKING:
     import torch
@@ -27,17 +27,11 @@ _NAMES = frozenset(array.name for array in ARRAYS)
 
 @dataclass(frozen=True)
 class Lanes:
-    """Where the lanes of each subset lie; L is one more than the highest lane of all subsets.
+    """Where the lanes of each subset lie; L is one more than the highest lane of all subsets."""
 
-    Args:
-        last: (subsets,) the rightmost lane.
-        centre_m: (subsets, L + 1) y of the lanes' centres; NaN where unknown, at lane 0 and at L.
-        lane_width_m: (subsets, L + 1) widths of the lanes; NaN where the centre is.
-    """
-
-    last: npt.NDArray[np.int16]
-    centre_m: Floats
-    lane_width_m: Floats
+    last: npt.NDArray[np.int16]  # (subsets,) the rightmost lane
+    centre_m: Floats  # (subsets, L + 1) y of the lanes' centres; NaN where unknown, at lane 0 and at L
+    lane_width_m: Floats  # (subsets, L + 1) widths of the lanes; NaN where the centre is
 
 
 @dataclass(frozen=True)
@@ -122,19 +116,13 @@ class TensorFolder:
 
     @cached_property
     def scene_of_sample(self) -> npt.NDArray[np.int32]:
-        """(S,) the scene that each sample stands in.
-
-        Raises:
-            TensorError: a sample stands in no scene, or in several.
-        """
+        """(S,) the scene that each sample stands in; TensorError where it stands in none, or in several."""
         member = np.flatnonzero(self.scene_sample >= 0)
         sample, samples = self.scene_sample[member], len(self.sample_row)
         times = np.bincount(sample, minlength=samples)
         if len(times) != samples or (times != 1).any():
-            raise TensorError(
-                f"{self.path}: array `scene_sample`: expected each of {samples:,} samples in one scene, got "
-                f"{len(member):,} vehicles that are samples; {AGAIN}"
-            )
+            expected, found = f"each of {samples:,} samples in one scene", f"{len(member):,} vehicles that are samples"
+            raise TensorError.at(self.path, f"array `scene_sample`: expected {expected}, got {found}")
         scene = np.empty(samples, dtype=np.int32)
         scene[sample] = np.searchsorted(self.scene_offset, member, side="right") - 1
         return scene
@@ -165,12 +153,8 @@ class TensorFolder:
     def mark_flagged(self, samples: npt.ArrayLike, severity: str) -> Flags:
         """Return (B,) whether the sample's own vehicle breaks a rule within its history or its known future.
 
-        `finding` in `schemas.tensors.ARRAYS` says which frames a row stands for: the first row of a history also stands
-        for the frames since the tick before it.
-
-        Args:
-            samples: (B,) numbers of samples, in any order.
-            severity: one of `schemas.columns.SEVERITIES`; worse ones count as well.
+        Rules of a severity and worse ones count. `finding` in `schemas.tensors.ARRAYS` says which frames a row stands
+        for: the first row of a history also stands for the frames since the tick before it.
 
         Raises:
             IndexError: a number is below 0 or not below S.
@@ -188,21 +172,14 @@ class TensorFolder:
     def batches(
         self, part: str, batch_size: int, *, shuffle_seed: int | None = None, absolute: bool = False
     ) -> Iterator[Batch]:
-        """Yield every sample of a part once; the last batch may be smaller.
-
-        Args:
-            part: train, val or eval.
-            batch_size: samples in a batch, B.
-            shuffle_seed: seed of the order; None = the samples' own order.
-            absolute: measure positions on the carriageway, see `Batch`.
-        """
+        """Yield every sample of a part once, in their own order or shuffled; the last batch may be smaller."""
         for samples in _cut(self.samples_of(part), batch_size, shuffle_seed):
             yield self.gather(samples, absolute=absolute)
 
     def scene_batches(
         self, part: str, batch_size: int, *, shuffle_seed: int | None = None, absolute: bool = False
     ) -> Iterator[SceneBatch]:
-        """Yield every scene of a part once, `batch_size` at a time; otherwise as `batches`."""
+        """Yield every scene of a part once, in their own order or shuffled; the last batch may be smaller."""
         for scenes in _cut(self.scenes_of(part), batch_size, shuffle_seed):
             yield self.gather_scenes(scenes, absolute=absolute)
 

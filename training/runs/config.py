@@ -96,22 +96,15 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """Constants of a training loop, which follow from model, tensor folder and settings.
-
-    Args:
-        recipe: the model's recipe with the changes of the settings.
-        parameters: keywords of the model's `build`.
-        train: (n,) numbers of the samples to train on.
-        val: (v,) numbers of the samples to validate with.
-    """
+    """Constants of a training loop, which follow from model, tensor folder and settings."""
 
     entry: Model
     folder: TensorFolder
     config: TrainConfig
-    recipe: Recipe
-    parameters: dict[str, Any]
-    train: Integers
-    val: Integers
+    recipe: Recipe  # the model's, with the changes of the settings
+    parameters: dict[str, Any]  # keywords of the model's `build`
+    train: Integers  # (n,) numbers of the samples to train on
+    val: Integers  # (v,) numbers of the samples to validate with
     device: "torch.device"
 
     @property

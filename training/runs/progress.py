@@ -53,41 +53,28 @@ def open_log(path: Path, columns: dict[str, str], rows: list[Row]) -> Iterator[C
 
 @dataclass
 class TrainingState:
-    """Progress of a training between two steps, apart from weights and optimiser.
+    """Progress of a training between two steps, apart from weights and optimiser."""
 
-    Args:
-        step: optimiser steps done; gives the epoch and the place in it, too.
-        samples: samples in these steps.
-        elapsed_s: time since the start in s, without interruptions.
-        stepping_s: time in steps, in s, reading included.
-        reading_s: time for reading batches, in s.
-        smooth_loss: running mean of the loss.
-        losses: loss of every step.
-        phases: loss of each phase so far, and its first step.
-        course: rows of course.csv.
-        epochs: rows of epochs.csv.
-        logged: step, samples, stepping_s and reading_s at the last row of course.csv.
-        best_loss: smallest validation loss of the present phase.
-        best_epoch: epoch of that loss.
-        best_weights: weights at its end.
-        stale_epochs: epochs of the last phase since then.
-    """
-
-    step: int = 0
-    samples: int = 0
-    elapsed_s: float = 0.0
-    stepping_s: float = 0.0
-    reading_s: float = 0.0
-    smooth_loss: float = math.nan
-    losses: list[float] = field(default_factory=list)
-    phases: list[tuple[str, int]] = field(default_factory=list)
-    course: list[Row] = field(default_factory=list)
-    epochs: list[Row] = field(default_factory=list)
-    logged: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
-    best_loss: float | None = None
-    best_epoch: int | None = None
-    best_weights: dict[str, Any] | None = None
-    stale_epochs: int = 0
+    step: int = 0  # optimiser steps done; gives the epoch and the place in it, too
+    samples: int = 0  # in these steps
+    elapsed_s: float = 0.0  # since the start, without interruptions
+    stepping_s: float = 0.0  # time in steps, reading included
+    reading_s: float = 0.0  # time for reading batches
+    smooth_loss: float = math.nan  # running mean of the loss
+    losses: list[float] = field(default_factory=list)  # of every step
+    phases: list[tuple[str, int]] = field(default_factory=list)  # loss of each phase so far, and its first step
+    course: list[Row] = field(default_factory=list)  # rows of course.csv
+    epochs: list[Row] = field(default_factory=list)  # rows of epochs.csv
+    logged: tuple[int, int, float, float] = (
+        0,
+        0,
+        0.0,
+        0.0,
+    )  # step, samples, stepping_s, reading_s at its last row
+    best_loss: float | None = None  # smallest validation loss of the present phase
+    best_epoch: int | None = None  # epoch of that loss
+    best_weights: dict[str, Any] | None = None  # at its end
+    stale_epochs: int = 0  # of the last phase since then
 
     @property
     def phase(self) -> str:
