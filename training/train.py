@@ -25,17 +25,17 @@ from tracklake.training.runs.checkpoint import (
     claim_folder,
     read_checkpoint,
     refuse_other_run,
-    refuse_wrong_start,
     restore,
     save_checkpoint,
 )
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
 from tracklake.training.runs.memory import keep_freed_memory
-from tracklake.training.runs.progress import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, TrainingState, open_log
+from tracklake.training.runs.progress import COLUMNS, Row, TrainingState, open_log
 from tracklake.training.runs.run_folder import describe_run, save_run
 
 if TYPE_CHECKING:
     import torch
+    from torch.optim import Optimizer
 
     from tracklake.training.models.network import Network
 
@@ -46,6 +46,9 @@ Progress = Callable[[float, float], None]
 
 Read = Callable[[Integers], tuple[Any, Any]]
 """Reads samples by their numbers (B,): what may be seen of them and the truth, as tensors on the device."""
+
+Batches = Iterator[tuple[int, Any, Any]]
+"""Number of samples of each batch, what may be seen of them, and the truth."""
 
 VALIDATION_BATCH = 1024
 """Samples in a batch of validation."""
@@ -84,15 +87,12 @@ def train(
         resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
 
     Returns:
-        Content of `metrics.json`: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
-        where the split has no evaluation part).
+        Content of `metrics.json`: see `_describe_training`, and `evaluation`, null where there is no such part.
 
     Raises:
-        UnfinishedError: `resume` does not fit the checkpoint or its absence; it is of a training with other settings or
-            data; or another process is training the run.
+        UnfinishedError: `resume` does not fit the checkpoint, or another process is training the run.
         DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
-        FutureInputError: the model, untrained or trained, sees what comes after the tick at which it predicts. No
-            checkpoint is left.
+        FutureInputError: the model sees what comes after the tick at which it predicts; no checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
         TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
     """
@@ -101,8 +101,7 @@ def train(
     if not entry.learns:
         return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
-    refuse_wrong_start(out, resume=resume)
-    with claim_folder(out) as unfinished:
+    with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
         plan = make_plan(entry, folder, config or started_with)
@@ -115,7 +114,7 @@ def train(
         try:
             network, metrics = _fit(plan, run, unfinished, stored, progress)
             metrics["evaluation"] = _evaluate(network, entry, folder, out.name)
-            save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
+            save_run(out, run, metrics, network.cpu(), [unfinished / log for log in COLUMNS])
             checkpoint.unlink()
         except (DivergedError, NotFiniteError, FutureInputError):
             checkpoint.unlink(missing_ok=True)  # resumed, it would end the same, or it has learned from the future
@@ -154,8 +153,8 @@ def _fit(
         batches = _load_batches(plan, read, state.step)
         with (
             _hold_interrupts() as interrupted,
-            open_log(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
-            open_log(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
+            open_log(unfinished / "course.csv", state.course) as log_steps,
+            open_log(unfinished / "epochs.csv", state.epochs) as log_epoch,
         ):
             started = time.monotonic() - state.elapsed_s
             saved = time.monotonic()
@@ -202,9 +201,7 @@ def _fit(
     return network.eval(), _describe_training(plan, state, network)
 
 
-def _start(
-    plan: Plan, checkpoint: Path, stored: dict[str, Any] | None
-) -> tuple["Network", "torch.optim.Optimizer", TrainingState]:
+def _start(plan: Plan, checkpoint: Path, stored: dict[str, Any] | None) -> tuple["Network", "Optimizer", TrainingState]:
     """Build network, optimiser and state, new or as in a checkpoint; a new network must not see the future."""
     import torch
 
@@ -219,12 +216,7 @@ def _start(
 
 
 def _take_step(
-    plan: Plan,
-    state: TrainingState,
-    network: "Network",
-    optimizer: "torch.optim.Optimizer",
-    batches: Iterator[tuple[int, Any, Any]],
-    spent: float,
+    plan: Plan, state: TrainingState, network: "Network", optimizer: "Optimizer", batches: Batches, spent: float
 ) -> None:
     """Take one step of the optimiser on the next batch, at the learning rate of the budget spent."""
     import torch
@@ -243,8 +235,8 @@ def _take_step(
     state.stepping_s += time.perf_counter() - start
 
 
-def _load_batches(plan: Plan, read: Read, step: int) -> Iterator[tuple[int, Any, Any]]:
-    """Yield the batches from a step on, without end: number of samples, what may be seen of them, and the truth."""
+def _load_batches(plan: Plan, read: Read, step: int) -> Batches:
+    """Yield the batches from a step on, without end."""
     size = plan.recipe.batch_size
     epoch, done = divmod(step, plan.epoch_steps)
     while True:
@@ -298,10 +290,7 @@ def _isolate_torch(plan: Plan) -> Iterator[None]:
 
 @contextmanager
 def _hold_interrupts() -> Iterator[list[int]]:
-    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second Ctrl-C does not wait.
-
-    Left to the process where it handles the signal itself, or outside the main thread.
-    """
+    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second one does not wait."""
     pressed: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -310,7 +299,7 @@ def _hold_interrupts() -> Iterator[list[int]]:
         pressed.append(number)
 
     is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # the process handles it
         yield pressed
         return
     signal.signal(signal.SIGINT, note)
@@ -364,9 +353,7 @@ def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> flo
     return total / len(plan.val)
 
 
-def _log_steps(
-    plan: Plan, state: TrainingState, optimizer: "torch.optim.Optimizer", log: Callable[[Row], None]
-) -> None:
+def _log_steps(plan: Plan, state: TrainingState, optimizer: "Optimizer", log: Callable[[Row], None]) -> None:
     """Log a row of course.csv for the steps since the row before, if there are any."""
     step, samples, stepping_s, reading_s = state.logged
     if state.step == step:

@@ -1,4 +1,7 @@
-"""Tensor folders read from disk: their index and arrays, checked against the declaration and each other."""
+"""Tensor folders read from disk: their index and arrays, checked against the declaration and each other.
+
+Whatever is absent, unreadable, cut short or not as declared raises TensorError.
+"""
 
 import json
 from collections.abc import Mapping
@@ -50,11 +53,7 @@ KINDS: dict[str, TypeAdapter[Any]] = {
 
 
 def read_index(path: Path) -> dict[str, Any]:
-    """Read `index.json` of a folder and check its version, its keys and its rounding errors.
-
-    Raises:
-        TensorError: it is absent, of another version, damaged, or its errors are larger than its storage can make.
-    """
+    """Read `index.json` of a folder and check its version, its keys and its rounding errors."""
     file = path / INDEX_FILE
     if not file.is_file():
         raise TensorError(f"{path}: no tensors here (no {INDEX_FILE}); run `tracklake tensors`")
@@ -106,22 +105,16 @@ def _check_storage(file: Path, index: dict[str, Any]) -> None:
 
 
 def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
-    """Read the protocol whose parameters the index holds.
-
-    Raises:
-        TensorError: the parameters are not those of this version, or do not give the digest beside them.
-    """
+    """Read the protocol whose parameters, those of this version, the index holds with their digest."""
     file, digest = path / INDEX_FILE, index["protocol"].get("digest")
     parameters: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value  # JSON has no tuples
         for name, value in index["protocol"].items()
         if name != "digest"
     }
-    known = {field.name for field in fields(Protocol)}
-    if set(parameters) != known:
-        raise TensorError.at(
-            file, f"expected a protocol of {', '.join(sorted(known))}, got {', '.join(sorted(parameters))}"
-        )
+    known, found = sorted(field.name for field in fields(Protocol)), sorted(parameters)
+    if found != known:
+        raise TensorError.at(file, f"expected a protocol of {', '.join(known)}, got {', '.join(found)}")
     protocol = Protocol(**parameters)
     if protocol.digest != digest:
         raise TensorError.at(file, f"the protocol's digest is {digest}, its parameters give {protocol.digest}")
@@ -129,12 +122,7 @@ def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
 
 
 def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
-    """Map every array of ARRAYS read-only, and check it against its declaration and the index.
-
-    Raises:
-        TensorError: a file is absent, cut short or too long, is no .npy file, or holds another dtype or shape; or
-            offsets, subsets or parts do not agree with the index.
-    """
+    """Map every array of ARRAYS read-only, and check it against its declaration and the index."""
     arrays = {}
     for array in ARRAYS:
         file = path / array.file

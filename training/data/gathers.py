@@ -47,11 +47,7 @@ def take_columns(array: Array, columns: Array) -> Array:
 
 
 def expand_groups(offset: Array, groups: Array) -> tuple[Array, Array]:
-    """List the members of ragged groups (B,), of which group g has the members offset[g] to offset[g + 1] - 1.
-
-    Returns:
-        (K,) members, in the order of `groups`; and (K,) positions in `groups`, increasing.
-    """
+    """List members (K,) of groups (B,), offset[g] to offset[g + 1] - 1, and each one's position (K,) in `groups`."""
     first = offset[groups]
     count = offset[groups + 1] - first
     if isinstance(count, np.ndarray):
@@ -75,20 +71,18 @@ def find_runs(folder: Folder, row: Array) -> Array:
 
 
 def read_history(folder: Folder, row: Array, first: Array) -> tuple[Array, Array]:
-    """Read the positions of the H ticks up to rows (...); ticks before the `first` known rows repeat their position.
+    """Read the positions (..., H, 2), as stored, of the H ticks up to rows (...), and whether each is known (..., H).
 
-    Returns:
-        (..., H, 2) positions as stored, and (..., H) True where the position is known.
+    Ticks before the `first` known rows repeat their position.
     """
     rows = row[..., None] + count_from(1 - folder.protocol.history_ticks, 1, row)
     return _read(folder, find_namespace(row).maximum(rows, first[..., None])), rows >= first[..., None]
 
 
 def read_future(folder: Folder, row: Array, last: Array) -> tuple[Array, Array]:
-    """Read the positions of the F ticks after rows (...); ticks after the `last` known rows repeat their position.
+    """Read the positions (..., F, 2), as stored, of the F ticks after rows (...), and whether each is known (..., F).
 
-    Returns:
-        (..., F, 2) positions as stored, and (..., F) True where the position is known.
+    Ticks after the `last` known rows repeat their position.
     """
     rows = row[..., None] + count_from(1, folder.protocol.horizon_ticks + 1, row)
     return _read(folder, find_namespace(row).minimum(rows, last[..., None])), rows <= last[..., None]
@@ -215,13 +209,9 @@ def gather_nearest(
     Every vehicle of the scene counts, sample or not: whether it is one depends on its future. The nearest are those
     with the smallest distance between front centres; of two equally far the smaller id comes first.
 
-    Returns:
-        What may be seen, and the truth, of every vehicle: `future` (B, V, F, 2) is relative to the EGO's last position;
-        where masked, the vehicle's last known position again, and zeros where there is no vehicle.
-
-    Raises:
-        IndexError: a number is below 0 or not below S.
-        ValueError: `nearest` is negative.
+    In the truth, `future` (B, V, F, 2) is relative to the EGO's last position; where masked, the vehicle's last known
+    position again, and zeros where there is no vehicle. IndexError for a number below 0 or not below S, ValueError for
+    a negative `nearest`.
     """
     if nearest < 0:
         raise ValueError(f"cannot gather the {nearest} nearest vehicles: expected 0 or more")

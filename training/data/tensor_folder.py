@@ -49,13 +49,7 @@ class TensorFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Map a folder that the pipeline's tensors stage wrote.
-
-        Raises:
-            TensorError: the folder, its index or its arrays are absent, of another version, unreadable or cut short;
-                a key of the index is not of its kind; an array is not of the dtype and shape declared; or offsets,
-                subsets or parts do not agree with the index.
-        """
+        """Map a folder that the pipeline's tensors stage wrote; TensorError where it is not as declared and written."""
         index = read_index(path)
         return cls(path, index, read_protocol(path, index), map_arrays(path, index))
 
@@ -155,17 +149,13 @@ class TensorFolder:
 
         Rules of a severity and worse ones count. `finding` in `schemas.tensors.ARRAYS` says which frames a row stands
         for: the first row of a history also stands for the frames since the tick before it.
-
-        Raises:
-            IndexError: a number is below 0 or not below S.
-            ValueError: no such severity.
         """
         if severity not in SEVERITIES:
             raise ValueError(f"unknown severity `{severity}`: expected one of {', '.join(SEVERITIES)}")
         sample = check_numbers(samples, len(self.sample_row), "sample")
         row = self.sample_row[sample].astype(np.intp)
         marked = (self.finding > 0) & (self.finding <= 1 + SEVERITIES.index(severity))
-        before = np.concatenate([[0], np.cumsum(marked, dtype=np.int32)])
+        before = np.cumsum(np.concatenate([[False], marked]), dtype=np.int32)
         flagged: Flags = before[row + self.sample_future[sample] + 1] > before[row + 1 - self.protocol.history_ticks]
         return flagged
 

@@ -19,6 +19,7 @@ from tracklake.training.runs.progress import TrainingState
 if TYPE_CHECKING:
     import torch
     from torch import nn
+    from torch.optim import Optimizer
 
 CHECKPOINT_FILE = "checkpoint.pt"
 CHECKPOINT_VERSION = 3
@@ -32,11 +33,11 @@ _BROKEN = (AttributeError, BadZipFile, EOFError, LookupError, OSError, RuntimeEr
 
 
 class DamagedFileError(TracklakeError):
-    """A file is not what was written, or not what is expected there."""
+    """A file is absent, damaged, of another version, or does not hold what is expected there."""
 
 
 class UnfinishedError(TracklakeError):
-    """A training cannot start or resume because of what an interrupted one left."""
+    """A training cannot start or resume because of what an interrupted one left, or another process is training."""
 
 
 def unfinished_folder(run: Path) -> Path:
@@ -49,27 +50,17 @@ def is_unfinished(run: Path) -> bool:
     return (unfinished_folder(run) / CHECKPOINT_FILE).is_file()
 
 
-def refuse_wrong_start(run: Path, *, resume: bool | None) -> None:
-    """Raise UnfinishedError for `resume` True without a checkpoint, and for None (not decided) with one."""
-    folder = unfinished_folder(run)
-    if resume is None and is_unfinished(run):
-        raise UnfinishedError(
-            f"{folder}: a training of the run `{run.name}` was interrupted; resume it (`--resume`), or {RESTART}"
-        )
-    if resume and not is_unfinished(run):
-        raise UnfinishedError(
-            f"{folder}: no interrupted training of the run `{run.name}` to resume; train without `--resume`"
-        )
-
-
 @contextmanager
-def claim_folder(run: Path) -> Iterator[Path]:
+def claim_folder(run: Path, *, resume: bool | None = False) -> Iterator[Path]:
     """Lock the folder of a run's checkpoint and logs; where it holds no checkpoint in the end, it is removed.
 
-    Raises:
-        UnfinishedError: another process is training this run.
+    To resume (True) there must be a checkpoint; where that is not decided (None), there must be none to lose.
     """
-    folder = unfinished_folder(run)
+    folder, of_run = unfinished_folder(run), f"training of the run `{run.name}`"
+    if resume is None and is_unfinished(run):
+        raise UnfinishedError(f"{folder}: a {of_run} was interrupted; resume it (`--resume`), or {RESTART}")
+    if resume and not is_unfinished(run):
+        raise UnfinishedError(f"{folder}: no interrupted {of_run} to resume; train without `--resume`")
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("a") as lock:
         try:
@@ -91,7 +82,7 @@ def save_checkpoint(
     path: Path,
     run: dict[str, Any],
     network: "nn.Module",
-    optimizer: "torch.optim.Optimizer",
+    optimizer: "Optimizer",
     state: TrainingState,
     device: "torch.device",
 ) -> None:
@@ -111,16 +102,10 @@ def save_checkpoint(
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
-    """Read a checkpoint, and the settings that its training was started with.
-
-    Raises:
-        DamagedFileError: it is damaged, of another version, or holds other content.
-    """
+    """Read a checkpoint, and the settings that its training was started with."""
     content = read_torch_file(path, RESTART)
-    if content.get("version") != CHECKPOINT_VERSION:
-        raise DamagedFileError(
-            f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {content.get('version')}; {RESTART}"
-        )
+    if (got := content.get("version")) != CHECKPOINT_VERSION:
+        raise DamagedFileError(f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {got}; {RESTART}")
     state, run = content.get("state"), content.get("run")
     if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != _FIELDS:
         raise DamagedFileError(f"{path}: expected a checkpoint, got a file of {', '.join(sorted(content))}; {RESTART}")
@@ -134,17 +119,9 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
 
 
 def restore(
-    path: Path,
-    content: dict[str, Any],
-    network: "nn.Module",
-    optimizer: "torch.optim.Optimizer",
-    device: "torch.device",
+    path: Path, content: dict[str, Any], network: "nn.Module", optimizer: "Optimizer", device: "torch.device"
 ) -> TrainingState:
-    """Restore weights, moments and random state from a checkpoint's content, and return the progress.
-
-    Raises:
-        DamagedFileError: the weights, moments or random state do not fit.
-    """
+    """Restore weights, moments and random state from a checkpoint's content, and return the progress."""
     import torch
 
     load_weights(network, content["network"], path, RESTART)
@@ -181,11 +158,7 @@ def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def read_torch_file(path: Path, advice: str) -> dict[str, Any]:
-    """Read tensors and plain values by name onto the CPU, without running any code of the file.
-
-    Raises:
-        DamagedFileError: it is absent, cut short or changed, or holds other things; the message ends with `advice`.
-    """
+    """Read tensors and plain values by name onto the CPU, without running any code of the file."""
     import torch
 
     if not path.is_file():
@@ -197,10 +170,8 @@ def read_torch_file(path: Path, advice: str) -> dict[str, Any]:
             raise BadZipFile(f"`{changed}` has another checksum")
         content = torch.load(path, weights_only=True, map_location="cpu")
     except UnpicklingError:
-        raise DamagedFileError(
-            f"{path}: expected tensors and plain values, got objects that could run code, and did not read them; "
-            f"{advice}"
-        ) from None
+        unsafe = "got objects that could run code, and did not read them"
+        raise DamagedFileError(f"{path}: expected tensors and plain values, {unsafe}; {advice}") from None
     except _BROKEN as broken:
         size, reason = path.stat().st_size, str(broken).partition("\n")[0]
         raise DamagedFileError(f"{path}: damaged or no file of torch's ({size:,} bytes: {reason}); {advice}") from None
@@ -210,11 +181,7 @@ def read_torch_file(path: Path, advice: str) -> dict[str, Any]:
 
 
 def load_weights(network: "nn.Module", weights: object, path: Path, advice: str) -> None:
-    """Load weights by name into a network, all of its own shapes and dtypes.
-
-    Raises:
-        DamagedFileError: a name is missing or unknown, or a shape or dtype differs.
-    """
+    """Load weights by name into a network, all of its own shapes and dtypes."""
     if not isinstance(weights, dict):
         raise DamagedFileError(f"{path}: expected weights by name, got {type(weights).__name__}; {advice}")
     expected = {name: _describe(value) for name, value in network.state_dict().items()}
@@ -225,9 +192,8 @@ def load_weights(network: "nn.Module", weights: object, path: Path, advice: str)
         if expected.get(name) != found.get(name)
     ]
     if wrong:
-        raise DamagedFileError(
-            f"{path}: not the weights of this model, {len(wrong)} differ: {'; '.join(wrong[:3])}; {advice}"
-        )
+        some = f"{len(wrong)} differ: {'; '.join(wrong[:3])}"
+        raise DamagedFileError(f"{path}: not the weights of this model, {some}; {advice}")
     network.load_state_dict(weights)
 
 

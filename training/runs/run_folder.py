@@ -57,15 +57,11 @@ def describe_run(
         "blocks": folder.index["blocks"],
         "tensors": digest_tensors(folder),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(run, allow_nan=False))
-    return plain
+    return dict(json.loads(json.dumps(run, allow_nan=False)))
 
 
 def digest_tensors(folder: TensorFolder) -> str:
-    """Return the digest of the index and of every array: everything that a training can depend on.
-
-    A training resumes on tensors of the same digest only; finished runs are evaluated without it.
-    """
+    """Return the digest of the index and of every array: a training resumes on tensors of the same digest only."""
     flat = (folder.arrays[array.name].reshape(-1).view(np.uint8) for array in ARRAYS)
     pieces = (data[first : first + HASHED_BYTES] for data in flat for first in range(0, len(data), HASHED_BYTES))
     index = json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
@@ -80,14 +76,9 @@ def find_versions() -> dict[str, str | None]:
 def save_run(
     out: Path, config: dict[str, Any], metrics: dict[str, Any], network: "nn.Module | None", logs: Iterable[Path] = ()
 ) -> None:
-    """Write a run's folder under a hidden name and rename it when it is whole; a run of that name is replaced.
+    """Write a run's folder, with copies of its logs, under a hidden name, and rename it when it is whole.
 
-    Args:
-        out: the run's folder.
-        config: see `describe_run`; `config.json` also records the versions of `find_versions`.
-        metrics: plain values for `metrics.json`.
-        network: the trained module; None where the model does not learn.
-        logs: files to copy into the folder.
+    A run of that name is replaced. `config.json` (see `describe_run`) also records the versions of `find_versions`.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     aside = name_unfinished(out)
@@ -115,10 +106,7 @@ def save_run(
 def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]:
     """Load a trained run for tensors of a protocol: its config, and the model with the trained weights.
 
-    Raises:
-        StaleRunError: the run is of another version, was trained for another protocol, is of a model or has parameters
-            that this version does not know, or is damaged.
-        MissingExtraError: torch is needed and not installed.
+    StaleRunError where it is damaged or of another version, protocol or model; MissingExtraError without torch.
     """
     config = read_config(path)
     if config["protocol"]["digest"] != protocol.digest:
@@ -143,11 +131,7 @@ def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read and check a run's `config.json`.
-
-    Raises:
-        StaleRunError: it is of another version, or damaged.
-    """
+    """Read a run's `config.json`; StaleRunError where it is of another version, or damaged."""
     file = path / "config.json"
     try:
         config = json.loads(file.read_text(encoding="utf-8"))
@@ -167,20 +151,15 @@ def read_config(path: Path) -> dict[str, Any]:
 def refuse_unfinished(path: Path) -> None:
     """Raise StaleRunError for a run whose training was interrupted and has not been resumed."""
     if not (path / "config.json").is_file() and is_unfinished(path):
-        raise StaleRunError(
-            f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "
-            f"{path.name} --resume`"
-        )
+        command = f"`tracklake train MODEL --name {path.name} --resume`"
+        raise StaleRunError(f"{path}: the training of this run was interrupted; finish it first: {command}")
 
 
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:
-    """Refuse to evaluate a run on data that it was trained on.
+    """Raise StaleRunError where a part to evaluate holds data that the run was trained on.
 
     Where the split has changed since, no subset of the part may be one that the run was trained on, or that its weights
     were chosen by (`patience`); otherwise the split itself keeps the parts apart.
-
-    Raises:
-        StaleRunError: names the subsets.
     """
     if config["blocks"] == folder.index["blocks"]:
         return
@@ -188,6 +167,6 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     if seen:
         raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "
-            f"`{part}` ({', '.join(seen[:5])}) were in its training part, or chose its weights; train it again "
-            "on these tensors"
+            f"`{part}` ({', '.join(seen[:5])}) were in its training part, or chose its weights; {AGAIN} on "
+            "these tensors"
         )
