@@ -11,24 +11,31 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.observed import FutureInputError
-from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.evaluation.guard import refuse_future
-from tracklake.training.models import Model, Predictor, find_model, require_torch
+from tracklake.training.models import Model, Predictor, Reads, find_model, require_torch
+from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.checkpoint import read_checkpoint, refuse_other_run, restore, save_checkpoint
+from tracklake.training.runs.checkpoint import (
+    CHECKPOINT_FILE,
+    claim_folder,
+    read_checkpoint,
+    refuse_other_run,
+    restore,
+    save_checkpoint,
+)
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
-from tracklake.training.runs.loader import Read, load_batches, make_reader
-from tracklake.training.runs.logs import COURSE, COURSE_FILE, EPOCHS, EPOCHS_FILE, Row, open_log
 from tracklake.training.runs.memory import keep_freed_memory
+from tracklake.training.runs.progress import COLUMNS, Row, TrainingState, open_log
 from tracklake.training.runs.run_folder import describe_run, save_run
-from tracklake.training.runs.state import TrainingState
-from tracklake.training.runs.unfinished import CHECKPOINT_FILE, claim_folder, refuse_wrong_start
 
 if TYPE_CHECKING:
     import torch
+    from torch.optim import Optimizer
 
     from tracklake.training.models.network import Network
 
@@ -36,6 +43,12 @@ __all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]
 
 Progress = Callable[[float, float], None]
 """Called after every step with the share of the budget that is spent (0 to 1) and the smoothed loss."""
+
+Read = Callable[[Integers], tuple[Any, Any]]
+"""Reads samples by their numbers (B,): what may be seen of them and the truth, as tensors on the device."""
+
+Batches = Iterator[tuple[int, Any, Any]]
+"""Number of samples of each batch, what may be seen of them, and the truth."""
 
 VALIDATION_BATCH = 1024
 """Samples in a batch of validation."""
@@ -71,19 +84,15 @@ def train(
             logs are in a hidden folder beside it.
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
         progress: called after every step.
-        resume: True: resume from the checkpoint; False: start over, whatever there is; None: start, unless there is a
-            checkpoint, which would be lost.
+        resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
 
     Returns:
-        Content of `metrics.json`: see `_describe_training`, and `evaluation` (see `training.evaluation.evaluate`; null
-        where the split has no evaluation part).
+        Content of `metrics.json`: see `_describe_training`, and `evaluation`, null where there is no such part.
 
     Raises:
-        UnfinishedError: there is a checkpoint and `resume` is None; there is none and it is True; it is of a training
-            with other settings or data; or another process is training the run.
+        UnfinishedError: `resume` does not fit the checkpoint, or another process is training the run.
         DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
-        FutureInputError: the model sees what comes after the tick at which it predicts; raised before the first step
-            where it does so untrained, else after the last. No checkpoint is left.
+        FutureInputError: the model sees what comes after the tick at which it predicts; no checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
         TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
     """
@@ -92,12 +101,12 @@ def train(
     if not entry.learns:
         return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
-    refuse_wrong_start(out, resume=resume)
-    with claim_folder(out) as unfinished:
+    with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
         plan = make_plan(entry, folder, config or started_with)
-        run = plan.describe()
+        settings = vars(plan.config) | {"parameters": dict(plan.config.parameters)}
+        run = describe_run(model, plan.parameters, settings, folder, plan.recipe)
         if stored:
             refuse_other_run(checkpoint, stored["run"], run)
         else:
@@ -105,7 +114,7 @@ def train(
         try:
             network, metrics = _fit(plan, run, unfinished, stored, progress)
             metrics["evaluation"] = _evaluate(network, entry, folder, out.name)
-            save_run(out, run, metrics, network.cpu(), [unfinished / COURSE_FILE, unfinished / EPOCHS_FILE])
+            save_run(out, run, metrics, network.cpu(), [unfinished / log for log in COLUMNS])
             checkpoint.unlink()
         except (DivergedError, NotFiniteError, FutureInputError):
             checkpoint.unlink(missing_ok=True)  # resumed, it would end the same, or it has learned from the future
@@ -141,11 +150,11 @@ def _fit(
         network, optimizer, state = _start(plan, checkpoint, stored)
         save = partial(save_checkpoint, checkpoint, run, network, optimizer, state, plan.device)
         read = make_reader(plan.folder, plan.entry.reads, plan.device)
-        batches = load_batches(plan, read, state.step)
+        batches = _load_batches(plan, read, state.step)
         with (
             _hold_interrupts() as interrupted,
-            open_log(unfinished / COURSE_FILE, COURSE, state.course) as log_steps,
-            open_log(unfinished / EPOCHS_FILE, EPOCHS, state.epochs) as log_epoch,
+            open_log(unfinished / "course.csv", state.course) as log_steps,
+            open_log(unfinished / "epochs.csv", state.epochs) as log_epoch,
         ):
             started = time.monotonic() - state.elapsed_s
             saved = time.monotonic()
@@ -155,7 +164,7 @@ def _fit(
                 if spent >= plan.budget or (config.patience and state.stale_epochs >= config.patience):
                     break
                 phase = plan.recipe.phase_at(spent, plan.budget)
-                if not state.phases or state.phases[-1][0] != phase.loss:
+                if not state.phases or state.phase != phase.loss:
                     _log_steps(plan, state, optimizer, log_steps)  # a row is of one phase
                     state.begin_phase(phase.loss)
                 _take_step(plan, state, network, optimizer, batches, spent)
@@ -192,9 +201,7 @@ def _fit(
     return network.eval(), _describe_training(plan, state, network)
 
 
-def _start(
-    plan: Plan, checkpoint: Path, stored: dict[str, Any] | None
-) -> tuple["Network", "torch.optim.Optimizer", TrainingState]:
+def _start(plan: Plan, checkpoint: Path, stored: dict[str, Any] | None) -> tuple["Network", "Optimizer", TrainingState]:
     """Build network, optimiser and state, new or as in a checkpoint; a new network must not see the future."""
     import torch
 
@@ -209,12 +216,7 @@ def _start(
 
 
 def _take_step(
-    plan: Plan,
-    state: TrainingState,
-    network: "Network",
-    optimizer: "torch.optim.Optimizer",
-    batches: Iterator[tuple[int, Any, Any]],
-    spent: float,
+    plan: Plan, state: TrainingState, network: "Network", optimizer: "Optimizer", batches: Batches, spent: float
 ) -> None:
     """Take one step of the optimiser on the next batch, at the learning rate of the budget spent."""
     import torch
@@ -224,13 +226,47 @@ def _take_step(
     state.reading_s += time.perf_counter() - start
     for group in optimizer.param_groups:
         group["lr"] = plan.learning_rate(spent)
-    loss = network.loss(observed, truth, state.phases[-1][0])
+    loss = network.loss(observed, truth, state.phase)
     optimizer.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(network.parameters(), plan.recipe.max_gradient_norm)
     optimizer.step()
     state.count_step(_require_finite(loss.item(), plan, state), samples)
     state.stepping_s += time.perf_counter() - start
+
+
+def _load_batches(plan: Plan, read: Read, step: int) -> Batches:
+    """Yield the batches from a step on, without end."""
+    size = plan.recipe.batch_size
+    epoch, done = divmod(step, plan.epoch_steps)
+    while True:
+        order = plan.draw_epoch(epoch)
+        for first in range(done * size, len(order), size):
+            samples = order[first : first + size]
+            yield len(samples), *read(samples)
+        epoch, done = epoch + 1, 0
+
+
+def make_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
+    """Return the function that reads batches: from the mapped folder on a CPU, else from a copy on the device."""
+    import torch
+
+    if device.type != "cpu":
+        return make_device_reader(folder, reads, device)
+
+    def read(samples: Integers) -> tuple[Any, Any]:
+        observed, truth = read_samples(folder, samples, reads)
+        return observed.each(torch.from_numpy), truth.each(torch.from_numpy)
+
+    return read
+
+
+def make_device_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
+    """Return the function that reads batches from arrays that stand on a device as a whole."""
+    import torch
+
+    copied = DeviceFolder(folder, device)
+    return lambda samples: read_on_device(copied, torch.from_numpy(samples).to(device), reads)
 
 
 @contextmanager
@@ -254,10 +290,7 @@ def _isolate_torch(plan: Plan) -> Iterator[None]:
 
 @contextmanager
 def _hold_interrupts() -> Iterator[list[int]]:
-    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second Ctrl-C does not wait.
-
-    Where the process handles the signal itself, or this is not the main thread, it is left as it is.
-    """
+    """Yield a list that is empty until Ctrl-C is pressed, so that a step is completed; a second one does not wait."""
     pressed: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -266,7 +299,7 @@ def _hold_interrupts() -> Iterator[list[int]]:
         pressed.append(number)
 
     is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # the process handles it
         yield pressed
         return
     signal.signal(signal.SIGINT, note)
@@ -282,7 +315,7 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
     """Return the loss, or raise DivergedError where it is not finite."""
     if not math.isfinite(loss):
         raise DivergedError(
-            f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phases[-1][0]}`: train with a learning "
+            f"the loss is {loss} after {state.step + 1} steps, in phase `{state.phase}`: train with a learning "
             f"rate below {plan.recipe.learning_rate:g} (`--set learning_rate=...`), and check the tensors' positions"
         )
     return loss
@@ -290,7 +323,7 @@ def _require_finite(loss: float, plan: Plan, state: TrainingState) -> float:
 
 def _end_epoch(plan: Plan, state: TrainingState, network: "Network", read: Read) -> Row:
     """Validate where there is patience, keep the weights if they are the best, and return a row of epochs.csv."""
-    epoch, phase = (state.step - 1) // plan.epoch_steps, state.phases[-1][0]
+    epoch, phase = (state.step - 1) // plan.epoch_steps, state.phase
     losses = state.losses[max(epoch * plan.epoch_steps, state.phases[-1][1]) :]  # of one phase, to be comparable
     row: Row = {"epoch": epoch, "step": state.step, "phase": phase, "seconds": round(state.elapsed_s, 3)}
     row |= {"loss": sum(losses) / len(losses), "validation_loss": None, "best": None}
@@ -320,16 +353,14 @@ def _measure_loss(plan: Plan, network: "Network", read: Read, phase: str) -> flo
     return total / len(plan.val)
 
 
-def _log_steps(
-    plan: Plan, state: TrainingState, optimizer: "torch.optim.Optimizer", log: Callable[[Row], None]
-) -> None:
+def _log_steps(plan: Plan, state: TrainingState, optimizer: "Optimizer", log: Callable[[Row], None]) -> None:
     """Log a row of course.csv for the steps since the row before, if there are any."""
     step, samples, stepping_s, reading_s = state.logged
     if state.step == step:
         return
     state.logged = (state.step, state.samples, state.stepping_s, state.reading_s)
     took_s = state.stepping_s - stepping_s
-    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phases[-1][0]}
+    row: Row = {"step": state.step, "epoch": (state.step - 1) // plan.epoch_steps, "phase": state.phase}
     row |= {"seconds": round(state.elapsed_s, 3), "loss": sum(state.losses[step:]) / (state.step - step)}
     row |= {"learning_rate": optimizer.param_groups[0]["lr"]}
     row |= {"samples_per_s": round((state.samples - samples) / took_s, 1)}
@@ -337,24 +368,17 @@ def _log_steps(
 
 
 def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> dict[str, Any]:
-    """Describe a finished training for `metrics.json`, without its evaluation.
-
-    Returns:
-        model; train_samples, in the part; weights, number of learned numbers; seconds, of the loop; steps;
-        samples_seen, in all steps; samples_per_s and data_share, of the steps' time (reading included) and the share of
-        it that reading took; phases (loss, steps, and loss_first and loss_last, its mean over their first and last
-        twentieth); best (epoch and validation_loss of the weights that were kept; null without patience).
-    """
+    """Describe a finished training for `metrics.json`, without its evaluation."""
     best = {"epoch": state.best_epoch, "validation_loss": state.best_loss}
     return {
         "model": plan.entry.name,
-        "train_samples": len(plan.train),
+        "train_samples": len(plan.train),  # in the part
         "weights": sum(weight.numel() for weight in network.parameters()),
-        "seconds": round(state.elapsed_s, 3),
+        "seconds": round(state.elapsed_s, 3),  # in the loop
         "steps": state.step,
-        "samples_seen": state.samples,
-        "samples_per_s": round(state.samples / state.stepping_s, 1),
+        "samples_seen": state.samples,  # in all steps
+        "samples_per_s": round(state.samples / state.stepping_s, 1),  # reading included
         "data_share": round(state.reading_s / state.stepping_s, 4),
         "phases": state.describe_phases(),
-        "best": best if state.best_loss is not None else None,
+        "best": best if state.best_loss is not None else None,  # of the weights that were kept; null without patience
     }

@@ -1,8 +1,10 @@
 """Batches of samples and of whole scenes: names, shapes, units and order of their arrays."""
 
 from dataclasses import dataclass
+from typing import Any
 
-from tracklake.training.data.namespaces import Array
+Array = Any
+"""A NumPy array or a torch tensor; those of one batch or call are all of the same kind."""
 
 
 @dataclass(frozen=True)
@@ -12,34 +14,20 @@ class Batch:
     Positions are in m, float32: `[..., 0]` along the direction of travel (x_m), `[..., 1]` across it, positive to the
     driver's right (y_m). They are relative to the sample's last known position (that at its own tick), or, where
     `absolute`, measured on the carriageway as in `tracks`.
-
-    Args:
-        sample: (B,) int64 numbers of the samples in the folder.
-        history: (B, H, 2) the sample's own positions; the last one is (0, 0), or `origin` where absolute.
-        future: (B, F, 2) its positions at 1, 2, ... ticks; where masked, its last known future position again.
-        future_mask: (B, F) bool, True where the position is known.
-        neighbor_history: (K, H, 2) relative to the SAMPLE's last position; where masked (the neighbor's track began
-            later), its earliest known position again.
-        neighbor_mask: (K, H) bool, True where the position is known; the last one always is.
-        neighbor_sample: (K,) int64 position in the batch, 0 to B - 1, increasing.
-        neighbor_cell: (K,) int8 cell, 0 to 38, of the grid, increasing within a sample.
-        lateral: (B,) uint8 position in `schemas.columns.LATERAL_MANEUVERS`.
-        longitudinal: (B,) uint8 position in `LONGITUDINAL_MANEUVERS`.
-        origin: (B, 2) the sample's last position on the carriageway; adding it makes relative positions absolute.
-        absolute: whether positions are measured on the carriageway.
     """
 
-    sample: Array
-    history: Array
-    future: Array
-    future_mask: Array
+    sample: Array  # (B,) int64 numbers of the samples in the folder
+    history: Array  # (B, H, 2) the sample's own positions; the last one is (0, 0), or `origin` where absolute
+    future: Array  # (B, F, 2) at 1, 2, ... ticks; where masked, the last known future position again
+    future_mask: Array  # (B, F) bool, True where the position is known
+    # (K, H, 2) relative to the SAMPLE's last position; where masked (the track began later), the earliest known again
     neighbor_history: Array
-    neighbor_mask: Array
-    neighbor_sample: Array
-    neighbor_cell: Array
-    lateral: Array
-    longitudinal: Array
-    origin: Array
+    neighbor_mask: Array  # (K, H) bool, True where the position is known; the last one always is
+    neighbor_sample: Array  # (K,) int64 position in the batch, 0 to B - 1, increasing
+    neighbor_cell: Array  # (K,) int8 cell, 0 to 38, of the grid, increasing within a sample
+    lateral: Array  # (B,) uint8 position in `schemas.columns.LATERAL_MANEUVERS`
+    longitudinal: Array  # (B,) uint8 position in `LONGITUDINAL_MANEUVERS`
+    origin: Array  # (B, 2) the sample's last position on the carriageway; makes relative positions absolute
     absolute: bool = False
 
     def __len__(self) -> int:
@@ -53,46 +41,27 @@ class SceneBatch:
 
     Positions as in `Batch`, each vehicle's relative to its own last position; `origin` says where that is, so that the
     difference of two origins is the distance from one vehicle to the other.
-
-    Args:
-        scene: (B,) int64 numbers of the scenes in the folder.
-        vehicle_scene: (V,) position in the batch, 0 to B - 1, increasing.
-        vehicle_id: (V,) unique within the subset, increasing within a scene.
-        sample: (V,) int32 number of the sample that the vehicle is at this tick; -1 where it is none (its track is too
-            short before or after, for example): such vehicles are context and are not predicted.
-        history: (V, H, 2) where masked (the track began later), the earliest known position again.
-        history_mask: (V, H) True where the position is known; the last one always is.
-        future: (V, F, 2) where masked, the last known position again.
-        future_mask: (V, F) True where the position is known.
-        lateral: (V,) as in `Batch`; -1 where the vehicle is no sample.
-        longitudinal: (V,) likewise.
-        origin: (V, 2) the vehicle's position on the carriageway.
-        speed_mps: (V,) recorded, along the direction of travel.
-        lane: (V,) 1 is the driver's leftmost; 0 = unknown.
-        lane_offset_m: (V,) from the lane's centre, positive to the right; NaN where no markings are known.
-        lane_width_m: (V,) NaN where no markings are known.
-        has_left: (V,) whether there is a lane to the left.
-        has_right: (V,) whether there is one to the right: `lane` is not the index's `last_lane`.
-        absolute: whether positions are measured on the carriageway.
     """
 
-    scene: Array
-    vehicle_scene: Array
-    vehicle_id: Array
+    scene: Array  # (B,) int64 numbers of the scenes in the folder
+    vehicle_scene: Array  # (V,) position in the batch, 0 to B - 1, increasing
+    vehicle_id: Array  # (V,) unique within the subset, increasing within a scene
+    # (V,) int32 number of the sample that the vehicle is at this tick; -1 where it is none (its track is too short
+    # before or after, for example): such vehicles are context and are not predicted
     sample: Array
-    history: Array
-    history_mask: Array
-    future: Array
-    future_mask: Array
-    lateral: Array
-    longitudinal: Array
-    origin: Array
-    speed_mps: Array
-    lane: Array
-    lane_offset_m: Array
-    lane_width_m: Array
-    has_left: Array
-    has_right: Array
+    history: Array  # (V, H, 2) where masked (the track began later), the earliest known position again
+    history_mask: Array  # (V, H) True where the position is known; the last one always is
+    future: Array  # (V, F, 2) where masked, the last known position again
+    future_mask: Array  # (V, F) True where the position is known
+    lateral: Array  # (V,) as in `Batch`; -1 where the vehicle is no sample
+    longitudinal: Array  # (V,) likewise
+    origin: Array  # (V, 2) the vehicle's position on the carriageway
+    speed_mps: Array  # (V,) recorded, along the direction of travel
+    lane: Array  # (V,) 1 is the driver's leftmost; 0 = unknown
+    lane_offset_m: Array  # (V,) from the lane's centre, positive to the right; NaN where no markings are known
+    lane_width_m: Array  # (V,) NaN where no markings are known
+    has_left: Array  # (V,) whether there is a lane to the left
+    has_right: Array  # (V,) whether there is one to the right: `lane` is not the index's `last_lane`
     absolute: bool = False
 
     def __len__(self) -> int:

@@ -1,23 +1,41 @@
-"""Checks of an opened tensor folder: kinds of the index's values, and arrays that agree with the index."""
+"""Tensor folders read from disk: their index and arrays, checked against the declaration and each other.
 
+Whatever is absent, unreadable, cut short or not as declared raises TensorError.
+"""
+
+import json
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, conlist
 
-from tracklake.schemas.arrays import Integers
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.schemas.tensors import ARRAYS, INDEX_KEYS, SUBSET_KEYS
+from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.tensors import (
+    ARRAYS,
+    INDEX_FILE,
+    INDEX_KEYS,
+    POSITION_STORAGES,
+    STEPS_M,
+    SUBSET_KEYS,
+    TENSORS_VERSION,
+)
 
 AGAIN = "run `tracklake tensors` again"
 
 
 class TensorError(TracklakeError):
     """A tensor folder is absent, unfinished or not what its index says."""
+
+    @classmethod
+    def at(cls, where: Path | str, problem: str) -> Self:
+        """Name the place and the problem, and what to do."""
+        return cls(f"{where}: {problem}; {AGAIN}")
 
 
 KINDS: dict[str, TypeAdapter[Any]] = {
@@ -34,12 +52,24 @@ KINDS: dict[str, TypeAdapter[Any]] = {
 """Type of each kind of value that `schemas.tensors` declares for keys; checked strictly, as true is no number."""
 
 
-def check_index(file: Path, index: Mapping[str, Any]) -> None:
-    """Refuse an index that lacks a key, or whose values are not of the kinds declared.
+def read_index(path: Path) -> dict[str, Any]:
+    """Read `index.json` of a folder and check its version, its keys and its rounding errors."""
+    file = path / INDEX_FILE
+    if not file.is_file():
+        raise TensorError(f"{path}: no tensors here (no {INDEX_FILE}); run `tracklake tensors`")
+    try:
+        index = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as broken:
+        raise TensorError.at(file, f"not readable as JSON ({broken})") from broken
+    if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
+        found = index.get("version") if isinstance(index, dict) else type(index).__name__
+        raise TensorError.at(file, f"expected version {TENSORS_VERSION} of tensors, got {found}")
+    _check_keys(file, index)
+    _check_storage(file, index)
+    return index
 
-    Raises:
-        TensorError: names the first such value, or the missing keys.
-    """
+
+def _check_keys(file: Path, index: Mapping[str, Any]) -> None:
     _check_kinds(file, "", index, INDEX_KEYS)
     subsets = index.get("subsets", [])
     for number, subset in enumerate(subsets):
@@ -50,7 +80,7 @@ def check_index(file: Path, index: Mapping[str, Any]) -> None:
     missing += [f"sizes: {letter}" for letter in letters if letter not in index.get("sizes", letters)]
     missing += [f"samples_by_part: {part}" for part in PARTS if part not in index.get("samples_by_part", PARTS)]
     if missing:
-        raise TensorError(f"{file}: lacks {', '.join(missing[:5])}; {AGAIN}")
+        raise TensorError.at(file, f"lacks {', '.join(missing[:5])}")
 
 
 def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mapping[str, str]) -> None:
@@ -59,50 +89,83 @@ def _check_kinds(file: Path, where: str, found: Mapping[str, Any], kinds: Mappin
             if key in found:
                 KINDS[kind].validate_python(found[key], strict=True)
         except ValidationError:
-            got = str(found[key])[:60]
-            raise TensorError(f"{file}: `{where}{key}`: expected {kind}, got {got}; {AGAIN}") from None
+            raise TensorError.at(file, f"`{where}{key}`: expected {kind}, got {str(found[key])[:60]}") from None
 
 
-def check_arrays(path: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Refuse arrays that do not agree with each other or with the index, and would give wrong values.
+def _check_storage(file: Path, index: dict[str, Any]) -> None:
+    """Refuse rounding errors beyond half a step, as centres or steps are then not those of the arrays."""
+    storage, errors = index["storage"], index["max_error_m"]
+    if storage not in POSITION_STORAGES:
+        raise TensorError.at(file, f"expected storage {' or '.join(POSITION_STORAGES)}, got {storage!r}")
+    for axis, error, step in zip(("along", "across"), errors, STEPS_M.get(storage, (0.0, 0.0)), strict=True):
+        most = step / 2 + 1e-3  # float32 rounds as well: 0.5 mm at 8 km
+        if error > most:
+            expected = f"a rounding error {axis} the road of at most {most:g} m for {storage}"
+            raise TensorError.at(file, f"expected {expected}, got {error}")
+
+
+def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
+    """Read the protocol whose parameters, those of this version, the index holds with their digest."""
+    file, digest = path / INDEX_FILE, index["protocol"].get("digest")
+    parameters: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value  # JSON has no tuples
+        for name, value in index["protocol"].items()
+        if name != "digest"
+    }
+    known, found = sorted(field.name for field in fields(Protocol)), sorted(parameters)
+    if found != known:
+        raise TensorError.at(file, f"expected a protocol of {', '.join(known)}, got {', '.join(found)}")
+    protocol = Protocol(**parameters)
+    if protocol.digest != digest:
+        raise TensorError.at(file, f"the protocol's digest is {digest}, its parameters give {protocol.digest}")
+    return protocol
+
+
+def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
+    """Map every array of ARRAYS read-only, and check it against its declaration and the index."""
+    arrays = {}
+    for array in ARRAYS:
+        file = path / array.file
+        dtype, shape = np.dtype(array.stored_as(index["storage"])), array.sizes(index["sizes"])
+        try:
+            mapped = np.lib.format.open_memmap(file, mode="r")
+        except (OSError, ValueError) as broken:
+            raise TensorError.at(file, f"cannot be read ({broken})") from broken
+        if (mapped.dtype, mapped.shape) != (dtype, shape):
+            raise TensorError.at(file, f"expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}")
+        size, wanted = file.stat().st_size, mapped.offset + mapped.nbytes
+        if size != wanted:
+            raise TensorError.at(file, f"expected {wanted:,} bytes, got {size:,}")
+        arrays[array.name] = mapped.view(np.ndarray)  # indexing np.memmap itself runs Python code for every result
+    _check_values(path, index, arrays)
+    return arrays
+
+
+def _check_values(path: Path, index: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Refuse offsets, subsets and parts that do not agree with the index, and would give wrong values.
 
     Only arrays by run, sample and scene are read, once each: a few ms for a million samples.
-
-    Raises:
-        TensorError: offsets do not begin at 0, fall, or do not end where what they count ends; a run is of a subset
-            that the index does not name; or the parts' samples are not those that the index counts.
     """
     for array in ARRAYS:
-        if array.shape[0].endswith("+1"):
-            _check_offsets(f"{path}: array `{array.name}`", arrays[array.name], index["sizes"][array.counts])
+        if not array.shape[0].endswith("+1"):
+            continue
+        what, offset, end = f"{path}: array `{array.name}`", arrays[array.name], index["sizes"][array.counts]
+        if (offset[0], offset[-1]) != (0, end):
+            raise TensorError.at(what, f"expected offsets from 0 to {end}, got {offset[0]} to {offset[-1]}")
+        falls = offset[1:] < offset[:-1]
+        if falls.any():
+            at = int(falls.argmax())
+            falling = f"{offset[at + 1]} after {offset[at]} at {at + 1}"
+            raise TensorError.at(what, f"expected offsets that never fall, got {falling}")
     subset, last = arrays["run_subset"], len(index["subsets"]) - 1
     if len(subset) and (subset.min() < 0 or subset.max() > last):
-        raise TensorError(
-            f"{path}: array `run_subset`: expected 0 to {last}, the index's subsets, got {subset.min()} to "
-            f"{subset.max()}; {AGAIN}"
-        )
-    part = arrays["sample_part"]
+        found = f"{subset.min()} to {subset.max()}"
+        raise TensorError.at(path, f"array `run_subset`: expected 0 to {last}, the index's subsets, got {found}")
+    part, what = arrays["sample_part"], f"{path}: array `sample_part`"
     for number, name in enumerate(PARTS):
         expected, got = index["samples_by_part"][name], np.count_nonzero(part == number)
         if got != expected:
-            raise TensorError(
-                f"{path}: array `sample_part`: expected {expected:,} samples of {name}, as the index counts, got "
-                f"{got:,}; {AGAIN}"
-            )
-    others = len(part) - sum(index["samples_by_part"][name] for name in PARTS)
+            raise TensorError.at(what, f"expected {expected:,} samples of {name}, as the index counts, got {got:,}")
+    others = np.count_nonzero(part >= len(PARTS))
     if others:
-        raise TensorError(
-            f"{path}: array `sample_part`: expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no "
-            f"part); {AGAIN}"
-        )
-
-
-def _check_offsets(what: str, offset: Integers, end: int) -> None:
-    if (offset[0], offset[-1]) != (0, end):
-        raise TensorError(f"{what}: expected offsets from 0 to {end}, got {offset[0]} to {offset[-1]}; {AGAIN}")
-    falls = offset[1:] < offset[:-1]
-    if falls.any():
-        at = int(falls.argmax())
-        raise TensorError(
-            f"{what}: expected offsets that never fall, got {offset[at + 1]} after {offset[at]} at {at + 1}; {AGAIN}"
-        )
+        raise TensorError.at(what, f"expected 0 to {len(PARTS) - 1}, got {part.max()} ({others:,} samples of no part)")

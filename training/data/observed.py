@@ -29,11 +29,7 @@ class _Blind(_Arrays):
     """Arrays known at the tick of prediction; reading any other is refused."""
 
     def __getattr__(self, name: str) -> NoReturn:
-        """Refuse a name that is no array here.
-
-        Raises:
-            FutureInputError: always, except for Python's own names.
-        """
+        """Refuse a name that is no array here, except for Python's own names."""
         if name.startswith("__"):
             raise AttributeError(name)
         known = ", ".join(own.name for own in fields(self))
@@ -47,20 +43,13 @@ class Observed(_Blind, Generic[Array]):
     """B samples with K neighbors in their grids, over H ticks of history.
 
     Positions in m, relative to the sample's last one: along the direction of travel, and across, positive to the right.
-
-    Args:
-        history: (B, H, 2) the last one is (0, 0).
-        neighbor_history: (K, H, 2) where masked, the earliest known position again.
-        neighbor_mask: (K, H) True where the position is known.
-        neighbor_sample: (K,) position in the batch, increasing.
-        neighbor_cell: (K,) cell 0 to 38 of the 13 x 3 grid, increasing within a sample.
     """
 
-    history: Array
-    neighbor_history: Array
-    neighbor_mask: Array
-    neighbor_sample: Array
-    neighbor_cell: Array
+    history: Array  # (B, H, 2) the last one is (0, 0)
+    neighbor_history: Array  # (K, H, 2) where masked, the earliest known position again
+    neighbor_mask: Array  # (K, H) True where the position is known
+    neighbor_sample: Array  # (K,) position in the batch, increasing
+    neighbor_cell: Array  # (K,) cell 0 to 38 of the 13 x 3 grid, increasing within a sample
 
 
 @dataclass(frozen=True)
@@ -70,48 +59,31 @@ class ObservedScene(_Blind, Generic[Array]):
     Positions in m, all of a scene relative to its ego's last one, axes as in `Observed`. Vehicle 0 is the ego; the
     others stand in order of distance; where there are fewer, rows are masked and hold zeros.
 
-    Args:
-        history: (B, V, H, 2) where a tick is masked, the vehicle's earliest known position again.
-        history_mask: (B, V, H) True where the position is known; the last one is, of every vehicle that is there.
-        vehicle_mask: (B, V) True where there is a vehicle; the first always is.
-        size_m: (B, V, 2) length and width; 0 where unknown.
-        lanes: (B, 3, 3) lanes left of, under and right of the ego: the centre's offset from the ego's last position
-            (m, positive to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is
-            knowledge of the map: where no markings are known, the rightmost lane is the highest that any vehicle uses
-            during the whole recording (`last_lane` of `schemas.tensors`), so that a lane may exist here because a
-            vehicle uses it later.
+    `lanes` are those left of, under and right of the ego: the centre's offset from the ego's last position (m, positive
+    to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is knowledge of the map:
+    where no markings are known, the rightmost lane is the highest that any vehicle uses during the whole recording
+    (`last_lane` of `schemas.tensors`), so that a lane may exist here because a vehicle uses it later.
     """
 
-    history: Array
-    history_mask: Array
-    vehicle_mask: Array
-    size_m: Array
-    lanes: Array
+    history: Array  # (B, V, H, 2) where a tick is masked, the vehicle's earliest known position again
+    history_mask: Array  # (B, V, H) True where the position is known; the last one is, of every vehicle that is there
+    vehicle_mask: Array  # (B, V) True where there is a vehicle; the first always is
+    size_m: Array  # (B, V, 2) length and width; 0 where unknown
+    lanes: Array  # (B, 3, 3)
 
 
 @dataclass(frozen=True)
 class Truth(_Arrays, Generic[Array]):
-    """The true futures and maneuvers: for `loss` and for scores, never for a prediction.
+    """The true futures and maneuvers: for `loss` and for scores, never for a prediction."""
 
-    Args:
-        future: (B, F, 2) in m, axes and origin as the history's; of scenes (B, V, F, 2).
-        future_mask: (B, F) True where it is known; of scenes (B, V, F).
-        lateral: (B,) position in `schemas.columns.LATERAL_MANEUVERS`.
-        longitudinal: (B,) position in `LONGITUDINAL_MANEUVERS`.
-    """
-
-    future: Array
-    future_mask: Array
-    lateral: Array
-    longitudinal: Array
+    future: Array  # (B, F, 2) in m, axes and origin as the history's; of scenes (B, V, F, 2)
+    future_mask: Array  # (B, F) True where it is known; of scenes (B, V, F)
+    lateral: Array  # (B,) position in `schemas.columns.LATERAL_MANEUVERS`
+    longitudinal: Array  # (B,) position in `LONGITUDINAL_MANEUVERS`
 
 
 def part_batch(batch: Batch) -> tuple[Observed[Any], Truth[Any]]:
-    """Split a batch into what may be seen of it and the truth; nothing is copied.
-
-    Raises:
-        ValueError: the batch is absolute.
-    """
+    """Split a batch into what may be seen of it and the truth; nothing is copied; ValueError for an absolute batch."""
     if batch.absolute:
         raise ValueError("models see positions relative to the sample's last one: gather without `absolute`")
     return (

@@ -4,38 +4,42 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Floats, Integers, Singles
-from tracklake.schemas.columns import PARTS
+from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
+from tracklake.schemas.columns import PARTS, SEVERITIES
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.tensors import ARRAYS, STEPS_M
+from tracklake.schemas.tensors import ARRAYS, NOMINAL_LANE_M, STEPS_M
 from tracklake.training.data.batches import Batch, SceneBatch
-from tracklake.training.data.checks import TensorError
-from tracklake.training.data.opening import map_arrays, read_index, read_protocol
-from tracklake.training.data.positions import check_numbers, find_runs
-from tracklake.training.data.samples import gather_samples
-from tracklake.training.data.scenes import Lanes, find_lanes, find_scenes_of_samples, gather_scenes
+from tracklake.training.data.checks import TensorError, map_arrays, read_index, read_protocol
+from tracklake.training.data.gathers import check_numbers, find_runs, gather_samples, gather_scenes
 
-__all__ = ["Batch", "SceneBatch", "TensorError", "TensorFolder"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["Batch", "DeviceFolder", "SceneBatch", "TensorError", "TensorFolder"]
 
 _NAMES = frozenset(array.name for array in ARRAYS)
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Where the lanes of each subset lie; L is one more than the highest lane of all subsets."""
+
+    last: npt.NDArray[np.int16]  # (subsets,) the rightmost lane
+    centre_m: Floats  # (subsets, L + 1) y of the lanes' centres; NaN where unknown, at lane 0 and at L
+    lane_width_m: Floats  # (subsets, L + 1) widths of the lanes; NaN where the centre is
 
 
 @dataclass(frozen=True)
 class TensorFolder:
     """The arrays of one split, mapped into memory and not read until indexed.
 
-    Every array of `schemas.tensors.ARRAYS` is an attribute, too: `folder.sample_row`.
-
-    Args:
-        path: the folder.
-        index: content of `index.json`.
-        protocol: protocol of the samples; gives H and F.
-        arrays: arrays by name.
+    Every array of `schemas.tensors.ARRAYS` is an attribute, too: `folder.sample_row`. `index` is the content of
+    `index.json`; the protocol of the samples gives H and F.
     """
 
     path: Path
@@ -45,22 +49,12 @@ class TensorFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Map a folder that the pipeline's tensors stage wrote.
-
-        Raises:
-            TensorError: the folder, its index or its arrays are absent, of another version, unreadable or cut short;
-                a key of the index is not of its kind; an array is not of the dtype and shape declared; or offsets,
-                subsets or parts do not agree with the index.
-        """
+        """Map a folder that the pipeline's tensors stage wrote; TensorError where it is not as declared and written."""
         index = read_index(path)
         return cls(path, index, read_protocol(path, index), map_arrays(path, index))
 
     def __getattr__(self, name: str) -> npt.NDArray[Any]:
-        """Return an array by its name.
-
-        Raises:
-            AttributeError: no array has the name.
-        """
+        """Return an array by its name."""
         if name not in _NAMES:
             raise AttributeError(f"a tensor folder has no array `{name}`", name=name, obj=self)
         return self.arrays[name]
@@ -85,17 +79,47 @@ class TensorFolder:
     @cached_property
     def lanes(self) -> Lanes:
         """Where the lanes of each subset lie."""
-        return find_lanes(self.index["subsets"])
+        subsets = self.index["subsets"]
+        most = max((len(subset["lane_markings_m"] or [0]) for subset in subsets), default=1)
+        centre = np.full((len(subsets), most + 1), np.nan)
+        width = centre.copy()
+        for number, subset in enumerate(subsets):
+            if subset["lane_markings_m"]:
+                markings = np.array(subset["lane_markings_m"])
+                centre[number, 1 : len(markings)] = (markings[1:] + markings[:-1]) / 2
+                width[number, 1 : len(markings)] = np.diff(markings)
+        return Lanes(np.array([subset["last_lane"] for subset in subsets], dtype=np.int16), centre, width)
 
     @cached_property
     def adjacent_lanes(self) -> Floats:
-        """(subsets, O, 3, 3) the lanes beside each lane, see `Lanes.find_adjacent`."""
-        return self.lanes.find_adjacent()
+        """(subsets, O, 3, 3) the lanes left of, under and right of lanes 0 to O - 1: y of the centre, width, and 1.
+
+        Zeros where a lane does not exist: lane 0 stands for no lane and has no neighbors, and neither has any above
+        O - 1. Where a subset has no markings, lanes are NOMINAL_LANE_M wide, from the left edge on.
+        """
+        lanes = self.lanes
+        own = np.arange(int(lanes.last.max(initial=0)) + 3)[:, None]
+        lane = own + np.arange(-1, 2)
+        exists = (own > 0) & (lane > 0) & (lane <= lanes.last[:, None, None])
+        known = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
+        centre, width = lanes.centre_m[:, known], lanes.lane_width_m[:, known]
+        unmarked = np.isnan(centre)
+        centre = np.where(unmarked, (lane - 0.5) * NOMINAL_LANE_M, centre)
+        width = np.where(unmarked, NOMINAL_LANE_M, width)
+        return np.stack([centre, width, exists], axis=-1) * exists[..., None]
 
     @cached_property
     def scene_of_sample(self) -> npt.NDArray[np.int32]:
-        """(S,) the scene that each sample stands in."""
-        return find_scenes_of_samples(self)
+        """(S,) the scene that each sample stands in; TensorError where it stands in none, or in several."""
+        member = np.flatnonzero(self.scene_sample >= 0)
+        sample, samples = self.scene_sample[member], len(self.sample_row)
+        times = np.bincount(sample, minlength=samples)
+        if len(times) != samples or (times != 1).any():
+            expected, found = f"each of {samples:,} samples in one scene", f"{len(member):,} vehicles that are samples"
+            raise TensorError.at(self.path, f"array `scene_sample`: expected {expected}, got {found}")
+        scene = np.empty(samples, dtype=np.int32)
+        scene[sample] = np.searchsorted(self.scene_offset, member, side="right") - 1
+        return scene
 
     @property
     def split(self) -> str:
@@ -103,79 +127,83 @@ class TensorFolder:
         return str(self.index["split"])
 
     def samples_of(self, part: str) -> Integers:
-        """Return (S_part,) numbers of the samples of one part, increasing.
-
-        Raises:
-            ValueError: no such part.
-        """
-        return np.flatnonzero(self.sample_part == find_part(part))
+        """Return (S_part,) numbers of the samples of one part, increasing; ValueError for no such part."""
+        return np.flatnonzero(self.sample_part == _find_part(part))
 
     def scenes_of(self, part: str) -> Integers:
-        """Return (C_part,) numbers of the scenes of one part, increasing.
-
-        Raises:
-            ValueError: no such part.
-        """
-        return np.flatnonzero(self.scene_part == find_part(part))
+        """Return (C_part,) numbers of the scenes of one part, increasing; ValueError for no such part."""
+        return np.flatnonzero(self.scene_part == _find_part(part))
 
     def runs_of(self, row: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
         """Return the run that each row stands in."""
         runs: npt.NDArray[np.intp] = find_runs(self, row)
         return runs
 
-    def subset_of(self, samples: npt.ArrayLike) -> npt.NDArray[np.int32]:
-        """Return (B,) the position of each sample's subset in the index's `subsets`."""
-        return self.run_subset[self.runs_of(self.sample_row[np.asarray(samples, dtype=np.intp)])]
-
     def subsets_of(self, part: str) -> set[str]:
         """Return the subsets (`dataset/subset`) that have samples in a part."""
-        present = np.unique(self.subset_of(self.samples_of(part)))
+        present = np.unique(self.run_subset[self.runs_of(self.sample_row[self.samples_of(part)])])
         return {f"{named['dataset']}/{named['subset']}" for named in (self.index["subsets"][i] for i in present)}
+
+    def mark_flagged(self, samples: npt.ArrayLike, severity: str) -> Flags:
+        """Return (B,) whether the sample's own vehicle breaks a rule within its history or its known future.
+
+        Rules of a severity and worse ones count. `finding` in `schemas.tensors.ARRAYS` says which frames a row stands
+        for: the first row of a history also stands for the frames since the tick before it.
+        """
+        if severity not in SEVERITIES:
+            raise ValueError(f"unknown severity `{severity}`: expected one of {', '.join(SEVERITIES)}")
+        sample = check_numbers(samples, len(self.sample_row), "sample")
+        row = self.sample_row[sample].astype(np.intp)
+        marked = (self.finding > 0) & (self.finding <= 1 + SEVERITIES.index(severity))
+        before = np.cumsum(np.concatenate([[False], marked]), dtype=np.int32)
+        flagged: Flags = before[row + self.sample_future[sample] + 1] > before[row + 1 - self.protocol.history_ticks]
+        return flagged
 
     def batches(
         self, part: str, batch_size: int, *, shuffle_seed: int | None = None, absolute: bool = False
     ) -> Iterator[Batch]:
-        """Yield every sample of a part once; the last batch may be smaller.
-
-        Args:
-            part: train, val or eval.
-            batch_size: samples in a batch, B.
-            shuffle_seed: seed of the order; None = the samples' own order.
-            absolute: see `Batch`.
-        """
+        """Yield every sample of a part once, in their own order or shuffled; the last batch may be smaller."""
         for samples in _cut(self.samples_of(part), batch_size, shuffle_seed):
             yield self.gather(samples, absolute=absolute)
 
     def scene_batches(
         self, part: str, batch_size: int, *, shuffle_seed: int | None = None, absolute: bool = False
     ) -> Iterator[SceneBatch]:
-        """Yield every scene of a part once, `batch_size` at a time; otherwise as `batches`."""
+        """Yield every scene of a part once, in their own order or shuffled; the last batch may be smaller."""
         for scenes in _cut(self.scenes_of(part), batch_size, shuffle_seed):
             yield self.gather_scenes(scenes, absolute=absolute)
 
     def gather(self, samples: npt.ArrayLike, *, absolute: bool = False) -> Batch:
-        """Read samples by their numbers (B,), in any order.
-
-        Raises:
-            IndexError: a number is below 0 or not below S.
-        """
+        """Read samples by their numbers (B,), in any order; IndexError for one below 0 or not below S."""
         return gather_samples(self, check_numbers(samples, len(self.sample_row), "sample"), absolute=absolute)
 
     def gather_scenes(self, scenes: npt.ArrayLike, *, absolute: bool = False) -> SceneBatch:
-        """Read scenes by their numbers (B,), in any order.
-
-        Raises:
-            IndexError: a number is below 0 or not below C.
-        """
+        """Read scenes by their numbers (B,), in any order; IndexError for one below 0 or not below C."""
         return gather_scenes(self, check_numbers(scenes, len(self.scene_part), "scene"), absolute=absolute)
 
 
-def find_part(part: str) -> int:
-    """Return the part's position in PARTS.
+class DeviceFolder:
+    """The attributes of a `TensorFolder`, with every array as a tensor on a device, where batches are gathered.
 
-    Raises:
-        ValueError: no such part.
+    An array is copied when it is first used and stays there: 16 bytes for each sample, 6 for each of its neighbors and
+    8 for each row (4 with int16 positions) where the grid is gathered.
     """
+
+    def __init__(self, folder: TensorFolder, device: "torch.device") -> None:
+        self._folder, self._device = folder, device
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401  (a tensor, or the folder's own value)
+        """Return an attribute of the folder; called once for each, as the value is kept."""
+        import torch
+
+        value = getattr(self._folder, name)
+        if isinstance(value, np.ndarray):
+            value = torch.from_numpy(value.copy()).to(self._device)  # a copy: torch knows no read-only memory
+        setattr(self, name, value)
+        return value
+
+
+def _find_part(part: str) -> int:
     if part not in PARTS:
         raise ValueError(f"unknown part `{part}`: expected one of {', '.join(PARTS)}")
     return PARTS.index(part)

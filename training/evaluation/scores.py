@@ -14,7 +14,6 @@ from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
-from tracklake.training.data.findings import mark_flagged
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.densities import find_nll
@@ -105,7 +104,7 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     code = vehicle * maneuvers[0] + folder.sample_lateral[samples]
     code = code * maneuvers[1] + folder.sample_longitudinal[samples]
     levels = 1 + len(FINDING_GROUPS)
-    code = code * levels + sum(mark_flagged(folder, samples, severity).astype(np.int64) for severity in FINDING_GROUPS)
+    code = code * levels + sum(folder.mark_flagged(samples, severity).astype(np.int64) for severity in FINDING_GROUPS)
     found, first, of_sample = np.unique(code, return_index=True, return_inverse=True)
     names = [str(named["dataset"]) for named in folder.index["subsets"]]
     datasets = tuple(sorted({names[number] for number in np.unique(subset)}))

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Integers, Singles
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.nearest_vehicles import gather_nearest
+from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
 from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.positions import locate_rows
+from tracklake.training.data.gathers import locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 
 KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))

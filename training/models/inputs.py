@@ -4,12 +4,10 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tracklake.training.data.device_folder import DeviceFolder
-from tracklake.training.data.namespaces import Array
-from tracklake.training.data.nearest_vehicles import gather_nearest, gather_vehicles
+from tracklake.training.data.batches import Array
+from tracklake.training.data.gathers import gather_nearest, gather_samples, gather_vehicles
 from tracklake.training.data.observed import Observed, ObservedScene, Truth, part_batch
-from tracklake.training.data.samples import gather_samples
-from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.models import Reads
 
 NEAREST = 10

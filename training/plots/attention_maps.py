@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
+from tracklake.training.data.gathers import find_nearest, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.plots.forecasts import Doubles

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
-from tracklake.training.data.positions import check_numbers, locate_rows
+from tracklake.training.data.gathers import check_numbers, find_nearest, gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction

@@ -12,7 +12,7 @@ import numpy as np
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.batches import SceneBatch
-from tracklake.training.data.namespaces import expand_groups
+from tracklake.training.data.gathers import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.forecasts import Doubles, Forecast
 

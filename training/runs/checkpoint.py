@@ -1,48 +1,94 @@
-"""Checkpoints of a training, from which it resumes to the same weights bit for bit."""
+"""Checkpoints of a training, from which it resumes to the same weights bit for bit, in a hidden folder of its run."""
 
+import fcntl
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile, ZipFile
 
-from tracklake.schemas.errors import UsageError
-from tracklake.schemas.files import write_file
+from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.files import remove_unfinished, write_file
 from tracklake.training.runs.config import TrainConfig
-from tracklake.training.runs.state import TrainingState
-from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file
-from tracklake.training.runs.unfinished import RESTART, UnfinishedError
+from tracklake.training.runs.progress import TrainingState
 
 if TYPE_CHECKING:
     import torch
     from torch import nn
+    from torch.optim import Optimizer
 
+CHECKPOINT_FILE = "checkpoint.pt"
 CHECKPOINT_VERSION = 3
 """Number of the checkpoint's layout; it grows when older checkpoints cannot be resumed exactly."""
+RESTART = "start over with `--anew`"
 
 _FIELDS = {own.name for own in fields(TrainingState)}
 _KEYS = {"version", "run", "network", "optimizer", "random", "device_random", "state"}
+_BROKEN = (AttributeError, BadZipFile, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zlib.error)
+"""Errors of zipfile and torch on files that are damaged or of another kind."""
+
+
+class DamagedFileError(TracklakeError):
+    """A file is absent, damaged, of another version, or does not hold what is expected there."""
+
+
+class UnfinishedError(TracklakeError):
+    """A training cannot start or resume because of what an interrupted one left, or another process is training."""
+
+
+def unfinished_folder(run: Path) -> Path:
+    """Return the folder where a run's training keeps checkpoint and logs; hidden, so that it is not taken for a run."""
+    return run.parent / f".{run.name}.unfinished"
+
+
+def is_unfinished(run: Path) -> bool:
+    """Return whether there is a checkpoint to resume from."""
+    return (unfinished_folder(run) / CHECKPOINT_FILE).is_file()
+
+
+@contextmanager
+def claim_folder(run: Path, *, resume: bool | None = False) -> Iterator[Path]:
+    """Lock the folder of a run's checkpoint and logs; where it holds no checkpoint in the end, it is removed.
+
+    To resume (True) there must be a checkpoint; where that is not decided (None), there must be none to lose.
+    """
+    folder, of_run = unfinished_folder(run), f"training of the run `{run.name}`"
+    if resume is None and is_unfinished(run):
+        raise UnfinishedError(f"{folder}: a {of_run} was interrupted; resume it (`--resume`), or {RESTART}")
+    if resume and not is_unfinished(run):
+        raise UnfinishedError(f"{folder}: no interrupted {of_run} to resume; train without `--resume`")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UnfinishedError(
+                f"{folder}: another process is training the run `{run.name}`; wait for it to end, or choose another "
+                "name (`--name`)"
+            ) from None
+        remove_unfinished(folder)
+        try:
+            yield folder
+        finally:
+            if not is_unfinished(run):
+                shutil.rmtree(folder)
 
 
 def save_checkpoint(
     path: Path,
     run: dict[str, Any],
     network: "nn.Module",
-    optimizer: "torch.optim.Optimizer",
+    optimizer: "Optimizer",
     state: TrainingState,
     device: "torch.device",
 ) -> None:
-    """Write everything that decides how a training goes on after a step.
-
-    Args:
-        path: file of the checkpoint, replaced where it exists.
-        run: model, settings and data, see `training.runs.run_folder.describe_run`.
-        network: weights to save.
-        optimizer: moments to save.
-        state: progress of the training.
-        device: device whose random state the network draws from.
-    """
+    """Write everything that decides how a training goes on, with `run` (see `run_folder.describe_run`)."""
     import torch
 
-    plain = {name: getattr(state, name) for name in _FIELDS}
     content = {
         "version": CHECKPOINT_VERSION,
         "run": run,
@@ -50,29 +96,22 @@ def save_checkpoint(
         "optimizer": optimizer.state_dict(),
         "random": torch.get_rng_state(),
         "device_random": torch.cuda.get_rng_state(device) if device.type == "cuda" else None,
-        "state": plain | {"losses": torch.tensor(state.losses, dtype=torch.float64)},
+        "state": vars(state) | {"losses": torch.tensor(state.losses, dtype=torch.float64)},
     }
     write_file(path, lambda stream: torch.save(content, stream))
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
-    """Read a checkpoint, and the settings that its training was started with.
-
-    Raises:
-        DamagedFileError: it is damaged, of another version, or holds other content.
-    """
+    """Read a checkpoint, and the settings that its training was started with."""
     content = read_torch_file(path, RESTART)
-    if content.get("version") != CHECKPOINT_VERSION:
-        raise DamagedFileError(
-            f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {content.get('version')}; {RESTART}"
-        )
+    if (got := content.get("version")) != CHECKPOINT_VERSION:
+        raise DamagedFileError(f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {got}; {RESTART}")
     state, run = content.get("state"), content.get("run")
-    settings = run.get("training") if isinstance(run, dict) else None
     if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != _FIELDS:
         raise DamagedFileError(f"{path}: expected a checkpoint, got a file of {', '.join(sorted(content))}; {RESTART}")
     try:
-        return content, TrainConfig(**settings)  # type: ignore[arg-type]  # checked by the call itself
-    except (TypeError, UsageError) as wrong:
+        return content, TrainConfig(**run["training"])  # type: ignore[index]  # checked by the expression itself
+    except (LookupError, TypeError, UsageError) as wrong:
         raise DamagedFileError(
             f"{path}: expected settings of a training that this version knows ({wrong}); resume with the version that "
             f"started it, or {RESTART}"
@@ -80,17 +119,9 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
 
 
 def restore(
-    path: Path,
-    content: dict[str, Any],
-    network: "nn.Module",
-    optimizer: "torch.optim.Optimizer",
-    device: "torch.device",
+    path: Path, content: dict[str, Any], network: "nn.Module", optimizer: "Optimizer", device: "torch.device"
 ) -> TrainingState:
-    """Restore weights, moments and random state from a checkpoint, and return the progress.
-
-    Raises:
-        DamagedFileError: the weights, moments or random state do not fit.
-    """
+    """Restore weights, moments and random state from a checkpoint's content, and return the progress."""
     import torch
 
     load_weights(network, content["network"], path, RESTART)
@@ -99,18 +130,13 @@ def restore(
         torch.set_rng_state(content["random"])
         if device.type == "cuda":
             torch.cuda.set_rng_state(content["device_random"], device)
-        plain = content["state"]
-        return TrainingState(**(plain | {"losses": plain["losses"].tolist()}))
+        return TrainingState(**(content["state"] | {"losses": content["state"]["losses"].tolist()}))
     except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as wrong:
         raise DamagedFileError(f"{path}: not a checkpoint of this training ({wrong}); {RESTART}") from None
 
 
 def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
-    """Refuse to resume with other settings or data than the training was started with.
-
-    Raises:
-        UnfinishedError: names the differences.
-    """
+    """Raise UnfinishedError where settings or data differ from those that the training was started with."""
     old, new = _flatten(then), _flatten(now)
     differing = [
         f"other {name}" if isinstance(old.get(name), list) else f"{name} {old.get(name)} then, {new.get(name)} now"
@@ -129,3 +155,47 @@ def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in values.items():
         flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
+
+
+def read_torch_file(path: Path, advice: str) -> dict[str, Any]:
+    """Read tensors and plain values by name onto the CPU, without running any code of the file."""
+    import torch
+
+    if not path.is_file():
+        raise DamagedFileError(f"{path}: there is no such file; {advice}")
+    try:
+        with ZipFile(path) as archive:
+            changed = archive.testzip()  # torch itself does not compare the checksums that it writes
+        if changed is not None:
+            raise BadZipFile(f"`{changed}` has another checksum")
+        content = torch.load(path, weights_only=True, map_location="cpu")
+    except UnpicklingError:
+        unsafe = "got objects that could run code, and did not read them"
+        raise DamagedFileError(f"{path}: expected tensors and plain values, {unsafe}; {advice}") from None
+    except _BROKEN as broken:
+        size, reason = path.stat().st_size, str(broken).partition("\n")[0]
+        raise DamagedFileError(f"{path}: damaged or no file of torch's ({size:,} bytes: {reason}); {advice}") from None
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise DamagedFileError(f"{path}: expected values by name, got {type(content).__name__}; {advice}")
+    return content
+
+
+def load_weights(network: "nn.Module", weights: object, path: Path, advice: str) -> None:
+    """Load weights by name into a network, all of its own shapes and dtypes."""
+    if not isinstance(weights, dict):
+        raise DamagedFileError(f"{path}: expected weights by name, got {type(weights).__name__}; {advice}")
+    expected = {name: _describe(value) for name, value in network.state_dict().items()}
+    found = {name: _describe(value) for name, value in weights.items()}
+    wrong = [
+        f"`{name}`: expected {expected.get(name, 'nothing')}, got {found.get(name, 'nothing')}"
+        for name in sorted(expected.keys() | found.keys())
+        if expected.get(name) != found.get(name)
+    ]
+    if wrong:
+        some = f"{len(wrong)} differ: {'; '.join(wrong[:3])}"
+        raise DamagedFileError(f"{path}: not the weights of this model, {some}; {advice}")
+    network.load_state_dict(weights)
+
+
+def _describe(value: Any) -> str:  # noqa: ANN401  (whatever a file held)
+    return f"{tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else f"a {type(value).__name__}"

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -11,7 +11,6 @@ from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Model, Recipe
-from tracklake.training.runs.run_folder import describe_run
 
 if TYPE_CHECKING:
     import torch
@@ -31,53 +30,33 @@ class TrainConfig:
     """Settings of a training; those left out are the model's recipe (`training.models.Recipe`).
 
     At most one of `seconds`, `steps` and `epochs` is given. The recipe's phases share it in proportion to their epochs.
-
-    Args:
-        seconds: time budget of the training loop with all its work; the learning rate follows the time.
-        steps: optimiser steps. With these, or with epochs, and on a CPU the result depends only on the seed, the
-            machine's arithmetic and the number of threads.
-        epochs: epochs of all phases together. None of the three = the recipe's epochs.
-        samples_per_epoch: most samples of an epoch; each epoch draws its own.
-        patience: epochs without a smaller loss on the part `val` after which the last phase ends; the weights with the
-            smallest loss are kept. Phases before it run their length, as their loss does not judge a model.
-        batch_size: samples per step.
-        learning_rate: highest learning rate of the optimiser.
-        optimizer: `adam` or `adamw`.
-        schedule: `constant`, or `cosine`: warms up over the first 2 % and decays to 0.
-        max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
-        parameters: parameters of the model.
-        seed: seed of the weights, of the order of samples, and of dropout.
-        threads: threads of torch; None = its own choice. For networks this small a second one gains little on an idle
-            machine, and on a busy one the threads wait for each other: a step takes ten times as long.
-        device: `cpu`; or `cuda`, where batches are gathered from tensors that are there as a whole. There the seed does
-            not decide the weights bit for bit, as threads add up some sums (of pooled neighbors, for one) in any order.
-        log_steps: steps between two rows of course.csv.
-        checkpoint_s: most seconds between two checkpoints; there is also one at the end of an epoch that took a while.
+    With steps or epochs, and on a CPU, the result depends only on the seed, the machine's arithmetic and the number of
+    threads. On `cuda`, threads add up some sums in any order: there the seed does not decide the weights bit for bit.
     """
 
-    seconds: float | None = None
-    steps: int | None = None
-    epochs: int | None = None
-    samples_per_epoch: int = 200_000
+    seconds: float | None = None  # time budget of the loop with all its work; the learning rate follows the time
+    steps: int | None = None  # optimiser steps
+    epochs: int | None = None  # epochs of all phases together; none of the three = the recipe's epochs
+    samples_per_epoch: int = 200_000  # most samples of an epoch; each epoch draws its own
+    # Epochs without a smaller loss on the part `val` after which the last phase ends; the weights with the smallest
+    # loss are kept. Earlier phases run their length: their loss does not judge a model.
     patience: int | None = None
-    batch_size: int | None = None
-    learning_rate: float | None = None
+    batch_size: int | None = None  # samples per step
+    learning_rate: float | None = None  # highest one of the optimiser
     optimizer: OptimizerName | None = None
-    schedule: ScheduleName | None = None
-    max_gradient_norm: float | None = None
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    seed: int = 0
+    schedule: ScheduleName | None = None  # cosine: warms up over the first 2 % and decays to 0
+    max_gradient_norm: float | None = None  # larger gradients are scaled down
+    parameters: Mapping[str, Any] = field(default_factory=dict)  # of the model
+    seed: int = 0  # of the weights, of the order of samples, and of dropout
+    # Threads of torch; None = its own choice. For networks this small more gain little on an idle machine, and wait for
+    # each other on a busy one: a step takes ten times as long.
     threads: int | None = 1
-    device: str = "cpu"
-    log_steps: int = 20
-    checkpoint_s: float = 60.0
+    device: str = "cpu"  # or `cuda`, with all tensors there
+    log_steps: int = 20  # between two rows of course.csv
+    checkpoint_s: float = 60.0  # most between two checkpoints; one is also at the end of an epoch that took a while
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot train anything.
-
-        Raises:
-            UsageError: names the value.
-        """
+        """Raise UsageError for a value that cannot train anything."""
         for own in fields(self):
             value = getattr(self, own.name)
             if own.name in WHOLE_NUMBERS and not isinstance(value, int | None):
@@ -100,26 +79,15 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """Constants of a training loop, which follow from model, tensor folder and settings.
-
-    Args:
-        entry: the model.
-        folder: tensors to train on.
-        config: settings.
-        recipe: the model's recipe with the changes of the settings.
-        parameters: keywords of the model's `build`.
-        train: (n,) numbers of the samples to train on.
-        val: (v,) numbers of the samples to validate with.
-        device: device of the network.
-    """
+    """Constants of a training loop, which follow from model, tensor folder and settings."""
 
     entry: Model
     folder: TensorFolder
     config: TrainConfig
-    recipe: Recipe
-    parameters: dict[str, Any]
-    train: Integers
-    val: Integers
+    recipe: Recipe  # the model's, with the changes of the settings
+    parameters: dict[str, Any]  # keywords of the model's `build`
+    train: Integers  # (n,) numbers of the samples to train on
+    val: Integers  # (v,) numbers of the samples to validate with
     device: "torch.device"
 
     @property
@@ -144,8 +112,7 @@ class Plan:
 
     def draw_epoch(self, epoch: int) -> Integers:
         """Draw (epoch_samples,) numbers of an epoch's samples in their order, each at most once."""
-        random = np.random.default_rng((self.config.seed, epoch))
-        return random.choice(self.train, self.epoch_samples, replace=False)
+        return np.random.default_rng((self.config.seed, epoch)).choice(self.train, self.epoch_samples, replace=False)
 
     def learning_rate(self, spent: float) -> float:
         """Return the learning rate of a step before which a part of the budget is spent."""
@@ -154,19 +121,9 @@ class Plan:
         share = spent / self.budget
         return self.recipe.learning_rate * min(1.0, share / 0.02 + 0.05) * 0.5 * (1.0 + math.cos(math.pi * share))
 
-    def describe(self) -> dict[str, Any]:
-        """Describe model, settings and data, for `config.json` and checkpoints."""
-        settings = asdict(self.config) | {"parameters": dict(self.config.parameters)}
-        return describe_run(self.entry.name, self.parameters, settings, self.folder, asdict(self.recipe))
-
 
 def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
-    """Combine model, tensor folder and settings.
-
-    Raises:
-        TracklakeError: the model does not learn; `train` has no samples, or `val` has none and `patience` is given; or
-            there is no such device.
-    """
+    """Combine model, tensor folder and settings; TracklakeError where they do not allow a training."""
     import torch
 
     if entry.recipe is None:
@@ -184,9 +141,7 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
         )
     if config.device != "cpu" and not (config.device == "cuda" and torch.cuda.is_available()):
         raise TracklakeError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
-    device = (
-        torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device(config.device)
-    )
+    device = torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device("cpu")
     given = {name: value for name in RECIPE_SETTINGS if (value := getattr(config, name)) is not None}
     recipe = replace(entry.recipe, **given)
     return Plan(entry, folder, config, recipe, {**entry.parameters, **config.parameters}, train, val, device)

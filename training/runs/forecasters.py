@@ -15,13 +15,7 @@ class UnknownRunError(TracklakeError):
 
 @dataclass(frozen=True)
 class Forecaster:
-    """A model that is ready to predict.
-
-    Args:
-        name: name of the run or model.
-        predictor: the model.
-        reads: kind of its input.
-    """
+    """A model that is ready to predict: name of the run or model, the model itself, and the kind of its input."""
 
     name: str
     predictor: Predictor
@@ -29,13 +23,7 @@ class Forecaster:
 
 
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
-    """Open a trained run, or a model that needs no training, written as a run or not.
-
-    Args:
-        name: a run's folder in `models`, or the name of a model that does not learn.
-        folder: tensors to predict on.
-        models: folder of the runs.
-        parts: parts of the split to predict on.
+    """Open a trained run in the folder `models`, or a model that needs no training, to predict parts of a split.
 
     Raises:
         StaleRunError: the run was trained for another protocol, or on subsets of these parts (other than `train`); or
@@ -46,11 +34,11 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
     if name in MODELS and not MODELS[name].learns:
         return Forecaster(name, MODELS[name].build(folder.protocol), MODELS[name].reads)
     if Path(name).name == name and (models / name / "config.json").is_file():
-        run = load_run(models / name, folder.protocol)
-        model = find_model(run.config["model"])
+        config, predictor = load_run(models / name, folder.protocol)
+        model = find_model(config["model"])
         for part in sorted(parts - {"train"}) if model.learns else ():
-            refuse_leak(run.config, folder, part)
-        return Forecaster(name, run.predictor, model.reads)
+            refuse_leak(config, folder, part)
+        return Forecaster(name, predictor, model.reads)
     refuse_unfinished(models / name)
     if Path(name).name == name and (models / name / "metrics.json").is_file():
         raise StaleRunError(f"{models / name}: a run without its config.json; train it again")

@@ -19,10 +19,8 @@ def keep_freed_memory() -> bool:
 
     A chunk of a file and a step of training take tens of MB and free them again. By default blocks of that size go
     back to the system, which clears and maps other pages for the next ones: a quarter of the time that ingestion
-    takes, and a fifth of a training step of convolutional social pooling on a processor.
-
-    Returns:
-        Whether glibc took the settings; another C library is left as it is.
+    takes, and a fifth of a training step of convolutional social pooling on a processor. Returns whether glibc took the
+    settings; another C library is left as it is.
     """
     os.environ.setdefault("_RJEM_MALLOC_CONF", _POLARS_KEEPS)
     if platform.libc_ver()[0] != "glibc":

@@ -2,9 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.metadata import distributions, version
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,8 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, find_model, require_torch
-from tracklake.training.runs.torch_files import DamagedFileError, load_weights, read_torch_file
-from tracklake.training.runs.unfinished import is_unfinished
+from tracklake.training.models.recipes import Recipe
+from tracklake.training.runs.checkpoint import DamagedFileError, is_unfinished, load_weights, read_torch_file
 
 if TYPE_CHECKING:
     from torch import nn
@@ -39,25 +40,8 @@ class StaleRunError(TracklakeError):
     """A run cannot be evaluated on these tensors: it was trained for others, is unfinished, or is damaged."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """A trained run, ready to predict.
-
-    Args:
-        config: content of `config.json`.
-        predictor: the model with the trained weights.
-    """
-
-    config: dict[str, Any]
-    predictor: Predictor
-
-
 def describe_run(
-    model: str,
-    parameters: dict[str, Any],
-    config: dict[str, Any],
-    folder: TensorFolder,
-    recipe: dict[str, Any] | None = None,
+    model: str, parameters: dict[str, Any], config: dict[str, Any], folder: TensorFolder, recipe: Recipe | None = None
 ) -> dict[str, Any]:
     """Return the content of `config.json` without the versions; a model without recipe does not learn."""
     run = {
@@ -65,7 +49,7 @@ def describe_run(
         "model": model,
         "parameters": parameters,
         "training": config,
-        "recipe": recipe,
+        "recipe": recipe and asdict(recipe),
         "protocol": folder.index["protocol"],
         "split": folder.split,
         "train_subsets": sorted(folder.subsets_of("train")),
@@ -73,24 +57,15 @@ def describe_run(
         "blocks": folder.index["blocks"],
         "tensors": digest_tensors(folder),
     }
-    plain: dict[str, Any] = json.loads(json.dumps(run, allow_nan=False))
-    return plain
+    return dict(json.loads(json.dumps(run, allow_nan=False)))
 
 
 def digest_tensors(folder: TensorFolder) -> str:
-    """Return the digest of the index and of every array: everything that a training can depend on.
-
-    A training resumes on tensors of the same digest only; finished runs are evaluated without it.
-    """
-
-    def list_chunks() -> Iterator[Any]:
-        yield json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
-        for array in ARRAYS:
-            data = folder.arrays[array.name].reshape(-1).view(np.uint8)
-            for first in range(0, len(data), HASHED_BYTES):
-                yield data[first : first + HASHED_BYTES]
-
-    return hash_chunks(list_chunks(), 12)
+    """Return the digest of the index and of every array: a training resumes on tensors of the same digest only."""
+    flat = (folder.arrays[array.name].reshape(-1).view(np.uint8) for array in ARRAYS)
+    pieces = (data[first : first + HASHED_BYTES] for data in flat for first in range(0, len(data), HASHED_BYTES))
+    index = json.dumps(folder.index, sort_keys=True).encode()  # states each array's dtype and shape
+    return hash_chunks(chain([index], pieces), 12)
 
 
 def find_versions() -> dict[str, str | None]:
@@ -99,20 +74,11 @@ def find_versions() -> dict[str, str | None]:
 
 
 def save_run(
-    out: Path,
-    config: dict[str, Any],
-    metrics: dict[str, Any],
-    network: "nn.Module | None",
-    logs: Iterable[Path] = (),
+    out: Path, config: dict[str, Any], metrics: dict[str, Any], network: "nn.Module | None", logs: Iterable[Path] = ()
 ) -> None:
-    """Write a run's folder under a hidden name and rename it when it is whole; a run of that name is replaced.
+    """Write a run's folder, with copies of its logs, under a hidden name, and rename it when it is whole.
 
-    Args:
-        out: the run's folder.
-        config: see `describe_run`; `config.json` also records the versions of `find_versions`.
-        metrics: plain values for `metrics.json`.
-        network: the trained module; None where the model does not learn.
-        logs: files to copy into the folder.
+    A run of that name is replaced. `config.json` (see `describe_run`) also records the versions of `find_versions`.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     aside = name_unfinished(out)
@@ -127,25 +93,20 @@ def save_run(
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
         recorded = config | {"versions": find_versions()}
         (aside / "config.json").write_text(json.dumps(recorded, indent=1, allow_nan=False), encoding="utf-8")
+        old = aside.with_suffix(".old")
         if out.exists():
-            # A folder cannot be renamed over a full one.
-            old = aside.with_suffix(".old")
-            out.rename(old)
-            aside.rename(out)
+            out.rename(old)  # a folder cannot be renamed over a full one
+        aside.rename(out)
+        if old.exists():
             shutil.rmtree(old)
-        else:
-            aside.rename(out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def load_run(path: Path, protocol: Protocol) -> Run:
-    """Load a trained run for tensors of a protocol.
+def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]:
+    """Load a trained run for tensors of a protocol: its config, and the model with the trained weights.
 
-    Raises:
-        StaleRunError: the run is of another version, was trained for another protocol, is of a model or has parameters
-            that this version does not know, or is damaged.
-        MissingExtraError: torch is needed and not installed.
+    StaleRunError where it is damaged or of another version, protocol or model; MissingExtraError without torch.
     """
     config = read_config(path)
     if config["protocol"]["digest"] != protocol.digest:
@@ -166,15 +127,11 @@ def load_run(path: Path, protocol: Protocol) -> Run:
         except DamagedFileError as damaged:
             raise StaleRunError(str(damaged)) from None
         predictor.eval()
-    return Run(config=config, predictor=predictor)
+    return config, predictor
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read and check a run's `config.json`.
-
-    Raises:
-        StaleRunError: it is of another version, or damaged.
-    """
+    """Read a run's `config.json`; StaleRunError where it is of another version, or damaged."""
     file = path / "config.json"
     try:
         config = json.loads(file.read_text(encoding="utf-8"))
@@ -194,25 +151,15 @@ def read_config(path: Path) -> dict[str, Any]:
 def refuse_unfinished(path: Path) -> None:
     """Raise StaleRunError for a run whose training was interrupted and has not been resumed."""
     if not (path / "config.json").is_file() and is_unfinished(path):
-        raise StaleRunError(
-            f"{path}: the training of this run was interrupted; finish it first: `tracklake train MODEL --name "
-            f"{path.name} --resume`"
-        )
+        command = f"`tracklake train MODEL --name {path.name} --resume`"
+        raise StaleRunError(f"{path}: the training of this run was interrupted; finish it first: {command}")
 
 
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:
-    """Refuse to evaluate a run on data that it was trained on.
+    """Raise StaleRunError where a part to evaluate holds data that the run was trained on.
 
-    The split may have changed since the run was trained. Then no subset of the part may be one that the run was trained
-    on, or that its weights were chosen by (`patience`); otherwise the split itself keeps the parts apart.
-
-    Args:
-        config: content of the run's `config.json`.
-        folder: tensors to evaluate on.
-        part: part to evaluate.
-
-    Raises:
-        StaleRunError: names the subsets.
+    Where the split has changed since, no subset of the part may be one that the run was trained on, or that its weights
+    were chosen by (`patience`); otherwise the split itself keeps the parts apart.
     """
     if config["blocks"] == folder.index["blocks"]:
         return
@@ -220,6 +167,6 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     if seen:
         raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "
-            f"`{part}` ({', '.join(seen[:5])}) were in its training part, or chose its weights; train it again "
-            "on these tensors"
+            f"`{part}` ({', '.join(seen[:5])}) were in its training part, or chose its weights; {AGAIN} on "
+            "these tensors"
         )

@@ -17,7 +17,7 @@ from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.columns import PARTS
-from tracklake.training.data.namespaces import expand_groups
+from tracklake.training.data.gathers import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
 
 CARD = "README.md"

@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, random_tables
 from tensor_tables import write
 
-from tracklake.training.data.device_folder import DeviceFolder
-from tracklake.training.data.nearest_vehicles import gather_nearest, gather_vehicles
-from tracklake.training.data.samples import gather_samples
-from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.data.gathers import gather_nearest, gather_samples, gather_vehicles
+from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 
 CPU = torch.device("cpu")
 STORAGES = ["float32", "int16-decimetres", "int16-centimetres"]

@@ -12,7 +12,7 @@ from tensor_tables import CLOCK, TINY, sample_everything, sizes_of, split_row, w
 
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.checks import TensorError
-from tracklake.training.data.nearest_vehicles import gather_nearest
+from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 

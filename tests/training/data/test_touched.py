@@ -10,7 +10,6 @@ from tensor_tables import CLOCK, finding, sample_everything, write
 
 from tracklake.schemas.columns import SEVERITIES
 from tracklake.schemas.findings import FINDINGS
-from tracklake.training.data.findings import mark_flagged
 from tracklake.training.data.tensor_folder import TensorFolder
 
 ONE = st.tuples(st.integers(0, 10_000), st.sampled_from(SEVERITIES), st.integers(-6, 3), st.integers(0, 4))
@@ -57,7 +56,7 @@ def test_a_sample_is_touched_by_findings_of_its_window_alone(tmp_path_factory, s
                 for where, who, kind, first, more in drawn
             )
         )  # fmt: skip
-    assert mark_flagged(folder, samples, severity).tolist() == expected
+    assert folder.mark_flagged(samples, severity).tolist() == expected
     assert F == 4  # of which some futures know fewer: they are touched by what is known alone
 
 
@@ -71,13 +70,13 @@ def test_the_first_and_the_last_tick_of_a_window_count_and_no_others(tmp_path):
         path = write(
             tmp_path / str(frame), [("a", clock, *drawn)], UNDIVIDED, findings=finding(7, "error", frame, frame)
         )
-        told.append(mark_flagged(TensorFolder.open(path), [0], "info").tolist())
+        told.append(TensorFolder.open(path).mark_flagged([0], "info").tolist())
     assert told == [[True], [True], [False]]
 
 
 def test_what_is_none_is_refused(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
     with pytest.raises(ValueError, match="unknown severity `fatal`: expected one of error, warning, info"):
-        mark_flagged(folder, [0], "fatal")
+        folder.mark_flagged([0], "fatal")
     with pytest.raises(IndexError, match="samples are numbered"):
-        mark_flagged(folder, [len(folder.sample_row)], "error")
+        folder.mark_flagged([len(folder.sample_row)], "error")

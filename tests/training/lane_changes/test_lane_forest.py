@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.nearest_vehicles import gather_nearest
+from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,

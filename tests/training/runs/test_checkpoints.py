@@ -12,15 +12,15 @@ from tensor_tables import TINY
 from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
 
 from tracklake.training.evaluation.evaluate import evaluate
-from tracklake.training.runs.run_folder import StaleRunError
-from tracklake.training.runs.torch_files import DamagedFileError
-from tracklake.training.runs.unfinished import (
+from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
+    DamagedFileError,
     UnfinishedError,
     claim_folder,
     is_unfinished,
     unfinished_folder,
 )
+from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import TrainConfig, TrainingInterruptedError, train
 
 # 4 steps an epoch; `mse` for 2 of 3 epochs. Other than one step after the other: dropout, Adam's moments, a cosine,

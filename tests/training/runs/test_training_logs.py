@@ -8,12 +8,10 @@ import pytest
 import torch
 from tiny_network import read_log, register, write_tiny
 
-import tracklake.training.runs.loader
 import tracklake.training.train
-from tracklake.training.data.nearest_vehicles import gather_nearest
+from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.runs.loader import make_device_reader
-from tracklake.training.train import TrainConfig, train
+from tracklake.training.train import TrainConfig, make_device_reader, train
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +48,13 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
 
 def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
-    real = tracklake.training.runs.loader.read_samples
+    real = tracklake.training.train.read_samples
 
     def read_slowly(*given):
         time.sleep(0.02)
         return real(*given)
 
-    monkeypatch.setattr(tracklake.training.runs.loader, "read_samples", read_slowly)
+    monkeypatch.setattr(tracklake.training.train, "read_samples", read_slowly)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
     assert 0 < metrics["samples_per_s"] < 32 / 0.02
