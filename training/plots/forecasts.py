@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Singles
+from tracklake.schemas.arrays import Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
 from tracklake.training.data.positions import check_numbers, locate_rows
@@ -15,11 +15,6 @@ from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
-
-if TYPE_CHECKING:
-    from tracklake.training.models.attention import SceneForecast
-
-Doubles = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,9 +29,9 @@ class Alternative:
     """
 
     probability: float
-    mean_m: Doubles
-    sigma_m: Doubles
-    correlation: Doubles
+    mean_m: Floats
+    sigma_m: Floats
+    correlation: Floats
 
 
 @dataclass(frozen=True)
@@ -47,12 +42,11 @@ class Forecast:
         model: name of the run or model.
         position_m: (F, 2) positions on the carriageway after 1, 2, ... ticks.
         alternatives: the most probable first; empty where the model gives no density.
-        lateral: probabilities by maneuver; None where the model gives none.
-        longitudinal: probabilities by maneuver; None where the model gives none.
+        lateral: probabilities by maneuver; None where the model gives none; `longitudinal` likewise.
     """
 
     model: str
-    position_m: Doubles
+    position_m: Floats
     alternatives: tuple[Alternative, ...] = ()
     lateral: dict[str, float] | None = None
     longitudinal: dict[str, float] | None = None
@@ -86,14 +80,12 @@ def forecast_samples(
         NotFiniteError: a predicted position is not a finite number.
     """
     sample = np.asarray(samples, dtype=np.int64)
-    found: dict[int, list[Forecast]] = {int(number): [] for number in sample}
-    origin = find_origins(folder, sample)
-    for model in models:
-        observed, _ = read_samples(folder, sample, model.reads)
-        prediction = model.predictor.predict(observed)
-        for row, number in enumerate(sample.tolist()):
-            found[number].append(place_forecast(model.name, prediction, row, origin[row]))
-    return found
+    predictions = [(one.name, one.predictor.predict(read_samples(folder, sample, one.reads)[0])) for one in models]
+    origin = _find_origins(folder, sample)
+    return {
+        number: [_place_forecast(name, prediction, row, origin[row]) for name, prediction in predictions]
+        for row, number in enumerate(sample.tolist())
+    }
 
 
 def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaster]) -> dict[int, list[Forecast]]:
@@ -125,52 +117,44 @@ def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, oth
     """Predict a sample's vehicle and the others of its scene at once, by id."""
     number = np.asarray([sample], dtype=np.int64)
     observed, _ = gather_nearest(folder, number, nearest=others)
-    network: Any = model.predictor
-    scene: SceneForecast = network.predict_scene(observed)
+    network: Any = model.predictor  # a network with attention
+    scene = network.predict_scene(observed)
     ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, number, others).row[0])].tolist()
-    origin = find_origins(folder, number)[0]
+    origin = _find_origins(folder, number)[0]
     sigma = np.sqrt(np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1))  # (V, F, 2)
     correlation = scene.covariance_m2[0, ..., 0, 1] / sigma.prod(axis=-1)
     weight = np.ones((len(ids), 1), dtype=sigma.dtype)
     density = Density(weight, scene.mean_m[0, :, None], sigma[:, None], correlation[:, None])
     prediction = Prediction(scene.mean_m[0], density)
     present = np.flatnonzero(scene.vehicle_mask[0]).tolist()
-    return {ids[row]: place_forecast(model.name, prediction, row, origin) for row in present}
+    return {ids[row]: _place_forecast(model.name, prediction, row, origin) for row in present}
 
 
-def find_origins(folder: TensorFolder, samples: npt.NDArray[np.int64]) -> Doubles:
+def _find_origins(folder: TensorFolder, samples: Integers) -> Floats:
     """Find the samples' last positions on the carriageway (B, 2)."""
     return np.asarray(locate_rows(folder, folder.sample_row[samples]), dtype=np.float64)
 
 
-def place_forecast(model: str, prediction: Prediction, row: int, origin_m: Doubles) -> Forecast:
-    """Move one prediction of a batch from the sample's last position (2,) to the carriageway.
-
-    Raises:
-        NotFiniteError: a position is not a finite number.
-    """
-    position = prediction.position_m[row].astype(np.float64) + origin_m
-    if not np.isfinite(position).all():
+def _place_forecast(model: str, prediction: Prediction, row: int, origin_m: Floats) -> Forecast:
+    """Move one prediction of a batch from the sample's last position (2,) to the carriageway."""
+    position_m, density = prediction.position_m[row] + origin_m, prediction.density
+    if not np.isfinite(position_m).all():
         raise NotFiniteError(model, "positions")
-    return Forecast(
-        model=model,
-        position_m=position,
-        alternatives=() if prediction.density is None else _place_density(prediction.density, row, origin_m),
-        lateral=_name_maneuvers(LATERAL_MANEUVERS, prediction.lateral, row),
-        longitudinal=_name_maneuvers(LONGITUDINAL_MANEUVERS, prediction.longitudinal, row),
-    )
+    alternatives = () if density is None else _place_density(density, row, origin_m)
+    lateral = _name_maneuvers(LATERAL_MANEUVERS, prediction.lateral, row)
+    longitudinal = _name_maneuvers(LONGITUDINAL_MANEUVERS, prediction.longitudinal, row)
+    return Forecast(model, position_m, alternatives, lateral, longitudinal)
 
 
-def _place_density(density: Density, row: int, origin_m: Doubles) -> tuple[Alternative, ...]:
-    weight = density.weight[row].astype(np.float64)
+def _place_density(density: Density, row: int, origin_m: Floats) -> tuple[Alternative, ...]:
     return tuple(
         Alternative(
-            probability=float(weight[a]),
-            mean_m=density.mean_m[row, a].astype(np.float64) + origin_m,
+            probability=float(density.weight[row, a]),
+            mean_m=density.mean_m[row, a] + origin_m,
             sigma_m=density.sigma_m[row, a].astype(np.float64),
             correlation=density.correlation[row, a].astype(np.float64),
         )
-        for a in np.argsort(-weight, kind="stable")
+        for a in np.argsort(-density.weight[row], kind="stable")
     )
 
 

@@ -9,14 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tracklake.schemas.arrays import Floats
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.batches import SceneBatch
 from tracklake.training.data.namespaces import expand_groups
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.forecasts import Doubles, Forecast
-
-Role = Literal["own", "neighbor", "other"]
+from tracklake.training.plots.forecasts import Forecast
 
 
 @dataclass(frozen=True)
@@ -29,16 +27,15 @@ class Vehicle:
         role: `own` for the sample's vehicle, `neighbor` in its 13 x 3 grid, else `other`.
         history_m: (h, 2) front centres up to this tick; 1 <= h <= H.
         future_m: (f, 2) true positions after 1, 2, ... ticks; 0 <= f <= F.
-        length_m: NaN where unknown.
-        width_m: NaN where unknown.
+        length_m: NaN where unknown; `width_m` likewise.
         forecasts: in the models' order.
     """
 
     vehicle_id: int
     sample: int
-    role: Role
-    history_m: Doubles
-    future_m: Doubles
+    role: Literal["own", "neighbor", "other"]
+    history_m: Floats
+    future_m: Floats
     length_m: float
     width_m: float
     forecasts: tuple[Forecast, ...] = ()
@@ -69,13 +66,8 @@ class Picture:
     Args:
         sample: number of the sample.
         part: part of the split that holds the sample.
-        split: name of the split.
-        dataset: data set of the sample.
-        subset: subset of the sample.
         time_s: seconds since the recording began.
-        rate_hz: ticks per second.
-        lateral: the sample's true lateral maneuver.
-        longitudinal: the sample's true longitudinal maneuver.
+        lateral: true lateral maneuver; `longitudinal` likewise.
         markings_m: y of the lanes' borders, from the left edge to the right one.
         marked: whether the borders are known; else lanes are NOMINAL_LANE_M wide.
         vehicles: the sample's own first, then by id.
@@ -120,6 +112,23 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
     if not 0 <= sample < len(folder.sample_row):
         raise IndexError(f"samples are numbered 0 to {len(folder.sample_row) - 1:,}, got {sample}")
     batch = folder.gather_scenes([int(folder.scene_of_sample[sample])], absolute=True)
+    members, _ = expand_groups(folder.scene_offset, batch.scene)
+    pairs, _ = expand_groups(folder.neighbor_offset, np.asarray([sample]))
+    near = np.isin(folder.scene_row[members], folder.neighbor_row[pairs])
+    runs = folder.runs_of(folder.scene_row[members])
+    vehicles = tuple(
+        Vehicle(
+            vehicle_id=int(batch.vehicle_id[v]),
+            sample=int(batch.sample[v]),
+            role="own" if batch.sample[v] == sample else "neighbor" if near[v] else "other",
+            history_m=batch.history[v][batch.history_mask[v]].astype(np.float64),
+            future_m=batch.future[v][batch.future_mask[v]].astype(np.float64),
+            length_m=float(folder.run_length_m[runs[v]]),
+            width_m=float(folder.run_width_m[runs[v]]),
+            forecasts=tuple(forecasts.get(int(batch.vehicle_id[v]), ())),
+        )
+        for v in np.argsort(batch.sample != sample, kind="stable")
+    )
     row = int(folder.sample_row[sample])
     run = int(folder.runs_of(np.asarray([row]))[0])
     tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
@@ -137,30 +146,5 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
         longitudinal=LONGITUDINAL_MANEUVERS[folder.sample_longitudinal[sample]],
         markings_m=tuple(float(border) for border in markings),
         marked=bool(facts["lane_markings_m"]),
-        vehicles=_list_vehicles(folder, batch, sample, forecasts),
-    )
-
-
-def _list_vehicles(
-    folder: TensorFolder, batch: SceneBatch, sample: int, forecasts: Mapping[int, Sequence[Forecast]]
-) -> tuple[Vehicle, ...]:
-    """List the vehicles of the scene: the sample's own, then the others in their order."""
-    member, _ = expand_groups(folder.scene_offset, batch.scene)
-    row = folder.scene_row[member]
-    run = folder.runs_of(row)
-    pairs, _ = expand_groups(folder.neighbor_offset, np.asarray([sample]))
-    near = np.isin(row, folder.neighbor_row[pairs])
-    order = np.argsort(batch.sample != sample, kind="stable")
-    return tuple(
-        Vehicle(
-            vehicle_id=int(batch.vehicle_id[v]),
-            sample=int(batch.sample[v]),
-            role="own" if batch.sample[v] == sample else "neighbor" if near[v] else "other",
-            history_m=batch.history[v][batch.history_mask[v]].astype(np.float64),
-            future_m=batch.future[v][batch.future_mask[v]].astype(np.float64),
-            length_m=float(folder.run_length_m[run[v]]),
-            width_m=float(folder.run_width_m[run[v]]),
-            forecasts=tuple(forecasts.get(int(batch.vehicle_id[v]), ())),
-        )
-        for v in order
+        vehicles=vehicles,
     )
