@@ -9,20 +9,9 @@ import altair as alt
 
 from tracklake.schemas.chart_theme import BLUE, GREEN, INK, MUTED, ORANGE, PAPER, PURPLE
 from tracklake.schemas.errors import UsageError
+from tracklake.training.plots import picture_rows
 from tracklake.training.plots.charts import Drawing, Layers, fix_scale, name_rows
 from tracklake.training.plots.picture import Picture
-from tracklake.training.plots.picture_rows import (
-    View,
-    choose_view,
-    find_likely,
-    list_boxes,
-    list_ellipses,
-    list_errors,
-    list_lanes,
-    list_markings,
-    list_paths,
-    list_probabilities,
-)
 
 MODEL_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 MODEL_SHAPES = ("circle", "square", "diamond", "triangle-up")
@@ -60,18 +49,20 @@ def draw_picture(picture: Picture) -> Drawing:
     models = picture.models
     if not 1 <= len(models) <= MOST_MODELS:
         raise UsageError(f"a drawing shows 1 to {MOST_MODELS} models, got {len(models)}: {', '.join(models)}")
-    view = choose_view(picture)
+    view = picture_rows.choose_view(picture)
     lane_m = (picture.markings_m[-1] - picture.markings_m[0]) / (len(picture.markings_m) - 1)
     height = round(min(max(LANE_HEIGHT * (view.last_y_m - view.first_y_m) / lane_m, LEAST_HEIGHT), MOST_HEIGHT))
     pixel_x_m, pixel_y_m = (view.last_x_m - view.first_x_m) / WIDTH, (view.last_y_m - view.first_y_m) / height
     rows = {
-        "markings": list_markings(picture),
-        "lanes": list_lanes(picture),
-        "boxes": list_boxes(picture, view),
-        "paths": list_paths(picture, view),
-        "ellipses": list_ellipses(picture),
-        "probabilities": list_probabilities(picture, view, step_x_m=26 * pixel_x_m, step_y_m=16 * pixel_y_m),
-        "errors": list_errors(picture),
+        "markings": picture_rows.list_markings(picture),
+        "lanes": picture_rows.list_lanes(picture),
+        "boxes": picture_rows.list_boxes(picture, view),
+        "paths": picture_rows.list_paths(picture, view),
+        "ellipses": picture_rows.list_ellipses(picture),
+        "probabilities": picture_rows.list_probabilities(
+            picture, view, step_x_m=26 * pixel_x_m, step_y_m=16 * pixel_y_m
+        ),
+        "errors": picture_rows.list_errors(picture),
         "zero": [{"error_m": 0}],
     }
     to = _Channels.make(view, models, stretch=pixel_x_m / pixel_y_m)
@@ -95,14 +86,14 @@ def describe_maneuvers(picture: Picture) -> list[str]:
     return lines
 
 
-def describe_marks(picture: Picture, view: View) -> list[str]:
+def describe_marks(picture: Picture, view: picture_rows.View) -> list[str]:
     """Describe the marks that the legend does not show, in one line; no line where there are none."""
     others, own = any(vehicle.has_density for vehicle in picture.vehicles[1:]), picture.own.has_density
     sigmas = f"{'1 and ' if own else ''}3 sigma at each second{', of others 3' if own and others else ''}"
     marks = {
         f"ellipses: {sigmas}": own or others,
-        "thin lines: less probable, with probability": any(map(find_likely, picture.own.forecasts)),
-        "outlined vehicle: size unknown": not all(box["known"] for box in list_boxes(picture, view)),
+        "thin lines: less probable, with probability": any(map(picture_rows.find_likely, picture.own.forecasts)),
+        "outlined vehicle: size unknown": not all(box["known"] for box in picture_rows.list_boxes(picture, view)),
         "lanes of 12 ft, as no markings are known": not picture.marked,
     }
     line = "; ".join(text for text, present in marks.items() if present)
@@ -120,7 +111,7 @@ class _Channels:
     shape: alt.Shape
 
     @classmethod
-    def make(cls, view: View, models: tuple[str, ...], stretch: float) -> "_Channels":
+    def make(cls, view: picture_rows.View, models: tuple[str, ...], stretch: float) -> "_Channels":
         names, count = ["history", "truth", *models], len(models)
         columns = max(1, WIDTH // (LEGEND_SYMBOL + LEGEND_LETTER * max(map(len, names))))
         legend = alt.Legend(title=None, labelColor=INK, symbolSize=70, columns=columns)

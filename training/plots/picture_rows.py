@@ -8,8 +8,7 @@ import numpy as np
 
 from tracklake.schemas.arrays import Floats
 from tracklake.training.plots.charts import Row
-from tracklake.training.plots.forecasts import Alternative, Forecast
-from tracklake.training.plots.picture import Picture, Vehicle
+from tracklake.training.plots.picture import Alternative, Forecast, Picture, Vehicle
 
 UNKNOWN_SIZE_M = (4.5, 1.8)
 """Length and width drawn, as an outline, where a vehicle's size is unknown."""
