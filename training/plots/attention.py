@@ -101,10 +101,7 @@ class AttentionMap:
 def export_attention(
     folder: TensorFolder, network: "SceneAttention", samples: npt.ArrayLike, out_dir: Path
 ) -> list[Path]:
-    """Write a drawing and a JSON table per sample; files of the same names are replaced.
-
-    Returns:
-        Drawing and table of the first sample, of the second ...
+    """Write a drawing and a JSON table per sample, and return their paths; files of the same names are replaced.
 
     Raises:
         IndexError: no sample has the number.
@@ -268,6 +265,7 @@ def _draw_road(shown: AttentionMap, head: int) -> Layers:
     )
     across = partial(alt.Y, scale=fix_scale(rightmost, leftmost), axis=None)
     bands, boxes = (name_rows(name, f"datum.head === {head}") for name in ("bands", "boxes"))
+    ego = boxes.transform_filter("datum.own")
     area = {"y": across("left_m:Q"), "y2": "right_m:Q"}
     box = {"x": along("back_m:Q"), "x2": "front_m:Q", **area}
     middles = boxes.transform_calculate(centre_m="(datum.back_m + datum.front_m) / 2")
@@ -279,9 +277,7 @@ def _draw_road(shown: AttentionMap, head: int) -> Layers:
         ),
         name_rows("markings").mark_rule(color=MUTED, strokeDash=[10, 8]).encode(y=across("y_m:Q")),
         boxes.mark_rect(stroke=MUTED, strokeWidth=1, cornerRadius=2).encode(**box, **_shade(shown, lanes=False)),
-        boxes.transform_filter("datum.own")
-        .mark_rect(fillOpacity=0, stroke=INK, strokeWidth=2.5, cornerRadius=2)
-        .encode(**box),
+        ego.mark_rect(fillOpacity=0, stroke=INK, strokeWidth=2.5, cornerRadius=2).encode(**box),
         bands.mark_text(align="left", color=INK, fontSize=12).encode(
             x=alt.value(ROAD_WIDTH + 6), y=across("middle_m:Q"), text="label:N"
         ),

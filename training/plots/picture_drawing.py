@@ -146,12 +146,8 @@ def _either(test: str, yes: str | float | list[int], no: str | float | list[int]
 
 def _draw_road(to: _Channels) -> Iterator[alt.Chart]:
     edge, markings = "datum.edge", name_rows("markings").encode(y=to.across("y_m:Q"))
-    yield (
-        markings.transform_filter(edge)
-        .transform_aggregate(top="min(y_m)", bottom="max(y_m)")
-        .mark_rect(color=ASPHALT)
-        .encode(y=to.across("top:Q"), y2="bottom:Q")
-    )
+    asphalt = markings.transform_filter(edge).transform_aggregate(top="min(y_m)", bottom="max(y_m)")
+    yield asphalt.mark_rect(color=ASPHALT).encode(y=to.across("top:Q"), y2="bottom:Q")
     yield markings.mark_rule().encode(
         color=_either(edge, MUTED, LANE_LINE),
         strokeWidth=_either(edge, 2, 1.5),
@@ -173,47 +169,36 @@ def _draw_vehicles(to: _Channels, present: list[str], own: str) -> Iterator[alt.
     histories = name_rows("paths", "datum.kind === 'history'").mark_line(strokeWidth=1.5, clip=True)
     yield histories.encode(x=to.along("x_m:Q"), y=to.across("y_m:Q"), color=role, detail="path:N", order="tick:Q")
     for shown, style in (("datum.known", {"stroke": PAPER, "strokeWidth": 1}), ("!datum.known", {"filled": False})):
-        yield (
-            name_rows("boxes", shown)
-            .mark_rect(cornerRadius=2, clip=True, **style)
-            .encode(x=to.along("back_m:Q"), x2="front_m:Q", y=to.across("left_m:Q"), y2="right_m:Q", color=role)
-        )
+        boxes = name_rows("boxes", shown).mark_rect(cornerRadius=2, clip=True, **style)
+        boxes = boxes.encode(x=to.along("back_m:Q"), x2="front_m:Q", y=to.across("left_m:Q"), y2="right_m:Q")
+        yield boxes.encode(color=role)
 
 
 def _draw_paths(to: _Channels) -> Iterator[alt.Chart]:
     place = {"x": to.along("x_m:Q"), "y": to.across("y_m:Q"), "stroke": to.stroke}
     own, inner, thin = "datum.own", "datum.sigmas === 1", "datum.kind === 'alternative'"
     faint = alt.when(inner).then(alt.value(0.16)).when(own).then(alt.value(0.06)).otherwise(alt.value(0.02))
-    yield (
-        name_rows("ellipses")
-        .mark_line(interpolate="linear-closed", clip=True)
-        .encode(
-            **place,
-            fill=to.fill,
-            detail=["ellipse:N", "own:N", "sigmas:N"],
-            order="order:Q",
-            strokeWidth=_either(inner, 1.2, 0.8),
-            strokeOpacity=_either(own, 0.9, 0.5),
-            fillOpacity=faint,
-        )
+    ellipses = name_rows("ellipses").mark_line(interpolate="linear-closed", clip=True)
+    yield ellipses.encode(
+        **place,
+        fill=to.fill,
+        detail=["ellipse:N", "own:N", "sigmas:N"],
+        order="order:Q",
+        strokeWidth=_either(inner, 1.2, 0.8),
+        strokeOpacity=_either(own, 0.9, 0.5),
+        fillOpacity=faint,
     )
-    yield (
-        name_rows("paths", "datum.kind !== 'history'")
-        .mark_line(clip=True)
-        .encode(
-            **place,
-            strokeDash=_either("datum.kind === 'truth'", TRUTH_DASH, SOLID),
-            detail=["path:N", "kind:N", "role:N"],
-            order="tick:Q",
-            strokeWidth=_either(f"datum.role === 'own' && !({thin})", 2, 1.2),
-            strokeOpacity=_either(thin, 0.55, 1),
-        )
+    futures = name_rows("paths", "datum.kind !== 'history'").mark_line(clip=True)
+    yield futures.encode(
+        **place,
+        strokeDash=_either("datum.kind === 'truth'", TRUTH_DASH, SOLID),
+        detail=["path:N", "kind:N", "role:N"],
+        order="tick:Q",
+        strokeWidth=_either(f"datum.role === 'own' && !({thin})", 2, 1.2),
+        strokeOpacity=_either(thin, 0.55, 1),
     )
-    yield (
-        name_rows("paths", "datum.marked")
-        .mark_point(strokeWidth=1.6, opacity=1, clip=True)
-        .encode(**place, fill=to.fill, shape=to.shape, size=_either("datum.kind === 'history'", 12, 50))
-    )
+    marked = name_rows("paths", "datum.marked").mark_point(strokeWidth=1.6, opacity=1, clip=True)
+    yield marked.encode(**place, fill=to.fill, shape=to.shape, size=_either("datum.kind === 'history'", 12, 50))
     labels = name_rows("probabilities").encode(x=to.along("x_m:Q"), y=to.across("y_m:Q"))
     yield labels.mark_rule(strokeWidth=0.8, opacity=0.7).encode(x2="end_x_m:Q", y2="end_y_m:Q", stroke=to.stroke)
     text = partial(labels.encode(text="label:N").mark_text, align="left", dx=3, fontSize=13)
@@ -239,9 +224,8 @@ def _draw_error(to: _Channels, error: str, has_density: bool) -> Layers:
     errors = name_rows("errors").transform_calculate(series="datum.model").encode(x=x, y=value(f"{error}_m:Q"))
     own = errors.transform_filter("datum.own")
     mean, sigma = f"datum.{error}_m", f"datum.{error}_sigma_m"
-    band = own.transform_filter(f"isValid({sigma})").transform_calculate(
-        low=f"{mean} - {sigma}", high=f"{mean} + {sigma}"
-    )
+    band = own.transform_filter(f"isValid({sigma})")
+    band = band.transform_calculate(low=f"{mean} - {sigma}", high=f"{mean} + {sigma}")
     under = [
         band.mark_area(opacity=0.15).encode(y=value("low:Q"), y2="high:Q", fill=to.fill),
         name_rows("zero").mark_rule(color=MUTED).encode(y=value("error_m:Q")),
