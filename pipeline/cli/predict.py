@@ -16,9 +16,8 @@ from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.attention_drawing import export_attention
-from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
-from tracklake.training.plots.picture import Picture, take_picture
+from tracklake.training.plots.attention import export_attention
+from tracklake.training.plots.picture import Picture, forecast_samples, forecast_scene, take_picture
 from tracklake.training.plots.picture_drawing import draw_picture
 from tracklake.training.plots.picture_rows import list_errors
 from tracklake.training.plots.sample_choice import MOST_SEARCHED, find_sample, pick_samples

@@ -12,8 +12,7 @@ from tracklake.schemas.errors import UsageError
 
 Row = dict[str, Any]
 Layers = alt.LayerChart | alt.FacetChart
-"""What `altair.layer` returns."""
-Layout = alt.Chart | Layers | alt.HConcatChart | alt.VConcatChart
+"""Type of `altair.layer`."""
 
 _THEME = make_config(background=PAPER, padding=14, label=13, title=13, heading=17)
 _LEGENDS = {"labelLimit": 0, "layout": {"top": {"direction": "vertical", "margin": 0}}}
@@ -26,14 +25,9 @@ SUFFIXES = (".svg", ".png")
 
 @dataclass(frozen=True)
 class Drawing:
-    """A chart and its rows.
+    """A chart of `altair.NamedData`, and its rows by name; Altair takes seconds to copy and check rows."""
 
-    Args:
-        layout: charts of `altair.NamedData`; Altair would copy and check rows at every step, which takes seconds.
-        rows: the data, by name.
-    """
-
-    layout: Layout
+    layout: alt.VConcatChart
     rows: dict[str, list[Row]]
 
     def to_vega_lite(self) -> dict[str, Any]:
@@ -41,10 +35,7 @@ class Drawing:
         return {**self.layout.to_dict(validate=False), "config": CONFIG, "datasets": self.rows}
 
     def render(self, suffix: str) -> bytes:
-        """Make the bytes of a file.
-
-        Args:
-            suffix: one of SUFFIXES, in any case.
+        """Make the bytes of a file; the suffix is one of SUFFIXES, in any case.
 
         Raises:
             UsageError: another suffix.
@@ -54,8 +45,20 @@ class Drawing:
         if suffix.lower() == ".png":
             png: bytes = vl_convert.vegalite_to_png(self.to_vega_lite(), scale=PNG_SCALE)
             return png
-        svg: str = vl_convert.vegalite_to_svg(self.to_vega_lite())
-        return _renumber(svg).encode("utf-8")
+        return _renumber(vl_convert.vegalite_to_svg(self.to_vega_lite())).encode("utf-8")
+
+
+def name_rows(name: str, *conditions: str) -> alt.Chart:
+    """Start a chart of the named rows that meet all conditions, Vega expressions of `datum`."""
+    chart = alt.Chart(alt.NamedData(name))
+    for condition in conditions:
+        chart = chart.transform_filter(condition)
+    return chart
+
+
+def fix_scale(first: float, last: float) -> alt.Scale:
+    """Make a scale of exactly this range."""
+    return alt.Scale(domain=[first, last], nice=False, zero=False)
 
 
 def _renumber(svg: str) -> str:

@@ -3,9 +3,8 @@
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
-from tracklake.schemas.arrays import Flags, Integers
+from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -36,36 +35,32 @@ def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
     Raises:
         NoSampleError: no such subset, vehicle or time, or the vehicle is written in another form.
     """
-    name, colon, number = vehicle.rpartition(":")
-    if not colon or not name or not number.isascii() or not number.isdigit():
+    name, _, number = vehicle.rpartition(":")
+    if not name or not number.isascii() or not number.isdigit():
         raise NoSampleError(f"expected a vehicle as SUBSET:ID, for instance 02-lower:21, got `{vehicle}`")
     full = [f"{subset['dataset']}/{subset['subset']}" for subset in folder.index["subsets"]]
     subsets = [at for at, known in enumerate(full) if name in (known, known.partition("/")[2])]
     if not subsets:
         raise NoSampleError(f"{folder.path}: no subset `{name}`: expected one of {', '.join(sorted(full))}")
     if len(subsets) > 1:
-        raise NoSampleError(
-            f"{folder.path}: several subsets `{name}`: name one of {', '.join(full[at] for at in subsets)}"
-        )
+        names = ", ".join(full[at] for at in subsets)
+        raise NoSampleError(f"{folder.path}: several subsets `{name}`: name one of {names}")
     run = folder.runs_of(folder.sample_row)
     inside = np.flatnonzero(folder.run_subset[run] == subsets[0])
     ids = folder.run_vehicle_id[run[inside]]
     own = inside[ids == int(number)]
+    missing = f"{folder.path}: no sample of vehicle {number} in {name}"
     if len(own) == 0:
         known = np.unique(ids)
         near = np.sort(known[np.argsort(np.abs(known - float(number)), kind="stable")[:5]])
-        nearest = ", ".join(map(str, near)) or "none"
-        raise NoSampleError(
-            f"{folder.path}: no sample of vehicle {number} in {name}; the nearest ids with any: {nearest}"
-        )
-    rate_hz = folder.protocol.rate_hz
+        raise NoSampleError(f"{missing}; the nearest ids with any: {', '.join(map(str, near)) or 'none'}")
     rows = folder.sample_row[own].astype(np.int64)
-    times_s = (folder.run_first_tick[run[own]] + rows - folder.run_first_row[run[own]]) / rate_hz
+    times_s = (folder.run_first_tick[run[own]] + rows - folder.run_first_row[run[own]]) / folder.protocol.rate_hz
     best = int(np.argmin(np.abs(times_s - time_s)))
-    if not abs(times_s[best] - time_s) < 0.5 / rate_hz:
+    if not abs(times_s[best] - time_s) < 0.5 / folder.protocol.rate_hz:
         raise NoSampleError(
-            f"{folder.path}: no sample of vehicle {number} in {name} at {time_s:g} s: it has {len(own):,} from "
-            f"{times_s.min():g} to {times_s.max():g} s; the nearest is at {times_s[best]:g} s"
+            f"{missing} at {time_s:g} s: it has {len(own):,} from {times_s.min():g} to {times_s.max():g} s; "
+            f"the nearest is at {times_s[best]:g} s"
         )
     return int(own[best])
 
@@ -73,26 +68,23 @@ def find_sample(folder: TensorFolder, vehicle: str, time_s: float) -> int:
 def pick_samples(
     folder: TensorFolder, part: str, pick: Pick, *, count: int = 1, seed: int = 0, judge: Forecaster | None = None
 ) -> Integers:
-    """Choose samples of a kind: numbers (count,), or fewer where there are fewer.
+    """Choose samples of a kind: at most `count` numbers.
 
-    Samples with a whole future come first, then, among lane changes, those that happen after the sample.
-
-    Args:
-        folder: tensors.
-        part: train, val or eval.
-        pick: the kind; `worst`: greatest distance at the last known position, the worst first.
-        count: most samples.
-        seed: seed of the draw.
-        judge: the model whose distances count; needed by `worst`.
+    Samples with a whole future come first, then, among lane changes, those that happen after the sample. `worst` are
+    those with the greatest distance at the last known position, the worst first, of the model `judge`.
 
     Raises:
         NoSampleError: no sample is of the kind.
     """
     samples = folder.samples_of(part)
-    found = samples[_is_kind(folder, samples, pick)]
+    keep = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
+    normal = folder.sample_longitudinal[samples] == LONGITUDINAL_MANEUVERS.index("normal")
+    kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
+    found = samples[kinds[pick]] if pick in kinds else samples
     found = _prefer(found, folder.sample_future[found] == folder.protocol.horizon_ticks)
     if pick == "lane-change":
-        found = _prefer(found, _changes_lane(folder, found))
+        row = folder.sample_row[found].astype(np.intp)
+        found = _prefer(found, folder.lane[row + folder.sample_future[found]] != folder.lane[row])
     if len(found) == 0:
         raise NoSampleError(
             f"{folder.path}: no sample to pick by `{pick}` among the {len(samples):,} of part `{part}` of the split "
@@ -109,7 +101,12 @@ def pick_samples(
     return found[np.argsort(-distance, kind="stable")[:count]]
 
 
-def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Forecaster) -> npt.NDArray[np.float64]:
+def _prefer(samples: Integers, flagged: Flags) -> Integers:
+    """Keep the flagged samples if there are any, else all."""
+    return samples[flagged] if flagged.any() else samples
+
+
+def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Forecaster) -> Floats:
     """Measure the distance in m between predicted and true position at each sample's last known tick (B,)."""
     distances = []
     for start in range(0, len(samples), BATCH_SIZE):
@@ -120,23 +117,3 @@ def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Foreca
         apart = (position_m - truth.future)[np.arange(len(last)), last]
         distances.append(np.hypot(apart[:, 0], apart[:, 1]))
     return np.concatenate(distances)
-
-
-def _is_kind(folder: TensorFolder, samples: Integers, pick: Pick) -> Flags:
-    """Find which samples (B,) are of a kind."""
-    keep = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
-    normal = folder.sample_longitudinal[samples] == LONGITUDINAL_MANEUVERS.index("normal")
-    kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
-    return kinds.get(pick, np.ones(len(samples), dtype=np.bool_))
-
-
-def _changes_lane(folder: TensorFolder, samples: Integers) -> Flags:
-    """Find whether the last known lane of the future differs from the sample's (B,)."""
-    row = folder.sample_row[samples].astype(np.intp)
-    changes: Flags = folder.lane[row + folder.sample_future[samples]] != folder.lane[row]
-    return changes
-
-
-def _prefer(samples: Integers, flagged: Flags) -> Integers:
-    """Keep the flagged samples if there are any, else all."""
-    return samples[flagged] if flagged.any() else samples

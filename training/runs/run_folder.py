@@ -18,7 +18,7 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, find_model, require_torch
-from tracklake.training.models.recipes import Recipe
+from tracklake.training.models import Recipe
 from tracklake.training.runs.checkpoint import DamagedFileError, is_unfinished, load_weights, read_torch_file
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from drawn_moment import FAR, NEAR, OWN, OWN_SAMPLE, open_moment, sure
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracklake.training.plots.forecasts import forecast_scene
-from tracklake.training.plots.picture import take_picture
+from tracklake.training.plots.picture import forecast_scene, take_picture
 from tracklake.training.plots.picture_rows import (
     choose_view,
     list_boxes,

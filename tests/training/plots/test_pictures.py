@@ -10,8 +10,7 @@ from lane_tracks import open_tracks, track
 
 from tracklake.training.data.observed import FutureInputError, ObservedScene
 from tracklake.training.models.prediction import NotFiniteError, Prediction
-from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
-from tracklake.training.plots.picture import take_picture
+from tracklake.training.plots.picture import forecast_samples, forecast_scene, take_picture
 from tracklake.training.runs.forecasters import Forecaster, UnknownRunError, open_forecaster
 
 

@@ -8,8 +8,7 @@ import pytest
 from drawn_moment import OWN, OWN_SAMPLE, open_moment, sure
 
 from tracklake.schemas.errors import UsageError
-from tracklake.training.plots.forecasts import forecast_samples, forecast_scene
-from tracklake.training.plots.picture import take_picture
+from tracklake.training.plots.picture import forecast_samples, forecast_scene, take_picture
 from tracklake.training.plots.picture_drawing import MODEL_COLOURS, MODEL_SHAPES, describe_marks, draw_picture
 from tracklake.training.plots.picture_rows import choose_view
 from tracklake.training.runs.forecasters import open_forecaster

@@ -10,7 +10,7 @@ from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, open_moment
 from tensor_tables import TINY
 
 from tracklake.training.models import find_model
-from tracklake.training.plots.attention_drawing import (
+from tracklake.training.plots.attention import (
     choose_extent,
     describe_head,
     draw_attention,
@@ -18,8 +18,8 @@ from tracklake.training.plots.attention_drawing import (
     list_bands,
     list_boxes,
     list_weights,
+    map_attention,
 )
-from tracklake.training.plots.attention_maps import map_attention
 
 HEADS = 2
 
@@ -97,14 +97,14 @@ def test_what_is_drawn_of_a_head(shown):
     assert describe_head(alone, 1) == (
         "the ego attends most to itself (100%) and no lane, as none is known; in the decoder to itself (100%)"
     )
-    assert [(row["lane"], row["top_m"], row["bottom_m"], row["label"]) for row in list_bands(shown, 0)] == [
+    assert [(row["lane"], row["left_m"], row["right_m"], row["label"]) for row in list_bands(shown, 0)] == [
         ("left", -6, -2, "left (33%)"),
         ("own", -2, 2, "own (67%)"),
     ]
     own, near, far = list_boxes(shown, 0)
     assert (own["own"], near["own"]) == (True, False)
     assert (near["front_m"], near["back_m"]) == pytest.approx((5, 0.8))
-    assert (near["top_m"], near["bottom_m"]) == pytest.approx((-4.76, -3.24))
+    assert (near["left_m"], near["right_m"]) == pytest.approx((-4.76, -3.24))
     assert far["front_m"] - far["back_m"] == pytest.approx(4.5), "of unknown size"
     assert [box["label"] for box in (own, near, far)] == ["ego (17%)", "1 (33%)", "2 (50%)"]
     weights = {(row["matrix"], row["by"], row["to"]): row["weight"] for row in list_weights(shown, 0)}
