@@ -2,7 +2,7 @@
 
 A negative log likelihood here is the negative logarithm of the density in nats, with every constant, of positions in
 metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`. In training and in
-evaluation (`training.evaluation.densities`, which also mixes alternatives) it is the same. The code published with
+evaluation (`training.evaluation.scores`, which also mixes alternatives) it is the same. The code published with
 convolutional social pooling differs in two places, neither repeated here: the branch of its test that mixes
 maneuvers halves the second axis's square and the term between the axes twice, and what it subtracts to turn a density
 per square foot into one per square metre is 0.516, the decimal logarithm of 3.2808, where it should be 2 ln 3.2808 =
