@@ -2,9 +2,9 @@
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +32,13 @@ LATENCY_MOMENTS = 20
 
 
 @dataclass(frozen=True)
-class Latency:
-    """Median time to predict all samples of a moment at once on one thread, in ms, and the median number of them."""
-
-    latency_ms: float
-    latency_samples: float
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
     Args:
         scores: scores by dataset, group, average and horizon.
         nearest: largest number of vehicles around the ego in the model's input; None where it reads the grid.
-        latency: None where it was not measured.
+        latency: see `measure_latency`; empty where it was not measured.
     """
 
     model: str
@@ -57,7 +49,7 @@ class Evaluation:
     vehicles: int
     scores: tuple[Score, ...]
     nearest: int | None = None
-    latency: Latency | None = None
+    latency: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def horizons(self) -> tuple[Score, ...]:
@@ -80,9 +72,9 @@ class Evaluation:
             "origin": "measured",
             "reference": "",
         }
-        latency = asdict(self.latency) if self.latency is not None else {}
         rows = [
-            shared | asdict(own) | (latency if own.dataset == own.group == EVERYTHING else {}) for own in self.scores
+            shared | asdict(own) | (dict(self.latency) if own.dataset == own.group == EVERYTHING else {})
+            for own in self.scores
         ]
         return pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
 
@@ -178,8 +170,11 @@ def measure_errors(
 
 def measure_latency(
     predictor: Predictor, folder: TensorFolder, part: str, *, reads: Reads = "grid", nearest: int = NEAREST
-) -> Latency:
-    """Predict some moments of a part, evenly spread over it, each by itself; the part has samples."""
+) -> dict[str, float]:
+    """Measure the median time to predict all samples of a moment on one thread, in ms, and the median number of them.
+
+    The moments are evenly spread over the part, which has samples; the time to read them is left out.
+    """
     spent, counts = [], []
     with _use_one_thread():
         for number, scene in enumerate(choose_moments(folder, part, LATENCY_MOMENTS)):
@@ -191,7 +186,7 @@ def measure_latency(
             predictor.predict(observed)
             spent.append(time.perf_counter() - start)
             counts.append(len(samples))
-    return Latency(latency_ms=1000.0 * float(np.median(spent)), latency_samples=float(np.median(counts)))
+    return {"latency_ms": 1000.0 * float(np.median(spent)), "latency_samples": float(np.median(counts))}
 
 
 @contextmanager

@@ -46,10 +46,8 @@ _HALVES = (0.5, 1.0, 1.5, 2.0)
 class Published:
     """One line of a published table.
 
-    Args:
-        model: name in the registry, or in the publication where the registry has no such model.
-        protocols: protocols whose figures it is shown beside.
-        figures: a value for each horizon, by column of `schemas.evaluations.FIGURES`.
+    `model` is the registry's name, or the publication's; `protocols` are shown beside it. `figures` hold a value by
+    horizon for each column of `schemas.evaluations.FIGURES`.
     """
 
     model: str
@@ -115,9 +113,7 @@ CELL_ACCURACY: dict[str, tuple[float, ...]] = {
 def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
     """List the figures published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
 
-    Args:
-        protocol: name of the protocol; one without published figures has no rows.
-        datasets: datasets of the part that is evaluated: figures on other public recordings are left out. None: all.
+    `datasets` are those of the part that is evaluated: figures on other public recordings are left out. None: all.
     """
     lines = [
         line

@@ -22,6 +22,7 @@ from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,
     Examples,
+    LaneForestSettings,
     draw_balanced,
     gather_examples,
     label_samples,
@@ -35,7 +36,6 @@ from tracklake.training.lane_changes.forest import (
     fit_examples,
     fit_lane_forest,
 )
-from tracklake.training.lane_changes.settings import LaneForestSettings
 
 FACTS = {"protocol": {"name": "short"}, "blocks": [], "train_subsets": ["highd/a"]}
 FEW = LaneForestSettings(trees=7, leaf=3, augmentation=(), examples=400)

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -134,7 +134,7 @@ def test_scores_by_hand(one_change):
     assert {row.stratum: row.n for row in scores.maneuvers} == counts
     nobody = by_key(scores, model="straight", column="place", seconds=2.0, stratum="decelerating, changing")
     assert (nobody.n, nobody.cell, nobody.majority) == (0, None, None)
-    json.dumps(scores.to_dict(), allow_nan=False)
+    json.dumps(asdict(scores), allow_nan=False)
 
 
 def test_a_true_place_outside_is_never_right(tmp_path):

@@ -1,11 +1,12 @@
-"""Scores of predicted cells: columns from a model's own places or from the forest, rows from the model's places.
+"""Scores of predicted cells and maneuvers, and the learning curve of the forest.
 
-True places and labels come from the future: predictions are compared with them and grouped by them. Models and the
-forest read only what `training.data.observed` holds.
+Columns of cells are those of a model's own places, or the forest's; rows are those of the model's places. True
+places and labels come from the future: predictions are compared with them and grouped by them. Models and the forest
+read only what `training.data.observed` holds.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,19 @@ from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
+    ALL,
+    Examples,
+    LabelledSamples,
+    LaneForestSettings,
     Targets,
     cut_numbers,
+    draw_balanced,
+    gather_examples,
     label_samples,
-    list_horizons,
     read_targets,
 )
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
-from tracklake.training.lane_changes.forest import LaneForest, decide_classes
+from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
 from tracklake.training.models import MODELS, Predictor, Reads
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.inputs import read_samples, truth_of_ego
@@ -37,25 +43,26 @@ COLUMNS = np.array([{"keep": 0, "left": -1, "right": 1}[name] for name in LATERA
 """Column of each class of the forest."""
 MOST = 200_000
 """Largest number of samples that are scored; of a larger part, so many are drawn."""
+SIZES = (250, 500, 1000, 2000, 4000)
+"""Numbers of examples drawn, before augmentation."""
+MOST_SCORED = 20_000
+"""Largest number of samples that each forest is scored on."""
 
 
 @dataclass(frozen=True)
 class CellScore:
-    """Scores of one model at one horizon, over all samples or one stratum. Shares are None where n is 0.
+    """Scores of one model at one horizon, over all samples or one stratum: shares of n samples, None where n is 0.
 
     Args:
-        model: name of the model.
         column: source of the column: `place`, the model's own, or `forest`.
-        seconds: horizon, s.
         stratum: name from `examples.STRATA`, or `all`.
-        n: number of samples behind each share.
-        cell: share of samples in the predicted cell; a true place outside the nine is never right.
+        cell: samples in the predicted cell; a true place outside the nine is never right.
         row: the same of rows alone.
         lane: the same of columns alone.
         cell_clipped: as `cell`, if the outer columns and rows had no end.
-        majority: share of the most frequent true cell: what a constant prediction of it would reach.
-        own_lane: share of true places in the own column.
-        outside: share of true places outside the nine cells.
+        majority: the most frequent true cell: what a constant prediction reaches.
+        own_lane: true places in the own column.
+        outside: true places outside the nine cells.
     """
 
     model: str
@@ -76,13 +83,8 @@ class CellScore:
 class ManeuverScore:
     """Scores of the forest's maneuvers, over all samples or one stratum. None: no such sample.
 
-    Args:
-        stratum: as in `CellScore`.
-        n: number of samples.
-        accuracy: share of samples whose most probable maneuver is the label.
-        recall: the same of the samples of each label.
-        balanced: mean of the recalls that are not None.
-        majority: share of the most frequent label.
+    `accuracy` is the share of samples whose most probable maneuver is the label, `recall` the same by label, `balanced`
+    the mean of the recalls, `majority` the share of the most frequent label.
     """
 
     stratum: str
@@ -95,23 +97,12 @@ class ManeuverScore:
 
 @dataclass(frozen=True)
 class GridScores:
-    """Scores of cells and maneuvers on one part.
-
-    Args:
-        cells: scores by model, column, horizon and stratum.
-        maneuvers: scores by stratum.
-        left_out: number of the part's samples that are not scored.
-        left_out_by_reason: the same by `examples.LEFT_OUT`.
-    """
+    """Scores of cells and maneuvers on one part, and the number of its samples that are not scored, by LEFT_OUT."""
 
     cells: list[CellScore]
     maneuvers: list[ManeuverScore]
     left_out: int
     left_out_by_reason: dict[str, int]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to plain values."""
-        return asdict(self)
 
 
 class _ForestPredictor:
@@ -140,17 +131,10 @@ def evaluate_grid(
     """Score models by the cells of their predicted places, at every horizon of the forest.
 
     Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
-    `examples.label_samples`, with the forest's T_d.
+    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn.
 
-    Args:
-        folder: tensors of the protocol that forest and models were made for.
-        predictors: models by name.
-        forest: fitted forest.
-        part: train, val or eval.
-        reads: input of each model; by default as in the registry, or else `grid`.
-        most: largest number of samples.
-        seed: seed of the draw where there are more.
-        on_skip: called with the name of a model that cannot be scored, and the reason. None: the first one is raised.
+    Each model reads its `reads`: by default as in the registry, or else `grid`. `on_skip` is called with the name of a
+    model that cannot be scored, and the reason; where it is None, the first refusal is raised.
 
     Raises:
         FutureInputError: the forest or a model sees the future.
@@ -218,13 +202,7 @@ def predict_places(
 
 
 def find_cells(place_m: Singles, straight_m: Singles, targets: Targets) -> Codes:
-    """Find the columns and rows of places: (S, T, 2).
-
-    Args:
-        place_m: (S, T, 2) places relative to the sample's last position.
-        straight_m: (S, T, 2) constant-velocity places.
-        targets: S samples as observed; their true places are not used.
-    """
+    """Find the columns and rows (S, T, 2) of places (S, T, 2), from constant-velocity places and observed targets."""
     speed_mps, ego = (targets.feature[:, FEATURE_NUMBER[name]] for name in ("relative_speed_mps", "ego"))
     column = find_columns(place_m[..., 1], targets.lanes)
     row = find_rows(place_m[..., 0], straight_m[..., 0], measure_rows(speed_mps, ego))
@@ -279,15 +257,107 @@ def _mean(flags: Flags) -> float | None:
 
 
 def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:
-    """Convert the forest's horizons to ticks ahead: (T,).
-
-    Raises:
-        TracklakeError: the forest was fitted at another rate, or for horizons that the folder does not score.
-    """
-    protocol, scored = folder.protocol, list_horizons(folder.protocol)
+    """Convert the forest's horizons to ticks ahead (T,); refuse other rates, and horizons the folder does not score."""
+    protocol = folder.protocol
+    scored = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
     if forest.rate_hz != protocol.rate_hz or not set(forest.horizons_s) <= set(scored):
         raise TracklakeError(
             f"the forest was fitted at {forest.rate_hz} Hz for horizons of {forest.horizons_s} s; {folder.path} is of "
             f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
         )
     return tuple(round(seconds * protocol.rate_hz) for seconds in forest.horizons_s)
+
+
+@dataclass(frozen=True)
+class LearningPoint:
+    """Scores on the evaluation part of a forest fitted on `drawn` examples, before augmentation.
+
+    `n` samples are scored; `accuracy`, `balanced` and `majority` are those of `ManeuverScore`, and `lane` is the share
+    of samples whose lane at the last horizon is right.
+    """
+
+    drawn: int
+    augmented: bool
+    seed: int
+    n: int
+    accuracy: float | None
+    balanced: float | None
+    lane: float
+    majority: float | None
+
+
+def learn_curve(
+    folder: TensorFolder,
+    *,
+    sizes: Sequence[int] = SIZES,
+    seeds: Sequence[int] = (0, 1, 2),
+    settings: LaneForestSettings | None = None,
+) -> list[LearningPoint]:
+    """Fit forests on growing draws from the training part, and score each on the evaluation part.
+
+    All points of a curve have the same mix, equally many examples of each stratum, or the curve would show how the mix
+    changes. So it ends where the smallest stratum is used up; larger sizes are cut to that size, once. The larger draws
+    of a seed hold the smaller ones. Each draw is fitted with the augmentation of the settings, and without.
+
+    Raises:
+        TracklakeError: one of the parts has no samples, or none whose maneuver is known; or see `fit_examples`.
+    """
+    settings = settings or LaneForestSettings()
+    pool, scored = (label_samples(folder, part, settings) for part in ("train", "eval"))
+    _refuse_empty(folder, {"train": pool, "eval": scored}, settings)
+    counts = pool.count_strata()
+    counts = counts[counts > 0]
+    most = int(len(counts) * counts.min())
+    sizes = sorted({min(size, most) for size in sizes})
+    # Samples that any of the draws needs are read once.
+    largest = {seed: draw_balanced(pool.stratum, sizes[-1], np.random.default_rng(seed)) for seed in seeds}
+    needed = np.unique(np.concatenate(list(largest.values())))
+    examples = gather_examples(folder, pool.select(needed))
+    truth = gather_examples(folder, scored.draw(MOST_SCORED, seed=0))
+    points: list[LearningPoint] = []
+    for seed in seeds:
+        own, stratum = np.searchsorted(needed, largest[seed]), pool.stratum[largest[seed]]
+        for size in sizes:
+            drawn = examples.select(own[draw_balanced(stratum, size, np.random.default_rng(seed))])
+            for augmentation in dict.fromkeys([(), settings.augmentation]):
+                changed = replace(settings, augmentation=augmentation, examples=size)
+                points += _fit_and_score(folder, drawn, truth, changed, seed)
+    return points
+
+
+def _refuse_empty(folder: TensorFolder, pools: dict[str, LabelledSamples], settings: LaneForestSettings) -> None:
+    """Refuse parts without samples, or without samples whose maneuver is known."""
+    empty = [part for part, pool in pools.items() if not len(pool)]
+    without = [part for part in empty if not len(folder.samples_of(part))]
+    if without:
+        raise TracklakeError(
+            f"{folder.path}: a learning curve is fitted on `train` and scored on `eval`, and the split "
+            f"`{folder.split}` has no samples in {' and '.join(f'`{part}`' for part in without)}; with a single "
+            "recording everything trains: add recordings and run `tracklake split`"
+        )
+    if empty:
+        raise TracklakeError(
+            f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
+            f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
+        )
+
+
+def _fit_and_score(
+    folder: TensorFolder, examples: Examples, truth: Examples, settings: LaneForestSettings, seed: int
+) -> Iterator[LearningPoint]:
+    """Fit a forest and score it: a point, or none where all examples are of one class."""
+    if len(np.unique(examples.maneuver)) < 2:
+        return
+    forest = fit_examples(examples, settings, seed, protocol=folder.protocol)
+    decided = decide_classes(forest.predict_proba(truth.feature))
+    score = score_maneuvers(ALL, decided[:, 0], truth.maneuver)
+    yield LearningPoint(
+        drawn=len(examples),
+        augmented=bool(settings.augmentation),
+        seed=seed,
+        n=score.n,
+        accuracy=score.accuracy,
+        balanced=score.balanced,
+        lane=float((decided[:, -1] == truth.ahead[:, -1]).mean()),
+        majority=score.majority,
+    )
