@@ -20,16 +20,16 @@ from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_er
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-from tracklake.training.lane_changes import (
-    ForestError,
-    LaneForest,
-    LaneForestSettings,
+from tracklake.training.lane_changes.examples import ALL, LaneForestSettings
+from tracklake.training.lane_changes.forest import ForestError, LaneForest, fit_lane_forest
+from tracklake.training.lane_changes.scores import (
+    SIZES,
+    CellScore,
+    GridScores,
+    LearningPoint,
     evaluate_grid,
-    fit_lane_forest,
     learn_curve,
 )
-from tracklake.training.lane_changes.examples import ALL
-from tracklake.training.lane_changes.scores import SIZES, CellScore, GridScores, LearningPoint
 from tracklake.training.models import MODELS, Predictor, Reads
 from tracklake.training.runs.forecasters import open_forecaster
 

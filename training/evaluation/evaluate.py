@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -108,14 +107,13 @@ def evaluate(
     """
     folder = TensorFolder.open(tensors)
     own = open_forecaster(name, folder, models, frozenset({part}))
-    ticks, rate_hz = range(1, folder.protocol.horizon_ticks + 1), folder.protocol.rate_hz
-    seconds = [tick / rate_hz for tick in ticks] if every_tick else None
-    evaluation = measure_errors(
-        own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds
-    )
-    if not with_latency:
-        return evaluation
-    return replace(evaluation, latency=measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest))
+    ticks = range(1, folder.protocol.horizon_ticks + 1)
+    seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
+    found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)
+    if with_latency:
+        latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
+        found = replace(found, latency=latency)
+    return found
 
 
 def measure_errors(
@@ -176,7 +174,11 @@ def measure_latency(
     The moments are evenly spread over the part, which has samples; the time to read them is left out.
     """
     spent, counts = [], []
-    with _use_one_thread():
+    torch = sys.modules.get("torch")  # None: not in use
+    threads = torch.get_num_threads() if torch else 1
+    try:
+        if torch:
+            torch.set_num_threads(1)
         for number, scene in enumerate(choose_moments(folder, part, LATENCY_MOMENTS)):
             samples = find_scene_samples(folder, scene)
             observed, _ = read_samples(folder, samples, reads, nearest=nearest)
@@ -186,19 +188,7 @@ def measure_latency(
             predictor.predict(observed)
             spent.append(time.perf_counter() - start)
             counts.append(len(samples))
-    return {"latency_ms": 1000.0 * float(np.median(spent)), "latency_samples": float(np.median(counts))}
-
-
-@contextmanager
-def _use_one_thread() -> Iterator[None]:
-    """Let torch compute on one thread for a while, if it is in use at all."""
-    torch = sys.modules.get("torch")
-    if torch is None:
-        yield
-        return
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
     finally:
-        torch.set_num_threads(threads)
+        if torch:
+            torch.set_num_threads(threads)
+    return {"latency_ms": 1000.0 * float(np.median(spent)), "latency_samples": float(np.median(counts))}

@@ -74,13 +74,7 @@ SAMPLE_CHANGES: Mapping[str, Change] = {
 
 
 def refuse_future(
-    predictor: Predictor,
-    folder: TensorFolder,
-    part: str,
-    *,
-    name: str,
-    reads: Reads = "grid",
-    nearest: int = NEAREST,
+    predictor: Predictor, folder: TensorFolder, part: str, *, name: str, reads: Reads = "grid", nearest: int = NEAREST
 ) -> None:
     """Refuse a model whose predictions of some moments, evenly spread over a part, change with what comes after them.
 

@@ -47,16 +47,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Strata:
-    """Strata of a part, P of them: samples of one stratum are summed together.
+    """Strata of a part, (P,) each but for `of_sample` (S_part,), the stratum of each of its samples in their order.
 
-    Args:
-        of_sample: (S_part,) stratum of each of the part's samples, in their order.
-        vehicle: (P,) vehicle of each stratum, never falling.
-        dataset: (P,) position in `datasets`.
-        lateral: (P,) true maneuver, position in LATERAL_MANEUVERS.
-        longitudinal: (P,) true maneuver, position in LONGITUDINAL_MANEUVERS.
-        findings: (P,) number of severities of FINDING_GROUPS that the samples' worst finding reaches; 0: no finding.
-        datasets: names of the part's datasets, sorted.
+    Vehicles never fall; maneuvers are true ones, by LATERAL_MANEUVERS and LONGITUDINAL_MANEUVERS; `dataset` is the
+    position in `datasets`, sorted; `findings` counts the severities of FINDING_GROUPS that the worst finding reaches.
     """
 
     of_sample: Integers
@@ -103,14 +97,10 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
 
 
 def find_nll(density: Density, future: Singles) -> Floats:
-    """Compute -ln p of each true place in nats, p in 1/m2: (B, F); not finite where there is no density (sigma 0).
+    """Compute -ln p of true places (B, F, 2), m, in nats, p in 1/m2: (B, F); not finite where a sigma is 0.
 
     A mixture's density is the weighted sum of its alternatives' densities, summed in logarithms, so that a place far
     out gives a large number and not infinity.
-
-    Args:
-        density: predicted density of B samples.
-        future: (B, F, 2) true places relative to the sample's last position, m.
 
     Source: the density of the bivariate normal distribution; Bishop 1994, Mixture density networks, for the mixture.
     """

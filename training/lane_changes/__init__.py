@@ -6,17 +6,3 @@
 Source: Choi, Yim, Baek and Lee 2021, Machine Learning-Based Vehicle Trajectory Prediction Using V2V Communications and
 On-Board Sensors, Electronics 10(4), 420, https://doi.org/10.3390/electronics10040420.
 """
-
-from tracklake.training.lane_changes.examples import LaneForestSettings
-from tracklake.training.lane_changes.forest import ForestError, LaneForest, fit_lane_forest
-from tracklake.training.lane_changes.scores import GridScores, evaluate_grid, learn_curve
-
-__all__ = [
-    "ForestError",
-    "GridScores",
-    "LaneForest",
-    "LaneForestSettings",
-    "evaluate_grid",
-    "fit_lane_forest",
-    "learn_curve",
-]

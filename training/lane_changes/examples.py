@@ -109,12 +109,8 @@ class LaneForestSettings:
 class LabelledSamples:
     """Samples of one part whose maneuver is known, B of them.
 
-    Args:
-        sample: (B,) sample numbers, increasing.
-        maneuver: (B,) position in LATERAL_MANEUVERS; from the future.
-        stratum: (B,) position in STRATA; from the future.
-        reasons: number of the part's samples left out, by LEFT_OUT.
-        changes: number of lane changes in the whole folder.
+    Numbers increase. Maneuvers, by LATERAL_MANEUVERS, and strata, by STRATA, come from the future. `reasons` count the
+    part's other samples by LEFT_OUT, and `changes` the lane changes in the whole folder.
     """
 
     sample: Integers
@@ -154,12 +150,9 @@ class LabelledSamples:
 
 @dataclass(frozen=True)
 class Examples:
-    """Features and classes that a forest learns from and is scored on. B examples, T horizons.
+    """Features (B, features), maneuvers (B,), and lanes (B, T) at each horizon, that a forest learns from.
 
-    Args:
-        feature: (B, features) in the order of `features.FEATURES`.
-        maneuver: (B,) position in LATERAL_MANEUVERS.
-        ahead: (B, T) lane at each horizon relative to the lane now, in the same codes; two lanes away counts as one.
+    Lanes are relative to the lane now, in codes of LATERAL_MANEUVERS; two lanes away counts as one.
     """
 
     feature: Singles

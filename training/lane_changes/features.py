@@ -71,21 +71,13 @@ def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:
     scenes = np.arange(len(observed.history))
     known = observed.history_mask.sum(axis=2)
     ego, found = find_egos(observed, known)
-    target_motion = _Motion.fit(observed.history[:, 0], known[:, 0], rate_hz)
-    ego_motion = _Motion.fit(observed.history[scenes, ego], known[scenes, ego], rate_hz)
+    target_motion = _fit_motion(observed.history[:, 0], known[:, 0], rate_hz)
+    ego_motion = _fit_motion(observed.history[scenes, ego], known[scenes, ego], rate_hz)
     ego_at = observed.history[scenes, ego, -1].astype(np.float64)
     centre, width = observed.lanes[:, 1, 0].astype(np.float64), observed.lanes[:, 1, 1].astype(np.float64)
-    relative = (
-        found,
-        find_columns(ego_at[:, 1], observed.lanes),
-        -ego_at[:, 0],
-        -ego_at[:, 1],
-        target_motion.speed - ego_motion.speed,
-        target_motion.accel - ego_motion.accel,
-        target_motion.lateral_speed - ego_motion.lateral_speed,
-        target_motion.heading - ego_motion.heading,
-        target_motion.yaw_rate - ego_motion.yaw_rate,
-    )
+    speed, accel, lateral_speed, _, heading, yaw_rate = target_motion - ego_motion
+    ego_column = find_columns(ego_at[:, 1], observed.lanes)
+    relative = (found, ego_column, -ego_at[:, 0], -ego_at[:, 1], speed, accel, lateral_speed, heading, yaw_rate)
     columns = (
         *target_motion,
         -observed.history[:, 0, 0, 1].astype(np.float64),
@@ -138,27 +130,19 @@ def shift_targets(features: Singles, shift_m: npt.NDArray[np.floating]) -> Singl
     return shifted
 
 
-class _Motion(NamedTuple):
-    """Motion of M vehicles along and across the road, and of their headings: (M,) each."""
+def _fit_motion(history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> Floats:
+    """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known.
 
-    speed: Floats
-    accel: Floats
-    lateral_speed: Floats
-    lateral_accel: Floats
-    heading: Floats
-    yaw_rate: Floats
-
-    @classmethod
-    def fit(cls, history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> "_Motion":
-        """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known."""
-        ticks = min(history.shape[1], round(FIT_S * rate_hz) + 1)
-        weights = weigh_positions(ticks, rate_hz)[np.minimum(known, ticks)]  # (M, 2, ticks)
-        (speed, lateral_speed), (accel, lateral_accel) = np.einsum(
-            "mot,mtd->odm", weights, history[:, -ticks:].astype(np.float64)
-        )
-        floored = np.maximum(speed, LEAST_SPEED_MPS)
-        yaw_rate = (floored * lateral_accel - lateral_speed * accel) / (floored**2 + lateral_speed**2)
-        return cls(speed, accel, lateral_speed, lateral_accel, np.arctan2(lateral_speed, floored), yaw_rate)
+    Returns:
+        Speed and acceleration along the road, the same across it, heading and yaw rate: (6, M).
+    """
+    ticks = min(history.shape[1], round(FIT_S * rate_hz) + 1)
+    weights = weigh_positions(ticks, rate_hz)[np.minimum(known, ticks)]  # (M, 2, ticks)
+    recent = history[:, -ticks:].astype(np.float64)
+    (speed, lateral_speed), (accel, lateral_accel) = np.einsum("mot,mtd->odm", weights, recent)
+    floored = np.maximum(speed, LEAST_SPEED_MPS)
+    yaw_rate = (floored * lateral_accel - lateral_speed * accel) / (floored**2 + lateral_speed**2)
+    return np.stack([speed, accel, lateral_speed, lateral_accel, np.arctan2(lateral_speed, floored), yaw_rate])
 
 
 def weigh_positions(ticks: int, rate_hz: int) -> Floats:
@@ -205,7 +189,7 @@ def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: fl
     """
     codes = np.arange(len(LATERAL_MANEUVERS))
     values, classes = _standardise_columns(feature), _standardise_columns(maneuver[:, None] == codes)
-    coefficient, between = np.clip(values.T @ classes, -1, 1), np.abs(values.T @ values)
+    coefficient, between = np.clip(values.T @ classes, -1, 1), np.minimum(np.abs(values.T @ values), 1)
     strength = np.abs(coefficient).max(axis=1)
     chosen: list[int] = []
     table = []

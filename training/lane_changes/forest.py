@@ -37,6 +37,7 @@ TRUSTED = ("sklearn.tree._tree.Tree",)
 their node numbers unchecked; `_check_classifier` checks them."""
 FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
 """Facts every forest holds, by type: they determine what it may be scored on."""
+Facts = Mapping[str, Any]
 AGAIN = "; run `tracklake lane-forest` again"
 """End of every message about a file that cannot be used."""
 
@@ -98,8 +99,8 @@ class LaneForest:
         """Read a forest that `save` wrote; nothing in the file is executed.
 
         Raises:
-            ForestError: no such file; it is damaged, of another kind or version, or holds types that are not trusted;
-                its nodes do not make trees; or facts are missing.
+            ForestError: no such file; it is damaged, of another kind or version, holds types that are not trusted or
+                nodes that do not make trees, or lacks facts.
         """
         if not file.is_file():
             raise ForestError(f"{file}: no such file{AGAIN}")
@@ -156,12 +157,7 @@ def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSetting
 
 
 def fit_examples(
-    examples: Examples,
-    settings: LaneForestSettings,
-    seed: int,
-    *,
-    protocol: Protocol,
-    facts: Mapping[str, Any] | None = None,
+    examples: Examples, settings: LaneForestSettings, seed: int, *, protocol: Protocol, facts: Facts | None = None
 ) -> LaneForest:
     """Augment examples, choose features, and fit the trees; `facts` are plain values to keep beside the fit's own.
 
@@ -180,9 +176,8 @@ def fit_examples(
             f"no feature correlates with the maneuver by {least:g} or more (the best, {table[0].feature}, by "
             f"{table[0].strength:.3f}): set `least_correlation` lower"
         )
-    classifier = RandomForestClassifier(
-        n_estimators=settings.trees, min_samples_leaf=settings.leaf, random_state=seed, n_jobs=1
-    )
+    trees, leaf = settings.trees, settings.leaf
+    classifier = RandomForestClassifier(n_estimators=trees, min_samples_leaf=leaf, random_state=seed, n_jobs=1)
     given = augmented.feature[:, [FEATURE_NUMBER[name] for name in names]]
     classifier.fit(given, np.column_stack([augmented.maneuver, augmented.ahead]))
     known = {

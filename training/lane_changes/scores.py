@@ -21,7 +21,6 @@ from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
     ALL,
-    Examples,
     LabelledSamples,
     LaneForestSettings,
     Targets,
@@ -33,7 +32,7 @@ from tracklake.training.lane_changes.examples import (
 )
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
-from tracklake.training.models import MODELS, Predictor, Reads
+from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import NotFiniteError, Prediction
@@ -53,16 +52,10 @@ MOST_SCORED = 20_000
 class CellScore:
     """Scores of one model at one horizon, over all samples or one stratum: shares of n samples, None where n is 0.
 
-    Args:
-        column: source of the column: `place`, the model's own, or `forest`.
-        stratum: name from `examples.STRATA`, or `all`.
-        cell: samples in the predicted cell; a true place outside the nine is never right.
-        row: the same of rows alone.
-        lane: the same of columns alone.
-        cell_clipped: as `cell`, if the outer columns and rows had no end.
-        majority: the most frequent true cell: what a constant prediction reaches.
-        own_lane: true places in the own column.
-        outside: true places outside the nine cells.
+    The `column` is that of the model's own `place`, or the `forest`'s. `cell`, `row` and `lane` are samples in the
+    predicted cell, row and column; a true place outside the nine is never right, but in `cell_clipped`, where outer
+    columns and rows have no end. `majority` is the most frequent true cell: what a constant prediction reaches.
+    `own_lane` and `outside` are true places in the own column, and outside the nine cells.
     """
 
     model: str
@@ -131,10 +124,9 @@ def evaluate_grid(
     """Score models by the cells of their predicted places, at every horizon of the forest.
 
     Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
-    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn.
-
-    Each model reads its `reads`: by default as in the registry, or else `grid`. `on_skip` is called with the name of a
-    model that cannot be scored, and the reason; where it is None, the first refusal is raised.
+    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn. `reads` holds models'
+    inputs, by default `grid`. `on_skip` is called with the name of a model that cannot be scored, and the reason; where
+    it is None, the first refusal is raised.
 
     Raises:
         FutureInputError: the forest or a model sees the future.
@@ -148,17 +140,17 @@ def evaluate_grid(
     if len(samples):
         refuse_future(_ForestPredictor(forest), folder, part, name="lane-forest", reads="scene")
     targets = read_targets(folder, samples.sample, ticks)
-    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, name="straight")
+    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, "straight")
     true = find_cells(targets.place_m, straight_m, targets)
     decided = decide_classes(forest.predict_proba(targets.feature))  # (S, 1 + T)
     forest_column = COLUMNS[decided[:, 1:]]
     strata = samples.find_strata()
-    inputs = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
     cells: list[CellScore] = []
     for name, predictor in predictors.items() if len(samples) else ():
+        kind = (reads or {}).get(name, "grid")
         try:
-            refuse_future(predictor, folder, part, name=name, reads=inputs[name])
-            place_m = predict_places(folder, samples.sample, predictor, ticks, name=name, reads=inputs[name])
+            refuse_future(predictor, folder, part, name=name, reads=kind)
+            place_m = predict_places(folder, samples.sample, predictor, ticks, name, kind)
         except (TracklakeError, FutureInputError, ValueError) as refused:
             if on_skip is None:
                 raise
@@ -173,13 +165,7 @@ def evaluate_grid(
 
 
 def predict_places(
-    folder: TensorFolder,
-    sample: Integers,
-    predictor: Predictor,
-    ticks: tuple[int, ...],
-    *,
-    name: str,
-    reads: Reads = "grid",
+    folder: TensorFolder, sample: Integers, predictor: Predictor, ticks: Sequence[int], name: str, reads: Reads = "grid"
 ) -> Singles:
     """Predict the places of samples (S,) at some ticks ahead (T,): (S, T, 2).
 
@@ -214,14 +200,9 @@ def score_maneuvers(stratum: str, decided: Bytes, label: Bytes) -> ManeuverScore
     right, of_class = decided == label, {name: label == code for code, name in enumerate(LATERAL_MANEUVERS)}
     recall = {name: _mean(right[of]) for name, of in of_class.items()}
     found = [share for share in recall.values() if share is not None]
-    return ManeuverScore(
-        stratum=stratum,
-        n=len(label),
-        accuracy=_mean(right),
-        recall=recall,
-        balanced=sum(found) / len(found) if found else None,
-        majority=max(float(of.mean()) for of in of_class.values()) if len(label) else None,
-    )
+    balanced = sum(found) / len(found) if found else None
+    majority = max(float(of.mean()) for of in of_class.values()) if len(label) else None
+    return ManeuverScore(stratum, len(label), _mean(right), recall, balanced, majority)
 
 
 def _score_cells(
@@ -316,12 +297,19 @@ def learn_curve(
     truth = gather_examples(folder, scored.draw(MOST_SCORED, seed=0))
     points: list[LearningPoint] = []
     for seed in seeds:
-        own, stratum = np.searchsorted(needed, largest[seed]), pool.stratum[largest[seed]]
+        of_seed, stratum = np.searchsorted(needed, largest[seed]), pool.stratum[largest[seed]]
         for size in sizes:
-            drawn = examples.select(own[draw_balanced(stratum, size, np.random.default_rng(seed))])
+            drawn = examples.select(of_seed[draw_balanced(stratum, size, np.random.default_rng(seed))])
+            if len(np.unique(drawn.maneuver)) < 2:  # no forest
+                continue
             for augmentation in dict.fromkeys([(), settings.augmentation]):
                 changed = replace(settings, augmentation=augmentation, examples=size)
-                points += _fit_and_score(folder, drawn, truth, changed, seed)
+                forest = fit_examples(drawn, changed, seed, protocol=folder.protocol)
+                decided = decide_classes(forest.predict_proba(truth.feature))
+                own = score_maneuvers(ALL, decided[:, 0], truth.maneuver)
+                lane = float((decided[:, -1] == truth.ahead[:, -1]).mean())
+                facts = (len(drawn), bool(augmentation), seed, own.n)
+                points.append(LearningPoint(*facts, own.accuracy, own.balanced, lane, own.majority))
     return points
 
 
@@ -340,24 +328,3 @@ def _refuse_empty(folder: TensorFolder, pools: dict[str, LabelledSamples], setti
             f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
             f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
         )
-
-
-def _fit_and_score(
-    folder: TensorFolder, examples: Examples, truth: Examples, settings: LaneForestSettings, seed: int
-) -> Iterator[LearningPoint]:
-    """Fit a forest and score it: a point, or none where all examples are of one class."""
-    if len(np.unique(examples.maneuver)) < 2:
-        return
-    forest = fit_examples(examples, settings, seed, protocol=folder.protocol)
-    decided = decide_classes(forest.predict_proba(truth.feature))
-    score = score_maneuvers(ALL, decided[:, 0], truth.maneuver)
-    yield LearningPoint(
-        drawn=len(examples),
-        augmented=bool(settings.augmentation),
-        seed=seed,
-        n=score.n,
-        accuracy=score.accuracy,
-        balanced=score.balanced,
-        lane=float((decided[:, -1] == truth.ahead[:, -1]).mean()),
-        majority=score.majority,
-    )
