@@ -34,10 +34,8 @@ LATENCY_MOMENTS = 20
 class Evaluation:
     """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
-    Args:
-        scores: scores by dataset, group, average and horizon.
-        nearest: largest number of vehicles around the ego in the model's input; None where it reads the grid.
-        latency: see `measure_latency`; empty where it was not measured.
+    `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
+    `latency` is empty where it was not measured.
     """
 
     model: str

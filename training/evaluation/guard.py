@@ -43,6 +43,8 @@ GREATEST_STEP = 7
 """Largest difference between the amounts by which two successive rows are changed."""
 CYCLE = 4093
 """Number of amounts after which they start again: more than the 255 steps of the longest horizon add up to."""
+LEVELS = len(SEVERITIES)
+"""Number of severities that a finding may have."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Change = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
@@ -59,9 +61,7 @@ ROW_CHANGES: Mapping[str, Change] = {
     "position_m": lambda own: (own + np.outer(_count_up(len(own)), [61, 17])).astype(own.dtype),
     "speed_mps": lambda own: own + _count_up(len(own)).astype(own.dtype),
     "lane": lambda own: own + _count_up(len(own)).astype(own.dtype),
-    "finding": lambda own: ((own + 1 + _count_up(len(own)) % len(SEVERITIES)) % (1 + len(SEVERITIES))).astype(
-        own.dtype
-    ),
+    "finding": lambda own: ((own + 1 + _count_up(len(own)) % LEVELS) % (1 + LEVELS)).astype(own.dtype),
 }
 """How rows after the moment are changed: all arrays by row of `schemas.tensors.ARRAYS`."""
 

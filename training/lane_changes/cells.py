@@ -28,9 +28,8 @@ ROW_S = 1.0
 def find_columns(side_m: npt.NDArray[np.floating], lanes: Singles) -> Codes:
     """Find the columns of places across the road, in the shape of `side_m`.
 
-    Args:
-        side_m: (B, ...) places to the right of each vehicle's place at the moment of prediction, m.
-        lanes: (B, 3, 3) as in `ObservedScene`; an unknown own lane is NOMINAL_LANE_M wide around the vehicle.
+    `side_m` (B, ...) is measured to the right of each vehicle's place at the moment of prediction, m; `lanes` (B, 3, 3)
+    is as in `ObservedScene`. An unknown own lane is NOMINAL_LANE_M wide around the vehicle.
     """
     known = lanes[:, 1, 2] > 0
     axes = tuple(range(1, side_m.ndim))

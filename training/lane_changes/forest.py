@@ -50,12 +50,8 @@ class ForestError(TracklakeError):
 class LaneForest:
     """Random forest that predicts the maneuver under way, and the vehicle's lane at each of T horizons.
 
-    Args:
-        classifier: 1 + T outputs, the maneuver and the lane at each horizon, in codes of LATERAL_MANEUVERS.
-        names: features the classifier reads, in its order.
-        rate_hz: ticks per second of the histories it was fitted on.
-        horizons_s: (T,) horizons, s.
-        facts: how it was fitted: settings, seed, protocol, examples, coefficients; plain values.
+    The classifier has 1 + T outputs, the maneuver and the lane at each horizon, in codes of LATERAL_MANEUVERS; it reads
+    the features `names` in their order. `facts` are plain values that describe the fit.
     """
 
     classifier: RandomForestClassifier

@@ -216,12 +216,9 @@ def _score_cells(
         for stratum, of in strata.items():
             cells = true_cell[of, horizon]
             inside = np.bincount(cells[cells >= 0], minlength=9)
+            key = (model, source, seconds, stratum, len(cells))
             yield CellScore(
-                model=model,
-                column=source,
-                seconds=seconds,
-                stratum=stratum,
-                n=len(cells),
+                *key,
                 cell=_mean(right[of, horizon].all(axis=-1)),
                 row=_mean(right[of, horizon, 1]),
                 lane=_mean(right[of, horizon, 0]),
@@ -253,8 +250,7 @@ def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:
 class LearningPoint:
     """Scores on the evaluation part of a forest fitted on `drawn` examples, before augmentation.
 
-    `n` samples are scored; `accuracy`, `balanced` and `majority` are those of `ManeuverScore`, and `lane` is the share
-    of samples whose lane at the last horizon is right.
+    `lane` is the share of `n` samples whose lane at the last horizon is right; see `ManeuverScore` for the others.
     """
 
     drawn: int
