@@ -8,13 +8,13 @@ from typing import Any
 
 import polars as pl
 from study_claims import judge
+from study_figure import draw_error_growth
 from study_forest import describe_forest
 from study_plan import ARMS, PLAIN, Arm
 from study_tables import FEW, grid, order, pick, show
 
 from tracklake.schemas.evaluations import EVERYTHING, FIGURES
 from tracklake.schemas.protocols import PROTOCOLS
-from tracklake.training.plots.error_figure import draw_error_growth
 
 EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv", "jobs.csv"
 GROUPS = "groups.csv"

@@ -35,7 +35,9 @@ def test_a_rule_is_declared_as_the_recipe_has_it():
     assert rule.name not in {known.name for known in RULES}
     entries = {"vehicle_id": (3,) * 5, "frame": (1, 2, 3, 4, 5), "speed_mps": (69.0, 70.0, 70.5, 71.0, 69.0)}
     scene = lay_out(Case(entries=entries, breaks=(2, 3)))
-    findings = find(prepare(scene, rule.reads), [rule]).select("vehicle_id", "rule", "first_frame", "last_frame", "worst")
+    findings = find(prepare(scene, rule.reads), [rule]).select(
+        "vehicle_id", "rule", "first_frame", "last_frame", "worst"
+    )
     assert findings.rows() == [(3, "too_fast", 3, 4, 71.0)]
     strict = find(prepare(scene, rule.reads), [rule], {"too_fast_mps": 69.0})
     assert strict.select("first_frame", "last_frame").rows() == [(2, 4)]

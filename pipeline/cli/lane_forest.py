@@ -20,17 +20,16 @@ from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_er
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-from tracklake.training.lane_changes import (
-    ForestError,
-    LaneForest,
-    LaneForestSettings,
+from tracklake.training.lane_changes.examples import ALL, LaneForestSettings
+from tracklake.training.lane_changes.forest import ForestError, LaneForest, fit_lane_forest
+from tracklake.training.lane_changes.scores import (
+    SIZES,
+    CellScore,
+    GridScores,
+    LearningPoint,
     evaluate_grid,
-    fit_lane_forest,
     learn_curve,
 )
-from tracklake.training.lane_changes.examples import ALL
-from tracklake.training.lane_changes.grid import CellScore, GridScores
-from tracklake.training.lane_changes.learning_curve import SIZES, LearningPoint
 from tracklake.training.models import MODELS, Predictor, Reads
 from tracklake.training.runs.forecasters import open_forecaster
 
@@ -110,7 +109,7 @@ def lane_forest(
         record = {
             "forest": forest.facts,
             "features": list(forest.names),
-            **scores.to_dict(),
+            **asdict(scores),
             "learning_curve": [],
             "passed_by": skipped,
         }
@@ -123,7 +122,7 @@ def lane_forest(
             except TracklakeError as impossible:
                 no_curve = str(impossible)
             else:
-                record["learning_curve"] = [point.to_dict() for point in curve]
+                record["learning_curve"] = [asdict(point) for point in curve]
                 _write_scores(out / SCORES, record)
                 _show_curve(terminal, curve)
         terminal.print_line(

@@ -1,7 +1,9 @@
 """Scores of a model or a trained run on one part of a split, and the samples and vehicles behind them."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,7 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.guard import refuse_future
-from tracklake.training.evaluation.latency import Latency, measure_latency
+from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
 from tracklake.training.evaluation.scores import Score, Tally, find_strata
 from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
@@ -25,20 +26,16 @@ BATCH_SIZE = 256
 the cache, and it takes nearly twice as long."""
 
 
+LATENCY_MOMENTS = 20
+"""Number of moments that the median time is taken of."""
+
+
 @dataclass(frozen=True)
 class Evaluation:
-    """Scores of a model on one part of a split.
+    """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
-    Args:
-        model: name of the run or model.
-        part: train, val or eval.
-        split: name of the split.
-        protocol: protocol of the tensors.
-        samples: number of samples in the part.
-        vehicles: number of their vehicles.
-        scores: scores by dataset, group, average and horizon.
-        nearest: largest number of vehicles around the ego in the model's input; None where it reads the grid.
-        latency: None where it was not measured.
+    `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
+    `latency` is empty where it was not measured.
     """
 
     model: str
@@ -49,46 +46,34 @@ class Evaluation:
     vehicles: int
     scores: tuple[Score, ...]
     nearest: int | None = None
-    latency: Latency | None = None
+    latency: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def horizons(self) -> tuple[Score, ...]:
         """Scores over all samples, each counting the same, by increasing seconds."""
-        return tuple(
-            own for own in self.scores if (own.dataset, own.group, own.average) == (EVERYTHING, EVERYTHING, "samples")
-        )
+        key = (EVERYTHING, EVERYTHING, "samples")
+        return tuple(own for own in self.scores if (own.dataset, own.group, own.average) == key)
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to plain values for JSON; of the scores `horizons` alone, without the keys they share."""
-        shared = ("dataset", "group", "average")
+        values = {name: getattr(self, name) for name in ("model", "part", "split", "protocol", "samples", "vehicles")}
+        shared = {"dataset", "group", "average"}
         rows = [{name: value for name, value in asdict(own).items() if name not in shared} for own in self.horizons]
-        return {
-            "model": self.model,
-            "part": self.part,
-            "split": self.split,
-            "protocol": self.protocol.name,
-            "samples": self.samples,
-            "vehicles": self.vehicles,
-            "horizons": rows,
-        }
+        return values | {"protocol": self.protocol.name, "horizons": rows}
 
     def to_table(self) -> pl.DataFrame:
         """Convert to rows of `schemas.evaluations.EVALUATIONS`."""
-        shared = {
+        shared = {name: getattr(self, name) for name in ("split", "part", "model", "nearest")} | {
             "protocol": self.protocol.name,
             "protocol_digest": self.protocol.digest,
-            "split": self.split,
-            "part": self.part,
             "origin": "measured",
-            "model": self.model,
             "reference": "",
-            "nearest": self.nearest,
         }
-        latency = asdict(self.latency) if self.latency is not None else {}
         rows = [
-            shared | asdict(own) | (latency if own.dataset == own.group == EVERYTHING else {}) for own in self.scores
+            shared | asdict(own) | (dict(self.latency) if own.dataset == own.group == EVERYTHING else {})
+            for own in self.scores
         ]
-        return EVALUATIONS.empty() if not rows else pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
+        return pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
 
 
 class EmptyPartError(TracklakeError):
@@ -107,34 +92,26 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a trained run, or a model that needs no training.
 
-    Args:
-        name: a run's folder in `models`, or the name of a model that does not learn.
-        tensors: the tensor folder.
-        models: the folder of the runs.
-        part: train, val or eval.
-        nearest: largest number of vehicles around the ego in the input of models of scenes.
-        with_latency: whether to measure how long a prediction takes.
-        every_tick: whether to score every tick of the horizon, not the protocol's seconds alone.
+    `name` is a run's folder in `models`, or a model that does not learn. `nearest` is the largest number of vehicles
+    around the ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon.
 
     Raises:
         TensorError: the tensors are missing or damaged.
-        EmptyPartError: the part has no samples.
         StaleRunError: the run was trained for another protocol, or on subsets that are in this part now; or it is
             unfinished or damaged.
         UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
-        FutureInputError: the model sees what comes after the moment at which it predicts.
         MissingExtraError: torch is needed and missing.
+        TracklakeError: see `measure_errors`.
     """
     folder = TensorFolder.open(tensors)
     own = open_forecaster(name, folder, models, frozenset({part}))
-    ticks, rate_hz = range(1, folder.protocol.horizon_ticks + 1), folder.protocol.rate_hz
-    seconds = [tick / rate_hz for tick in ticks] if every_tick else None
-    evaluation = measure_errors(
-        own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds
-    )
-    if not with_latency:
-        return evaluation
-    return replace(evaluation, latency=measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest))
+    ticks = range(1, folder.protocol.horizon_ticks + 1)
+    seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
+    found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)
+    if with_latency:
+        latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
+        found = replace(found, latency=latency)
+    return found
 
 
 def measure_errors(
@@ -147,16 +124,9 @@ def measure_errors(
     nearest: int = NEAREST,
     seconds: Sequence[float] | None = None,
 ) -> Evaluation:
-    """Predict every sample of a part and sum up the errors, after `training.evaluation.guard.refuse_future`.
+    """Predict every sample of a part and sum up the errors, after `refuse_future`.
 
-    Args:
-        predictor: model to score.
-        folder: tensors of the samples.
-        part: train, val or eval.
-        name: name of the model.
-        reads: input of the model.
-        nearest: largest number of vehicles around the ego in a scene.
-        seconds: horizons to score, s; None for the protocol's.
+    `nearest` is the largest number of vehicles around the ego in a scene; `seconds` None stands for the protocol's.
 
     Raises:
         EmptyPartError: the part has no samples.
@@ -192,3 +162,31 @@ def measure_errors(
         scores=tally.score(at, protocol.rate_hz),
         nearest=nearest if reads == "scene" else None,
     )
+
+
+def measure_latency(
+    predictor: Predictor, folder: TensorFolder, part: str, *, reads: Reads = "grid", nearest: int = NEAREST
+) -> dict[str, float]:
+    """Measure the median time to predict all samples of a moment on one thread, in ms, and the median number of them.
+
+    The moments are evenly spread over the part, which has samples; the time to read them is left out.
+    """
+    spent, counts = [], []
+    torch = sys.modules.get("torch")  # None: not in use
+    threads = torch.get_num_threads() if torch else 1
+    try:
+        if torch:
+            torch.set_num_threads(1)
+        for number, scene in enumerate(choose_moments(folder, part, LATENCY_MOMENTS)):
+            samples = find_scene_samples(folder, scene)
+            observed, _ = read_samples(folder, samples, reads, nearest=nearest)
+            if number == 0:
+                predictor.predict(observed)  # the first call prepares what later ones use
+            start = time.perf_counter()
+            predictor.predict(observed)
+            spent.append(time.perf_counter() - start)
+            counts.append(len(samples))
+    finally:
+        if torch:
+            torch.set_num_threads(threads)
+    return {"latency_ms": 1000.0 * float(np.median(spent)), "latency_samples": float(np.median(counts))}

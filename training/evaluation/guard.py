@@ -1,19 +1,17 @@
 """Check that no prediction depends on what comes after its moment, on the model itself, before it is scored.
 
-A model gets `training.data.observed` only, which refuses every other name. That does not cover a model that reaches the
-tensors another way, nor a reader that lets the future into what is observed. So a few moments are predicted twice: from
-the tensors as they are, and from the same tensors with another future: other places, speeds, lanes and findings, each
-changed by another amount than later ones; other maneuvers; and no track that goes on. Nothing may change.
+`training.data.observed` refuses every name that models may not see. A model may still reach the tensors another way,
+and a reader may let the future into what is observed. So a few moments are predicted twice: from the tensors as they
+are, and from tensors with another future: other places, speeds, lanes and findings, each changed by another amount than
+later ones; other maneuvers; and no track that goes on. Nothing may change.
 
-The check does not find:
+The check does not find a model that
 
-- a model that learnt the answers by heart before (`training.runs.run_folder.refuse_leak` keeps those away), or keeps
-  arrays of the folder from before;
-- one that reads the files again (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
-- one that finds out, in the folder that it holds, which vehicles are a sample, a neighbor (in which cell) or in a scene
-  later;
-- one that uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;
-- one that sees the future at moments that are not checked.
+- learnt the answers before (`training.runs.run_folder.refuse_leak` refuses those), or keeps arrays from before;
+- reads the files again (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
+- finds out, in the folder that it holds, which vehicles are a sample, a neighbor (in which cell) or in a scene later;
+- uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;
+- sees the future at moments that are not checked.
 """
 
 import copy
@@ -33,7 +31,7 @@ from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.inputs import NEAREST, read_samples
-from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.models.prediction import Prediction
 
 MOMENTS = 3
 """Number of moments that are predicted twice."""
@@ -42,40 +40,28 @@ TOLERANCE = 1e-3
 RELATIVE_TOLERANCE = 1e-5
 """Largest difference that is no leak, as a share of the prediction."""
 GREATEST_STEP = 7
-"""Largest difference between the amounts by which two rows in a row are changed."""
+"""Largest difference between the amounts by which two successive rows are changed."""
 CYCLE = 4093
-"""Number of amounts after which they start again: more than 255 steps, the longest horizon, add up to."""
+"""Number of amounts after which they start again: more than the 255 steps of the longest horizon add up to."""
+LEVELS = len(SEVERITIES)
+"""Number of severities that a finding may have."""
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Change = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 
 
 def _count_up(count: int) -> Integers:
-    """Make whole numbers (count,) from 1 to CYCLE that grow by 1 to GREATEST_STEP, irregularly, and then start again.
-
-    Two of them within a horizon of each other are never the same, so that differences between later rows change too.
-    """
+    """Make whole numbers (count,) from 1 to CYCLE that grow irregularly; within a horizon, no two are the same."""
     steps = np.random.default_rng(0).integers(1, GREATEST_STEP + 1, count)
     return 1 + np.cumsum(steps) % CYCLE
 
 
-def _move_places(places: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Change places (n, 2); int16 may wrap: that is another place as well."""
-    moved: npt.NDArray[Any] = places + np.multiply.outer(_count_up(len(places)), np.array([61, 17]))
-    return moved.astype(places.dtype)
-
-
-def _change_findings(finding: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Change findings (n,)."""
-    others: npt.NDArray[Any] = (finding + 1 + _count_up(len(finding)) % len(SEVERITIES)) % (1 + len(SEVERITIES))
-    return others.astype(finding.dtype)
-
-
 ROW_CHANGES: Mapping[str, Change] = {
-    "position_m": _move_places,
-    "speed_mps": lambda speed: speed + _count_up(len(speed)).astype(speed.dtype),
-    "lane": lambda lane: lane + _count_up(len(lane)).astype(lane.dtype),
-    "finding": _change_findings,
+    # int16 may wrap: that is another place as well
+    "position_m": lambda own: (own + np.outer(_count_up(len(own)), [61, 17])).astype(own.dtype),
+    "speed_mps": lambda own: own + _count_up(len(own)).astype(own.dtype),
+    "lane": lambda own: own + _count_up(len(own)).astype(own.dtype),
+    "finding": lambda own: ((own + 1 + _count_up(len(own)) % LEVELS) % (1 + LEVELS)).astype(own.dtype),
 }
 """How rows after the moment are changed: all arrays by row of `schemas.tensors.ARRAYS`."""
 
@@ -88,26 +74,12 @@ SAMPLE_CHANGES: Mapping[str, Change] = {
 
 
 def refuse_future(
-    predictor: Predictor,
-    folder: TensorFolder,
-    part: str,
-    *,
-    name: str,
-    reads: Reads = "grid",
-    nearest: int = NEAREST,
+    predictor: Predictor, folder: TensorFolder, part: str, *, name: str, reads: Reads = "grid", nearest: int = NEAREST
 ) -> None:
-    """Refuse a model whose predictions of some moments change with what comes after them.
+    """Refuse a model whose predictions of some moments, evenly spread over a part, change with what comes after them.
 
     The folder itself changes meanwhile, so that a model which holds it is found out too; no other thread may read it at
     that time. Each prediction is made by a copy of the model.
-
-    Args:
-        predictor: model to check.
-        folder: tensors to predict from.
-        part: part whose moments are predicted: a few, evenly spread over it.
-        name: name of the model in messages.
-        reads: input of the model.
-        nearest: largest number of vehicles around the ego in a scene.
 
     Raises:
         FutureInputError: a prediction changes, or already the input of the model.
@@ -123,8 +95,7 @@ def refuse_future(
             observed, _ = read_samples(folder, samples, reads, nearest=nearest)
             given = {own.name: np.array(getattr(observed, own.name)) for own in fields(observed)}  # before it is used
             # A copy each time: nothing that a model remembers of one prediction goes into the next one.
-            model = copy.deepcopy(predictor, {id(folder): folder})
-            return given, _list_arrays(model.predict(observed))
+            return given, _list_arrays(copy.deepcopy(predictor, {id(folder): folder}).predict(observed))
 
         given, predicted = predict()
         for array, change in ROW_CHANGES.items():
@@ -133,10 +104,17 @@ def refuse_future(
             given_then, predicted_then = predict()
         for array in ROW_CHANGES:
             rows[array][after] = getattr(folder, array)[after]
-        _refuse_changed_input(given, given_then, where, reads)
-        difference = _find_difference(predicted, predicted_then)
-        if difference is not None:
-            _refuse_irreproducible(name, where, predicted, predict()[1])
+        if difference := _find_difference(given, given_then, exactly=True):
+            raise FutureInputError(
+                f"what models are shown {where} changes with what comes after: `{difference[0]}` ({difference[2]}); "
+                f"the reader of `{reads}` must stop at the sample's own tick"
+            )
+        if difference := _find_difference(predicted, predicted_then):
+            if _find_difference(predicted, predict()[1]):
+                raise TracklakeError(
+                    f"`{name}` predicts differently each time from the same input ({where}): fix its seed, so that its "
+                    "scores mean something and it can be checked that it does not see the future"
+                )
             array, at, apart = difference
             sample = f"sample {samples[at]}" if len(predicted[array]) == len(samples) else f"position {at}"
             raise FutureInputError(
@@ -146,38 +124,8 @@ def refuse_future(
             )
 
 
-def _refuse_changed_input(given: Arrays, given_then: Arrays, where: str, reads: Reads) -> None:
-    """Refuse a reader whose arrays change with the future.
-
-    Raises:
-        FutureInputError: the two inputs differ.
-    """
-    difference = _find_difference(given, given_then, exactly=True)
-    if difference is not None:
-        raise FutureInputError(
-            f"what models are shown {where} changes with what comes after: `{difference[0]}` ({difference[2]}); the "
-            f"reader of `{reads}` must stop at the sample's own tick"
-        )
-
-
-def _refuse_irreproducible(name: str, where: str, predicted: Arrays, again: Arrays) -> None:
-    """Refuse a model that predicts differently from the same input.
-
-    Raises:
-        TracklakeError: the two predictions differ.
-    """
-    if _find_difference(predicted, again) is not None:
-        raise TracklakeError(
-            f"`{name}` predicts differently each time from the same input ({where}): fix its seed, so that its scores "
-            "mean something and it can be checked that it does not see the future"
-        )
-
-
 def choose_moments(folder: TensorFolder, part: str, count: int) -> Integers:
-    """Choose at most so many scenes of a part: the middle ones of as many equal stretches of it.
-
-    The very last scenes are not among them, where futures end after a tick.
-    """
+    """Choose at most so many scenes of a part, the middles of equal stretches; futures are short at its end."""
     scenes = folder.scenes_of(part)
     count = min(count, len(scenes))
     return scenes[(2 * np.arange(count) + 1) * len(scenes) // (2 * max(count, 1))]
@@ -190,11 +138,9 @@ def find_scene_samples(folder: TensorFolder, scene: int) -> Integers:
 
 
 def _find_later_rows(folder: TensorFolder, scene: int) -> tuple[str, Integers, Integers]:
-    """Find the rows of a scene's subset at later ticks.
+    """Find the moment of a scene, for messages, the first later row of each run in its subset, and all later rows.
 
-    Returns:
-        The moment, for messages; the first later row of each run, (R,), or the run's end where it has none (all runs of
-        other subsets); the later rows.
+    The second is (R,); it is the run's end where no row is later, and for runs of other subsets.
     """
     row = int(folder.scene_row[folder.scene_offset[scene]])
     run = int(folder.runs_of(np.array([row]))[0])
@@ -207,13 +153,9 @@ def _find_later_rows(folder: TensorFolder, scene: int) -> tuple[str, Integers, I
 
 
 def _cut_runs(folder: TensorFolder, begin: Integers) -> dict[str, npt.NDArray[Any]]:
-    """Make all arrays by run of a folder whose runs end at the moment; what follows are runs of unknown vehicles.
+    """Make all arrays by run with runs cut at `begin` (R,); what follows are runs of unknown vehicles.
 
     Rows keep their places and their ticks, so that nothing changes in what is observed at the moment.
-
-    Args:
-        folder: tensors to cut.
-        begin: (R,) see `_find_later_rows`.
     """
     first, end = folder.run_first_row[:-1], folder.run_first_row[1:]
     cut = np.flatnonzero((first < begin) & (begin < end))
@@ -236,7 +178,7 @@ def _replace_arrays(folder: TensorFolder, arrays: Arrays) -> Iterator[None]:
     own = {field.name: kept[field.name] for field in fields(folder)}
     try:
         vars(folder).clear()
-        vars(folder).update(own | dict(arrays))
+        vars(folder).update(own | {"arrays": {**own["arrays"], **arrays}})
         yield
     finally:
         vars(folder).clear()
@@ -245,10 +187,8 @@ def _replace_arrays(folder: TensorFolder, arrays: Arrays) -> Iterator[None]:
 
 def _list_arrays(prediction: Prediction) -> Arrays:
     """List the arrays of a prediction and its density by name."""
-    parts = {own.name: getattr(prediction, own.name) for own in fields(prediction) if own.name != "density"}
-    if prediction.density is not None:
-        parts |= {own.name: getattr(prediction.density, own.name) for own in fields(Density)}
-    return {name: np.array(values) for name, values in parts.items() if values is not None}
+    parts = vars(prediction) | (vars(prediction.density) if prediction.density else {})
+    return {name: np.array(values) for name, values in parts.items() if name != "density" and values is not None}
 
 
 def _find_difference(one: Arrays, other: Arrays, *, exactly: bool = False) -> tuple[str, int, str] | None:

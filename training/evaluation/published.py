@@ -5,7 +5,6 @@ state (the number of samples, NLL in our unit) stays null.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import polars as pl
 
@@ -47,13 +46,8 @@ _HALVES = (0.5, 1.0, 1.5, 2.0)
 class Published:
     """One line of a published table.
 
-    Args:
-        model: name in the registry, or in the publication where the registry has no such model.
-        reference: publication.
-        dataset: ngsim, highd, or own (the authors').
-        protocols: protocols whose figures it is shown beside.
-        seconds: horizons, s.
-        figures: a value for each horizon, by column of `schemas.evaluations.FIGURES`.
+    `model` is the registry's name, or the publication's; `protocols` are shown beside it. `figures` hold a value by
+    horizon for each column of `schemas.evaluations.FIGURES`.
     """
 
     model: str
@@ -119,24 +113,23 @@ CELL_ACCURACY: dict[str, tuple[float, ...]] = {
 def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
     """List the figures published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
 
-    Args:
-        protocol: name of the protocol; one without published figures has no rows.
-        datasets: datasets of the part that is evaluated: figures on other public recordings are left out. None: all.
+    `datasets` are those of the part that is evaluated: figures on other public recordings are left out. None: all.
     """
-    rows: list[dict[str, Any]] = []
-    for line in PUBLISHED:
-        if protocol not in line.protocols or (datasets is not None and line.dataset not in (*datasets, OWN_DATA)):
-            continue
-        braking = BRAKING_ACCURACY[line.dataset] if line.reference == VALIDATION_2020 else None
-        for at, seconds in enumerate(line.seconds):
-            row: dict[str, Any] = {
-                "protocol": protocol,
-                "origin": "published",
-                "model": line.model,
-                "reference": line.reference,
-            }
-            row |= {"dataset": line.dataset, "group": EVERYTHING, "average": "samples", "seconds": seconds}
-            row |= {"longitudinal_accuracy": braking} | {name: values[at] for name, values in line.figures.items()}
-            rows.append(row)
-    found = pl.DataFrame(rows, schema=EVALUATIONS.dtypes) if rows else EVALUATIONS.empty()
-    return found.sort(EVALUATIONS.key)
+    lines = [
+        line
+        for line in PUBLISHED
+        if protocol in line.protocols and (datasets is None or line.dataset in (*datasets, OWN_DATA))
+    ]
+    shared = {"protocol": protocol, "origin": "published", "group": EVERYTHING, "average": "samples"}
+    rows = [
+        {
+            **shared,
+            **{name: getattr(line, name) for name in ("model", "reference", "dataset")},
+            "seconds": seconds,
+            "longitudinal_accuracy": BRAKING_ACCURACY[line.dataset] if line.reference == VALIDATION_2020 else None,
+            **{name: values[at] for name, values in line.figures.items()},
+        }
+        for line in lines
+        for at, seconds in enumerate(line.seconds)
+    ]
+    return pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)

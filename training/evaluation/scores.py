@@ -1,6 +1,6 @@
-"""Floats of errors over batches, and the figures made of the sums: by vehicle and maneuver, and over all samples.
+"""Errors and NLL summed over batches, and the figures made of the sums: by vehicle, maneuver and finding, and overall.
 
-Samples are summed by stratum: those of one vehicle, with the same maneuvers and equally severe findings. Every group is
+Samples are summed by stratum: those of one vehicle with the same maneuvers and equally severe findings. Every group is
 a union of strata, so that one pass over the samples serves all of them.
 """
 
@@ -10,28 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from tracklake.schemas.arrays import Flags, Floats, Integers
+from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.densities import find_nll
-from tracklake.training.models.prediction import Prediction
+from tracklake.training.models.prediction import Density, Prediction
 
 
 @dataclass(frozen=True)
 class Score:
-    """One row of figures as `schemas.evaluations` defines them; None where there is nothing to measure.
-
-    Args:
-        dataset: name of a dataset, or `all`.
-        group: name of a group, for instance `lateral=left`, or `all`.
-        average: `samples` or `vehicles`.
-        seconds: horizon, s.
-        n: number of samples whose position is known then.
-        vehicles: number of their vehicles.
-    """
+    """One row of figures as `schemas.evaluations` defines them; None where there is nothing to measure."""
 
     dataset: str
     group: str
@@ -56,16 +46,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Strata:
-    """Strata of a part, P of them: samples of one stratum are summed together.
+    """Strata of a part, (P,) each but for `of_sample` (S_part,), the stratum of each of its samples in their order.
 
-    Args:
-        of_sample: (S_part,) stratum of each of the part's samples, in their order.
-        vehicle: (P,) vehicle of each stratum, never falling.
-        dataset: (P,) position in `datasets`.
-        lateral: (P,) true maneuver, position in LATERAL_MANEUVERS.
-        longitudinal: (P,) true maneuver, position in LONGITUDINAL_MANEUVERS.
-        findings: (P,) number of severities of FINDING_GROUPS that the samples' worst finding reaches; 0: no finding.
-        datasets: names of the part's datasets, sorted.
+    Vehicles never fall; maneuvers are true ones, by LATERAL_MANEUVERS and LONGITUDINAL_MANEUVERS; `dataset` is the
+    position in `datasets`, sorted; `findings` counts the severities of FINDING_GROUPS that the worst finding reaches.
     """
 
     of_sample: Integers
@@ -77,20 +61,21 @@ class Strata:
     datasets: tuple[str, ...]
 
     def __len__(self) -> int:
-        """Count the strata."""
+        """Return the number of samples."""
         return len(self.vehicle)
 
     def list_groups(self) -> Iterator[tuple[str, str, Flags]]:
         """List datasets and groups, with the strata (P,) in both."""
         groups = {EVERYTHING: np.ones(len(self), dtype=np.bool_)}
-        groups |= {f"lateral={name}": self.lateral == code for code, name in enumerate(LATERAL_MANEUVERS)}
-        groups |= {
-            f"longitudinal={name}": self.longitudinal == code for code, name in enumerate(LONGITUDINAL_MANEUVERS)
-        }
+        for kind, code, names in (
+            ("lateral", self.lateral, LATERAL_MANEUVERS),
+            ("longitudinal", self.longitudinal, LONGITUDINAL_MANEUVERS),
+        ):
+            groups |= {f"{kind}={name}": code == number for number, name in enumerate(names)}
         for below, (found, others) in enumerate(FINDING_GROUPS.values()):
             groups |= {found: self.findings > below, others: self.findings <= below}
-        for code, dataset in enumerate((EVERYTHING, *self.datasets), start=-1):
-            within = groups[EVERYTHING] if code < 0 else self.dataset == code
+        for number, dataset in enumerate((EVERYTHING, *self.datasets), start=-1):
+            within = groups[EVERYTHING] if number < 0 else self.dataset == number
             for group, members in groups.items():
                 yield dataset, group, members & within
 
@@ -99,26 +84,37 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     """Group samples (S_part,) by vehicle, maneuvers and findings; a vehicle in several runs counts once."""
     run = folder.runs_of(folder.sample_row[samples])
     subset = folder.run_subset[run].astype(np.int64)
-    vehicle = np.unique((subset << 32) | folder.run_vehicle_id[run], return_inverse=True)[1].astype(np.int64)
-    maneuvers = (len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS))
-    code = vehicle * maneuvers[0] + folder.sample_lateral[samples]
-    code = code * maneuvers[1] + folder.sample_longitudinal[samples]
-    levels = 1 + len(FINDING_GROUPS)
-    code = code * levels + sum(folder.mark_flagged(samples, severity).astype(np.int64) for severity in FINDING_GROUPS)
-    found, first, of_sample = np.unique(code, return_index=True, return_inverse=True)
-    names = [str(named["dataset"]) for named in folder.index["subsets"]]
-    datasets = tuple(sorted({names[number] for number in np.unique(subset)}))
-    dataset_of_subset = np.array([datasets.index(name) if name in datasets else -1 for name in names], dtype=np.int64)
-    rest, maneuver = found // levels, found // levels % maneuvers[1]
-    return Strata(
-        of_sample=of_sample.astype(np.int64),
-        vehicle=rest // (maneuvers[0] * maneuvers[1]),
-        dataset=dataset_of_subset[subset[first]],
-        lateral=rest // maneuvers[1] % maneuvers[0],
-        longitudinal=maneuver,
-        findings=found % levels,
-        datasets=datasets,
-    )
+    vehicle = np.unique((subset << 32) | folder.run_vehicle_id[run], return_inverse=True)[1]
+    findings = np.sum([folder.mark_flagged(samples, severity) for severity in FINDING_GROUPS], axis=0)
+    keys = (vehicle, folder.sample_lateral[samples], folder.sample_longitudinal[samples], findings)
+    counts = (1 + len(samples), len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS), 1 + len(FINDING_GROUPS))
+    _, first, of_sample = np.unique(np.ravel_multi_index(keys, counts), return_index=True, return_inverse=True)
+    names = np.array([str(named["dataset"]) for named in folder.index["subsets"]])
+    datasets, dataset = np.unique(names[subset[first]], return_inverse=True)
+    vehicle, lateral, longitudinal, findings = (key[first].astype(np.int64) for key in keys)
+    return Strata(of_sample, vehicle, dataset, lateral, longitudinal, findings, tuple(datasets.tolist()))
+
+
+def find_nll(density: Density, future: Singles) -> Floats:
+    """Compute -ln p of true places (B, F, 2), m, in nats, p in 1/m2: (B, F); not finite where a sigma is 0.
+
+    A mixture's density is the weighted sum of its alternatives' densities, summed in logarithms, so that a place far
+    out gives a large number and not infinity.
+
+    Source: the density of the bivariate normal distribution; Bishop 1994, Mixture density networks, for the mixture.
+    """
+    sigma = density.sigma_m.astype(np.float64)
+    correlation = density.correlation.astype(np.float64)
+    with np.errstate(all="ignore"):  # no density gives NaN or infinity, which the scores refuse
+        away = (future[:, None].astype(np.float64) - density.mean_m) / sigma
+        along, across = away[..., 0], away[..., 1]
+        rest = (1.0 - correlation) * (1.0 + correlation)
+        squared = (along**2 - 2.0 * correlation * along * across + across**2) / rest
+        log_normal = -0.5 * squared - np.log(2.0 * np.pi * sigma[..., 0] * sigma[..., 1]) - 0.5 * np.log(rest)
+        weighted = log_normal + np.log(density.weight.astype(np.float64))[:, :, None]
+        highest = weighted.max(axis=1)
+        nll: Floats = -highest - np.log(np.exp(weighted - highest[:, None]).sum(axis=1))
+    return nll
 
 
 def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Floats]:
@@ -154,12 +150,7 @@ def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Floa
 
 
 class Tally:
-    """Floats of `measure_samples` by stratum and tick, (P, F) each.
-
-    Args:
-        strata: P strata of the part.
-        ticks: number of ticks of the horizon, F.
-    """
+    """Sums of `measure_samples` by stratum and tick, (P, F) each."""
 
     def __init__(self, strata: Strata, ticks: int) -> None:
         self.strata, self._shape = strata, (len(strata), ticks)
@@ -181,8 +172,14 @@ class Tally:
         Raises:
             UsageError: the horizon has no tick at these seconds.
         """
-        ticks = [_find_tick(own, rate_hz, self._shape[1]) for own in seconds]
-        sums = {name: total[:, ticks] for name, total in self.sums.items()}
+        horizon = self._shape[1]
+        at = np.round(np.multiply(seconds, rate_hz)).astype(np.int64)
+        for own, tick in zip(seconds, at, strict=True):
+            if abs(tick - own * rate_hz) > 1e-6 or not 1 <= tick <= horizon:
+                raise UsageError(
+                    f"no tick lies {own:g} s ahead: expected multiples of {1 / rate_hz:g} s up to {horizon / rate_hz:g}"
+                )
+        sums = {name: total[:, at - 1] for name, total in self.sums.items()}
         rows: list[Score] = []
         for dataset, group, members in self.strata.list_groups():
             if group == EVERYTHING:
@@ -193,22 +190,9 @@ class Tally:
     def _count_majority(self, members: Flags, n: Floats) -> dict[str, Floats]:
         """Count samples whose maneuver is a dataset's most frequent one: (P, T); of equally frequent ones the first."""
         samples = np.bincount(self.strata.of_sample, minlength=len(self.strata)) * members
-        counts = {}
-        for name in ("lateral", "longitudinal"):
-            code = getattr(self.strata, name)
-            most_frequent = np.bincount(code, weights=samples).argmax()
-            counts[f"majority_{name}"] = n * (code == most_frequent)[:, None]
-        return counts
-
-
-def _find_tick(seconds: float, rate_hz: int, ticks: int) -> int:
-    """Find the position among the future's ticks that lies so many seconds ahead."""
-    tick = round(seconds * rate_hz)
-    if abs(tick - seconds * rate_hz) > 1e-6 or not 1 <= tick <= ticks:
-        raise UsageError(
-            f"no tick lies {seconds:g} s ahead: expected multiples of {1 / rate_hz:g} s up to {ticks / rate_hz:g}"
-        )
-    return tick - 1
+        codes = {"lateral": self.strata.lateral, "longitudinal": self.strata.longitudinal}
+        most = {name: np.bincount(code, weights=samples).argmax() for name, code in codes.items()}
+        return {f"majority_{name}": n * (code == most[name])[:, None] for name, code in codes.items()}
 
 
 ROOTS = {
@@ -236,12 +220,11 @@ def _score_group(
     dataset: str, group: str, members: Flags, sums: dict[str, Floats], vehicle: Integers, seconds: Sequence[float]
 ) -> Iterator[Score]:
     """Compute the rows of one group, by average and horizon."""
-    chosen = np.flatnonzero(members)
-    if len(chosen):
-        starts = np.unique(vehicle[chosen], return_index=True)[1]
-        by_vehicle = {name: np.add.reduceat(total[chosen], starts, axis=0) for name, total in sums.items()}
-    else:
-        by_vehicle = {name: total[chosen] for name, total in sums.items()}
+    starts = np.unique(vehicle[members], return_index=True)[1]
+    by_vehicle = {
+        name: np.add.reduceat(total[members], starts, axis=0) if len(starts) else total[members]
+        for name, total in sums.items()
+    }
     n = by_vehicle["n"]
     total_n, vehicles = n.sum(axis=0), (n > 0).sum(axis=0)
     for average in AVERAGES:

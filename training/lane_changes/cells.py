@@ -1,8 +1,7 @@
 """Nine cells around the place where a vehicle would be at a horizon if it kept its velocity: 3 lanes by 3 rows.
 
-Columns are lanes: the vehicle's own, and one lane's width to either side. Rows lie along the road: one around the
-constant-velocity place, one behind, one ahead. A place outside all nine has a column or row beyond them, which is no
-cell: it is counted, and a prediction is never right there.
+Columns are lanes: the vehicle's own, and one lane's width to either side. Rows lie along the road: around the
+constant-velocity place, behind and ahead. A place outside all nine is in no cell, where no prediction is right.
 
 Source: Choi et al. 2021, https://doi.org/10.3390/electronics10040420.
 """
@@ -29,10 +28,8 @@ ROW_S = 1.0
 def find_columns(side_m: npt.NDArray[np.floating], lanes: Singles) -> Codes:
     """Find the columns of places across the road, in the shape of `side_m`.
 
-    Args:
-        side_m: (B, ...) places to the right of each vehicle's place at the moment of prediction, m.
-        lanes: (B, 3, 3) as in `ObservedScene`; where the own lane is unknown, one of NOMINAL_LANE_M lies around the
-            vehicle.
+    `side_m` (B, ...) is measured to the right of each vehicle's place at the moment of prediction, m; `lanes` (B, 3, 3)
+    is as in `ObservedScene`. An unknown own lane is NOMINAL_LANE_M wide around the vehicle.
     """
     known = lanes[:, 1, 2] > 0
     axes = tuple(range(1, side_m.ndim))
@@ -42,23 +39,12 @@ def find_columns(side_m: npt.NDArray[np.floating], lanes: Singles) -> Codes:
 
 
 def find_rows(along_m: npt.NDArray[np.floating], middle_m: npt.NDArray[np.floating], length_m: Singles) -> Codes:
-    """Find the rows of places along the road: (B, T).
-
-    Args:
-        along_m: (B, T) places at the horizons.
-        middle_m: (B, T) constant-velocity places at the same horizons.
-        length_m: (B,) length of a row.
-    """
+    """Find the rows (B, T) of places (B, T) from constant-velocity places (B, T) and the length of a row (B,), m."""
     return _round_steps((along_m - middle_m) / length_m[:, None])
 
 
 def measure_rows(relative_speed_mps: Singles, ego: npt.NDArray[Any]) -> Singles:
-    """Compute the length of a row, m: (B,); LEAST_ROW_M where there is no ego.
-
-    Args:
-        relative_speed_mps: (B,) the target's speed minus the ego's.
-        ego: (B,) above 0 where there is an ego.
-    """
+    """Compute the length of a row, m: (B,), from the target's speed minus the ego's; `ego` is 0 where there is none."""
     length_m = np.maximum(LEAST_ROW_M, np.where(ego > 0, np.abs(relative_speed_mps) * ROW_S, 0.0))
     return length_m.astype(np.float32)
 

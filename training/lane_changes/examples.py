@@ -1,21 +1,33 @@
-"""Examples of keeping and changing lanes: samples with known maneuvers, their strata, features and classes."""
+"""Examples of keeping and changing lanes: labels of tracks, strata of samples, and what a forest learns from.
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+Labels use rows after the labelled one: they are for training and for scores, never for a prediction.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Bytes, Flags, Integers, Singles
-from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.gathers import gather_nearest
+from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles, expand_ranges
+from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.errors import UsageError
+from tracklake.schemas.tensors import NOMINAL_LANE_M
+from tracklake.training.data.gathers import gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
 from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets
-from tracklake.training.lane_changes.labels import KEEP, LEFT, RIGHT, find_labelled, find_maneuvers, label_rows
-from tracklake.training.lane_changes.settings import LaneForestSettings
 from tracklake.training.models.inputs import NEAREST
 
+KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))
+
+START_S = 4.0
+"""T_d, time from a maneuver's start to its end, s. The publication gives none; the samples' own lateral maneuvers are
+sought within 4 s, too."""
+TOLERANCE_M = 0.1
+"""Distance from the target lane's centre at which a vehicle has reached it, m."""
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Groups of samples. Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: the label
 is not keep."""
@@ -26,22 +38,78 @@ ALL = "all"
 SPEED_CHANGE_S = 1.0
 """Time between the two speeds that are compared, s."""
 LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
-"""Why a sample is left out: it has no lane now; its track ends before the horizon, or before T_d, so that a change
-would not have been recorded; or its speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
+"""Why a sample is left out: it has no lane now; its track ends before the horizon, or before T_d has passed; or its
+speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
 READ_SAMPLES = 4096
 """Number of samples read at once; their scenes take about 20 MB."""
+AUGMENTATIONS = ("mirror", "shift")
+"""Copies of all examples that a fit can add: on a mirrored road, or with the ego at another distance."""
+
+
+@dataclass(frozen=True)
+class LaneForestSettings:
+    """How examples are labelled, drawn and learned from; stored with the forest.
+
+    Args:
+        start_s: T_d, time from a maneuver's start to its end, s.
+        tolerance_m: distance from a lane's centre at which the vehicle has reached it, m.
+        examples: largest number drawn from the training part, before augmentation.
+        augmentation: names from AUGMENTATIONS.
+        shift_m: largest shift of an ego along the road, either way, m.
+        trees: number of trees.
+        leaf: smallest number of examples in a leaf.
+        least_correlation: smallest correlation of a feature with any class.
+        most_correlation: largest correlation between two features; the one closer to the classes stays.
+    """
+
+    start_s: float = START_S
+    tolerance_m: float = TOLERANCE_M
+    examples: int = 10_000
+    augmentation: tuple[str, ...] = AUGMENTATIONS
+    shift_m: float = 5.0
+    trees: int = 100
+    leaf: int = 20
+    least_correlation: float = 0.05
+    most_correlation: float = 0.95
+
+    def __post_init__(self) -> None:
+        """Raise a UsageError where a value is out of range or an augmentation is unknown."""
+        unknown = sorted(set(self.augmentation) - set(AUGMENTATIONS))
+        if unknown:
+            raise UsageError(f"augmentation: expected {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
+        for name in ("start_s", "examples", "trees", "leaf"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise UsageError(f"{name}: expected more than 0, got {getattr(self, name)}")
+        for name in ("tolerance_m", "shift_m", "least_correlation", "most_correlation"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any]) -> Self:
+        """Read settings from plain values; a missing setting takes its default.
+
+        Raises:
+            UsageError: a setting is unknown, of another type, or out of range.
+        """
+        defaults = {own.name: own.default for own in fields(cls)}
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()
+        }
+        for name, value in values.items():
+            kind = type(defaults.get(name))
+            if name not in defaults or not (type(value) is kind or (type(value), kind) == (int, float)):
+                raise UsageError(
+                    f"expected settings {', '.join(defaults)}, typed as their defaults; got {name} = {value!r}"
+                )
+        return cls(**values)
 
 
 @dataclass(frozen=True)
 class LabelledSamples:
     """Samples of one part whose maneuver is known, B of them.
 
-    Args:
-        sample: (B,) sample numbers, increasing.
-        maneuver: (B,) position in `schemas.columns.LATERAL_MANEUVERS`; from the future.
-        stratum: (B,) position in STRATA; from the future.
-        reasons: number of the part's samples left out, by LEFT_OUT.
-        changes: number of lane changes in the whole folder.
+    Numbers increase. Maneuvers, by LATERAL_MANEUVERS, and strata, by STRATA, come from the future. `reasons` count the
+    part's other samples by LEFT_OUT, and `changes` the lane changes in the whole folder.
     """
 
     sample: Integers
@@ -51,7 +119,7 @@ class LabelledSamples:
     changes: int
 
     def __len__(self) -> int:
-        """Count the samples."""
+        """Return the number of samples."""
         return len(self.sample)
 
     @property
@@ -81,13 +149,9 @@ class LabelledSamples:
 
 @dataclass(frozen=True)
 class Examples:
-    """Features and classes that a forest learns from and is scored on. B examples, T horizons.
+    """Features (B, features), maneuvers (B,), and lanes (B, T) at each horizon, that a forest learns from.
 
-    Args:
-        feature: (B, features) in the order of `features.FEATURES`.
-        maneuver: (B,) position in `schemas.columns.LATERAL_MANEUVERS`.
-        ahead: (B, T) lane of the vehicle at each horizon relative to its lane now, in the same codes: keep, left,
-            right; two lanes away counts as one.
+    Lanes are relative to the lane now, in codes of LATERAL_MANEUVERS; two lanes away counts as one.
     """
 
     feature: Singles
@@ -95,7 +159,7 @@ class Examples:
     ahead: Bytes
 
     def __len__(self) -> int:
-        """Count the examples."""
+        """Return the number of examples."""
         return len(self.feature)
 
     def select(self, which: npt.NDArray[np.integer]) -> "Examples":
@@ -110,35 +174,96 @@ class Examples:
         if "shift" in settings.augmentation:
             shift_m = random.uniform(-settings.shift_m, settings.shift_m, len(self)).astype(np.float32)
             copies.append(replace(self, feature=shift_targets(self.feature, shift_m)))
-        return Examples(
-            np.concatenate([copy.feature for copy in copies]),
-            np.concatenate([copy.maneuver for copy in copies]),
-            np.concatenate([copy.ahead for copy in copies]),
-        )
+        names = (own.name for own in fields(self))
+        return Examples(*(np.concatenate([getattr(copy, name) for copy in copies]) for name in names))
 
 
-@dataclass(frozen=True)
-class Targets:
-    """Samples as a forest and the grid read them, and their true places. B samples, T horizons.
-
-    Args:
-        feature: (B, features) in the order of `features.FEATURES`.
-        lanes: (B, 3, 3) as in `ObservedScene`.
-        place_m: (B, T, 2) true places relative to the sample's last position; from the future.
-    """
+class Targets(NamedTuple):
+    """Features (B, features) and lanes (B, 3, 3) of samples as observed, and their true places (B, T, 2), relative."""
 
     feature: Singles
     lanes: Singles
     place_m: Singles
 
 
+class Maneuvers(NamedTuple):
+    """Lane changes of a folder, (E,) each: the first and the last row, in the order of rows, and LEFT or RIGHT."""
+
+    start_row: Integers
+    end_row: Integers
+    lateral: Bytes
+
+
+def find_maneuvers(folder: TensorFolder, *, start_s: float = START_S, tolerance_m: float = TOLERANCE_M) -> Maneuvers:
+    """Find every lane change of every run, from T_e - T_d to T_e.
+
+    A lane changes where it differs from the row before in the same run; changes from or to an unknown lane (0) do not
+    count. T_e is the first row from then on at which the vehicle is at the new lane's centre (within the tolerance) or
+    beyond it. It is sought until the vehicle leaves the lane, the run ends or T_d has passed; if the centre is not
+    reached by then, T_e is the first of the rows nearest to it. No maneuver starts before its run. Lanes without known
+    markings are NOMINAL_LANE_M wide from the carriageway's left edge on.
+
+    Source: Choi et al. 2021, https://doi.org/10.3390/electronics10040420 (keeping, left and right by T_e and T_d).
+    """
+    lane, rows, ticks = folder.lane, len(folder.lane), round(start_s * folder.protocol.rate_hz)
+    run_begins = np.zeros(rows + 1, dtype=np.bool_)
+    run_begins[folder.run_first_row] = True
+    stay_begins = run_begins.copy()
+    stay_begins[1:-1] |= lane[1:] != lane[:-1]
+    stays = np.flatnonzero(stay_begins)  # first row of each stretch of a run in one lane, and the number of rows
+    first = stays[:-1]
+    changes = np.flatnonzero(~run_begins[first] & (lane[first] > 0) & (lane[first - 1] > 0))
+    if not len(changes):
+        none = np.empty(0, dtype=np.int64)
+        return Maneuvers(none, none, none.astype(np.uint8))
+
+    first, last = first[changes], np.minimum(stays[changes + 1] - 1, first[changes] + ticks)
+    to_right = lane[first] > lane[first - 1]
+    row, change = expand_ranges(first, last - first + 1)
+    begins = np.searchsorted(change, np.arange(len(first)))
+    offset = _find_offsets(folder, row)
+    distance = np.abs(offset)
+    is_reached = np.where(to_right[change], offset, -offset) >= -tolerance_m
+    is_nearest = distance == np.minimum.reduceat(distance, begins)[change]
+    reached, nearest = (np.minimum.reduceat(np.where(flags, row, rows), begins) for flags in (is_reached, is_nearest))
+    end = np.where(reached < rows, reached, nearest)
+    start = np.maximum(end - ticks, folder.run_first_row[folder.runs_of(end)])
+    return Maneuvers(start, end, np.where(to_right, RIGHT, LEFT).astype(np.uint8))
+
+
+def label_rows(folder: TensorFolder, maneuvers: Maneuvers) -> Bytes:
+    """Label all N rows of a folder with KEEP, LEFT or RIGHT: (N,); of overlapping maneuvers the earlier one holds."""
+    labels = np.full(len(folder.lane), KEEP, dtype=np.uint8)
+    free = np.concatenate([[0], maneuvers.end_row + 1])[:-1]  # first row after the maneuver before
+    start = np.maximum(maneuvers.start_row, free)
+    rows, which = expand_ranges(start, maneuvers.end_row - start + 1)
+    labels[rows] = maneuvers.lateral[which]
+    return labels
+
+
+def find_labelled(folder: TensorFolder, row: npt.NDArray[np.integer], *, start_s: float = START_S) -> Flags:
+    """Find rows (B,) whose label can be known: their run goes on for T_d, so that a change would have been recorded.
+
+    Other rows are left out whatever their label, or changes would be too frequent among them.
+    """
+    last = folder.run_first_row[folder.runs_of(row) + 1] - 1
+    labelled: Flags = last - row >= round(start_s * folder.protocol.rate_hz)
+    return labelled
+
+
+def _find_offsets(folder: TensorFolder, row: Integers) -> Floats:
+    """Measure how far each row's vehicle is right of its lane's centre: (B,), m."""
+    subset, lane, lanes = folder.run_subset[folder.runs_of(row)], folder.lane[row].astype(np.intp), folder.lanes
+    centre = lanes.centre_m[subset, np.minimum(lane, lanes.centre_m.shape[1] - 1)]
+    centre = np.where(np.isnan(centre), (lane - 0.5) * NOMINAL_LANE_M, centre)
+    offset: Floats = locate_rows(folder, row)[:, 1].astype(np.float64) - centre
+    return offset
+
+
 def label_samples(folder: TensorFolder, part: str, settings: LaneForestSettings) -> LabelledSamples:
     """Find the samples of a part whose maneuver, whole future and change of speed are known, and their strata.
 
     The same samples serve all scores: cells need the horizon alone, but are scored by maneuver, too.
-
-    Raises:
-        ValueError: no such part.
     """
     maneuvers = find_maneuvers(folder, start_s=settings.start_s, tolerance_m=settings.tolerance_m)
     everything = folder.samples_of(part)
@@ -161,11 +286,6 @@ def label_samples(folder: TensorFolder, part: str, settings: LaneForestSettings)
     return LabelledSamples(everything[known], maneuver, stratum, reasons, len(maneuvers.end_row))
 
 
-def list_horizons(protocol: Protocol) -> tuple[float, ...]:
-    """List the seconds ahead at which a protocol is scored: (T,)."""
-    return tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
-
-
 def cut_numbers(numbers: Integers, count: int) -> Iterator[Integers]:
     """Cut sample numbers into pieces of at most `count`; no numbers make one empty piece."""
     for start in range(0, max(1, len(numbers)), count):
@@ -173,21 +293,13 @@ def cut_numbers(numbers: Integers, count: int) -> Iterator[Integers]:
 
 
 def read_targets(folder: TensorFolder, sample: Integers, ticks: Sequence[int]) -> Targets:
-    """Read the features, lanes and true places of samples, READ_SAMPLES at a time.
-
-    Args:
-        folder: tensors of the samples.
-        sample: (B,) sample numbers.
-        ticks: (T,) ticks ahead at which places are read, from 1.
-    """
+    """Read the features, lanes and true places of samples (B,) at ticks ahead (T,), counted from 1."""
     at = np.array(ticks, dtype=np.intp) - 1
-    feature, lanes, place_m = [], [], []
+    pieces = []
     for numbers in cut_numbers(sample, READ_SAMPLES):
         scene, truth = gather_nearest(folder, numbers, nearest=NEAREST)
-        feature.append(describe_targets(scene, folder.protocol.rate_hz))
-        lanes.append(scene.lanes)
-        place_m.append(truth.future[:, 0, at])
-    return Targets(np.concatenate(feature), np.concatenate(lanes), np.concatenate(place_m))
+        pieces.append((describe_targets(scene, folder.protocol.rate_hz), scene.lanes, truth.future[:, 0, at]))
+    return Targets(*(np.concatenate(arrays) for arrays in zip(*pieces, strict=True)))
 
 
 def gather_examples(folder: TensorFolder, samples: LabelledSamples) -> Examples:
@@ -199,10 +311,7 @@ def gather_examples(folder: TensorFolder, samples: LabelledSamples) -> Examples:
 
 
 def draw_balanced(stratum: Bytes, most: int, random: np.random.Generator) -> Integers:
-    """Draw positions of at most `most` examples, increasing, as evenly over the strata as these allow.
-
-    Each stratum gives a quarter; where one has fewer, the others share the rest.
-    """
+    """Draw positions of examples, increasing: a quarter from each stratum; where one has fewer, others give more."""
     available = np.bincount(stratum, minlength=len(STRATA))
     quota, left = np.zeros(len(STRATA), dtype=np.intp), most
     for done, which in enumerate(np.argsort(available, kind="stable")):  # four strata, the smallest first

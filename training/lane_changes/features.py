@@ -25,14 +25,10 @@ LEAST_KNOWN = 2
 SAME, NEGATED = "same", "negated"
 
 
-@dataclass(frozen=True)
-class Feature:
-    """One number that describes a target.
+class Feature(NamedTuple):
+    """One number that describes a target: lateral values are positive to the right.
 
-    Args:
-        name: column name with its unit.
-        meaning: definition with its sign; lateral values are positive to the right.
-        mirrored: value on the mirrored road: SAME, NEGATED, or the name of another feature.
+    `mirrored` is the value on the mirrored road: SAME, NEGATED, or the name of another feature.
     """
 
     name: str
@@ -71,30 +67,17 @@ FEATURE_NUMBER = {name: number for number, name in enumerate(FEATURE_NAMES)}
 
 
 def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:
-    """Compute all candidates of B targets: (B, features) in the order of FEATURES.
-
-    Args:
-        observed: NumPy arrays of B scenes.
-        rate_hz: ticks per second of the histories.
-    """
+    """Compute all candidates of B targets: (B, features) in the order of FEATURES."""
     scenes = np.arange(len(observed.history))
     known = observed.history_mask.sum(axis=2)
     ego, found = find_egos(observed, known)
-    target_motion = _Motion.fit(observed.history[:, 0], known[:, 0], rate_hz)
-    ego_motion = _Motion.fit(observed.history[scenes, ego], known[scenes, ego], rate_hz)
+    target_motion = _fit_motion(observed.history[:, 0], known[:, 0], rate_hz)
+    ego_motion = _fit_motion(observed.history[scenes, ego], known[scenes, ego], rate_hz)
     ego_at = observed.history[scenes, ego, -1].astype(np.float64)
     centre, width = observed.lanes[:, 1, 0].astype(np.float64), observed.lanes[:, 1, 1].astype(np.float64)
-    relative = (
-        found,
-        find_columns(ego_at[:, 1], observed.lanes),
-        -ego_at[:, 0],
-        -ego_at[:, 1],
-        target_motion.speed - ego_motion.speed,
-        target_motion.accel - ego_motion.accel,
-        target_motion.lateral_speed - ego_motion.lateral_speed,
-        target_motion.heading - ego_motion.heading,
-        target_motion.yaw_rate - ego_motion.yaw_rate,
-    )
+    speed, accel, lateral_speed, _, heading, yaw_rate = target_motion - ego_motion
+    ego_column = find_columns(ego_at[:, 1], observed.lanes)
+    relative = (found, ego_column, -ego_at[:, 0], -ego_at[:, 1], speed, accel, lateral_speed, heading, yaw_rate)
     columns = (
         *target_motion,
         -observed.history[:, 0, 0, 1].astype(np.float64),
@@ -109,11 +92,7 @@ def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:
 
 
 def find_egos(observed: ObservedScene[Any], known: npt.NDArray[np.integer]) -> tuple[Integers, Flags]:
-    """Find the vehicle behind each target.
-
-    Args:
-        observed: B scenes with V vehicles each.
-        known: (B, V) number of known positions of each vehicle.
+    """Find the vehicle behind each of B targets, from the number of known positions of the V vehicles (B, V).
 
     Returns:
         Position in the scene, (B,), 0 where there is no ego; and whether there is one, (B,).
@@ -142,12 +121,7 @@ def mirror_targets(features: Singles) -> Singles:
 def shift_targets(features: Singles, shift_m: npt.NDArray[np.floating]) -> Singles:
     """Compute the features (B, features) with the ego moved along the road, and nothing else.
 
-    All features are relative, so that moving target and ego together would change none of them. Moved alone, the ego
-    follows at another distance; it stays behind: no gap shrinks to less than half.
-
-    Args:
-        features: all candidates of B targets.
-        shift_m: (B,) length added to the gap, m; ignored where there is no ego.
+    Lengths (B,) are added to the gaps, m, where there is an ego; no gap shrinks to less than half.
     """
     shifted = features.copy()
     gap = features[:, FEATURE_NUMBER["gap_m"]]
@@ -156,34 +130,25 @@ def shift_targets(features: Singles, shift_m: npt.NDArray[np.floating]) -> Singl
     return shifted
 
 
-class _Motion(NamedTuple):
-    """Motion of M vehicles along and across the road, and of their headings: (M,) each."""
+def _fit_motion(history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> Floats:
+    """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known.
 
-    speed: Floats
-    accel: Floats
-    lateral_speed: Floats
-    lateral_accel: Floats
-    heading: Floats
-    yaw_rate: Floats
-
-    @classmethod
-    def fit(cls, history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> "_Motion":
-        """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known."""
-        ticks = min(history.shape[1], round(FIT_S * rate_hz) + 1)
-        weights = weigh_positions(ticks, rate_hz)[np.minimum(known, ticks)]  # (M, 2, ticks)
-        (speed, lateral_speed), (accel, lateral_accel) = np.einsum(
-            "mot,mtd->odm", weights, history[:, -ticks:].astype(np.float64)
-        )
-        floored = np.maximum(speed, LEAST_SPEED_MPS)
-        yaw_rate = (floored * lateral_accel - lateral_speed * accel) / (floored**2 + lateral_speed**2)
-        return cls(speed, accel, lateral_speed, lateral_accel, np.arctan2(lateral_speed, floored), yaw_rate)
+    Returns:
+        Speed and acceleration along the road, the same across it, heading and yaw rate: (6, M).
+    """
+    ticks = min(history.shape[1], round(FIT_S * rate_hz) + 1)
+    weights = weigh_positions(ticks, rate_hz)[np.minimum(known, ticks)]  # (M, 2, ticks)
+    recent = history[:, -ticks:].astype(np.float64)
+    (speed, lateral_speed), (accel, lateral_accel) = np.einsum("mot,mtd->odm", weights, recent)
+    floored = np.maximum(speed, LEAST_SPEED_MPS)
+    yaw_rate = (floored * lateral_accel - lateral_speed * accel) / (floored**2 + lateral_speed**2)
+    return np.stack([speed, accel, lateral_speed, lateral_accel, np.arctan2(lateral_speed, floored), yaw_rate])
 
 
 def weigh_positions(ticks: int, rate_hz: int) -> Floats:
     """Compute the weights of the last positions that give speed and acceleration now: (ticks + 1, 2, ticks).
 
-    The first axis counts the known positions. The fit is a least-squares parabola; with two known positions, a line
-    (no acceleration); with fewer, no motion.
+    The first axis counts known positions. The fit is a least-squares parabola; with two, a line; with fewer, no motion.
     """
     weights = np.zeros((ticks + 1, 2, ticks))
     for known in range(2, ticks + 1):
@@ -196,16 +161,9 @@ def weigh_positions(ticks: int, rate_hz: int) -> Floats:
 
 @dataclass(frozen=True)
 class Coefficient:
-    """Correlation of a feature with each class, and whether the forest reads the feature.
+    """Pearson's coefficients of a feature with 1 where the class is keep, left or right, else 0 (point-biserial).
 
-    Args:
-        feature: name of the feature.
-        keep: Pearson's coefficient of the feature with 1 where the class is this one, else 0 (point-biserial); 0 where
-            either does not vary.
-        left: the same for changes to the left.
-        right: the same for changes to the right.
-        chosen: whether the forest reads the feature.
-        reason: why not; empty where it does.
+    They are 0 where either does not vary. `reason` says why the forest does not read the feature; empty where it does.
     """
 
     feature: str
@@ -222,20 +180,16 @@ class Coefficient:
 
 
 def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: float) -> list[Coefficient]:
-    """Choose features that correlate with the classes and not with each other.
+    """Choose features that correlate with the classes and not with each other, of all candidates (B, features).
 
-    Args:
-        feature: (B, features) in the order of FEATURES.
-        maneuver: (B,) position in LATERAL_MANEUVERS.
-        least: smallest strength of a chosen feature.
-        most: largest absolute correlation between two chosen features; of two that exceed it, the stronger is chosen.
+    A chosen feature has a strength of at least `least`. Of two that correlate by more than `most`, the stronger stays.
 
     Returns:
         All candidates from the strongest to the weakest, equally strong ones in the order of FEATURES.
     """
-    classes = (maneuver[:, None] == np.arange(len(LATERAL_MANEUVERS))).astype(np.float64)
-    values = feature.astype(np.float64)
-    coefficient, between = _correlate_columns(values, classes), np.abs(_correlate_columns(values, values))
+    codes = np.arange(len(LATERAL_MANEUVERS))
+    values, classes = _standardise_columns(feature), _standardise_columns(maneuver[:, None] == codes)
+    coefficient, between = np.clip(values.T @ classes, -1, 1), np.minimum(np.abs(values.T @ values), 1)
     strength = np.abs(coefficient).max(axis=1)
     chosen: list[int] = []
     table = []
@@ -252,13 +206,9 @@ def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: fl
     return table
 
 
-def _correlate_columns(left: Floats, right: Floats) -> Floats:
-    """Compute Pearson's coefficients of columns (B, P) with columns (B, Q): (P, Q); 0 where one does not vary."""
-    return np.clip(_standardise_columns(left).T @ _standardise_columns(right), -1, 1)
-
-
-def _standardise_columns(columns: Floats) -> Floats:
-    """Scale columns to mean 0 and length 1; columns that do not vary become zeros."""
+def _standardise_columns(numbers: npt.NDArray[Any]) -> Floats:
+    """Scale columns (B, P) to mean 0 and length 1; columns that do not vary become zeros."""
+    columns = numbers.astype(np.float64)
     if not len(columns):
         return columns
     centred = columns - columns.mean(axis=0)

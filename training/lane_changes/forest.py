@@ -23,13 +23,12 @@ from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import (
     STRATA,
     Examples,
+    LaneForestSettings,
     draw_balanced,
     gather_examples,
     label_samples,
-    list_horizons,
 )
 from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER, choose_features, describe_targets
-from tracklake.training.lane_changes.settings import LaneForestSettings
 
 VERSION = 2
 """Version of the file; a change that older readers cannot read raises it."""
@@ -38,6 +37,7 @@ TRUSTED = ("sklearn.tree._tree.Tree",)
 their node numbers unchecked; `_check_classifier` checks them."""
 FACTS = {"settings": dict, "protocol": dict, "blocks": list, "train_subsets": list}
 """Facts every forest holds, by type: they determine what it may be scored on."""
+Facts = Mapping[str, Any]
 AGAIN = "; run `tracklake lane-forest` again"
 """End of every message about a file that cannot be used."""
 
@@ -50,13 +50,8 @@ class ForestError(TracklakeError):
 class LaneForest:
     """Random forest that predicts the maneuver under way, and the vehicle's lane at each of T horizons.
 
-    Args:
-        classifier: 1 + T outputs, the maneuver and the lane at each horizon; classes are positions in
-            LATERAL_MANEUVERS.
-        names: features the classifier reads, in its order.
-        rate_hz: ticks per second of the histories it was fitted on.
-        horizons_s: (T,) horizons, s.
-        facts: how it was fitted: settings, seed, protocol, examples, coefficients; plain values.
+    The classifier has 1 + T outputs, the maneuver and the lane at each horizon, in codes of LATERAL_MANEUVERS; it reads
+    the features `names` in their order. `facts` are plain values that describe the fit.
     """
 
     classifier: RandomForestClassifier
@@ -75,16 +70,10 @@ class LaneForest:
         return self.predict_proba(describe_targets(observed, self.rate_hz))
 
     def predict_proba(self, described: Singles) -> Singles:
-        """Predict the probabilities of keep, left and right, of the maneuver and then of the lane at each horizon.
+        """Predict probabilities of keep, left and right (B, 1 + T, 3), of the maneuver and the lane at each horizon.
 
-        They hold for the mix of examples that the forest was fitted on, in which lane changes are far more frequent
-        than on the road: there, the probabilities of changes are lower.
-
-        Args:
-            described: (B, candidates) in the order of `features.FEATURES`.
-
-        Returns:
-            (B, 1 + T, 3) in the order of LATERAL_MANEUVERS.
+        `described` is (B, candidates) in the order of `features.FEATURES`. The probabilities hold for the mix of the
+        examples; on the road, where lane changes are far less frequent, those of changes are lower.
         """
         probability = np.zeros((len(described), 1 + len(self.horizons_s), len(LATERAL_MANEUVERS)), dtype=np.float32)
         if len(described):
@@ -96,13 +85,8 @@ class LaneForest:
 
     def save(self, file: Path) -> None:
         """Write the forest to a file, whole or not at all."""
-        header = {
-            "version": VERSION,
-            "features": list(self.names),
-            "rate_hz": self.rate_hz,
-            "horizons_s": list(self.horizons_s),
-            "facts": self.facts,
-        }
+        names = {"version": VERSION, "features": self.names}
+        header = names | {"rate_hz": self.rate_hz, "horizons_s": self.horizons_s, "facts": self.facts}
         content = {"header": json.dumps(header, allow_nan=False), "classifier": self.classifier}
         write_file(file, skops.io.dumps(content, compression=ZIP_DEFLATED))
 
@@ -111,8 +95,8 @@ class LaneForest:
         """Read a forest that `save` wrote; nothing in the file is executed.
 
         Raises:
-            ForestError: no such file; it is damaged, of another kind or version, or holds types that are not trusted;
-                its nodes do not make trees; or facts are missing.
+            ForestError: no such file; it is damaged, of another kind or version, holds types that are not trusted or
+                nodes that do not make trees, or lacks facts.
         """
         if not file.is_file():
             raise ForestError(f"{file}: no such file{AGAIN}")
@@ -125,13 +109,8 @@ class LaneForest:
             raise ForestError(f"{file}: not a lane forest that can be read here ({broken}){AGAIN}") from broken
         try:
             _check_header(header)
-            forest = cls(
-                classifier=classifier,
-                names=tuple(header["features"]),
-                rate_hz=header["rate_hz"],
-                horizons_s=tuple(map(float, header["horizons_s"])),
-                facts=header["facts"],
-            )
+            horizons_s = tuple(map(float, header["horizons_s"]))
+            forest = cls(classifier, tuple(header["features"]), header["rate_hz"], horizons_s, header["facts"])
             _check_classifier(forest)
         except (UsageError, ValueError, TypeError, AttributeError) as wrong:
             raise ForestError(f"{file}: {wrong}{AGAIN}") from wrong
@@ -145,12 +124,7 @@ def decide_classes(probability: Singles) -> Bytes:
 
 
 def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSettings | None = None) -> LaneForest:
-    """Fit a forest on a folder's training part.
-
-    Args:
-        folder: tensors of any protocol, which gives the horizons.
-        seed: seed of the draw, the shifts and the trees: same seed, same forest.
-        settings: None for the defaults.
+    """Fit a forest on a folder's training part, for the horizons of its protocol; same seed, same forest.
 
     Raises:
         TracklakeError: the training part has no sample that keeps its lane, or none that changes it.
@@ -179,24 +153,12 @@ def fit_lane_forest(folder: TensorFolder, seed: int, settings: LaneForestSetting
 
 
 def fit_examples(
-    examples: Examples,
-    settings: LaneForestSettings,
-    seed: int,
-    *,
-    protocol: Protocol,
-    facts: Mapping[str, Any] | None = None,
+    examples: Examples, settings: LaneForestSettings, seed: int, *, protocol: Protocol, facts: Facts | None = None
 ) -> LaneForest:
-    """Augment examples, choose features, and fit the trees.
+    """Augment examples, choose features, and fit the trees; `facts` are plain values to keep beside the fit's own.
 
-    One forest predicts everything: each tree is fitted on the maneuver and on the lanes at all horizons together, so
-    that a leaf knows both the maneuver under way and how far it will have come at each horizon.
-
-    Args:
-        examples: examples as drawn.
-        settings: settings of the fit.
-        seed: seed of the shifts and the trees.
-        protocol: protocol of the examples, which gives the rate and the horizons.
-        facts: plain values to keep beside the settings, the seed and the coefficients.
+    Each tree is fitted on the maneuver and on the lanes at all horizons together, so that a leaf knows both the
+    maneuver under way and how far it will have come at each horizon.
 
     Raises:
         TracklakeError: no feature correlates enough with the maneuver.
@@ -210,9 +172,8 @@ def fit_examples(
             f"no feature correlates with the maneuver by {least:g} or more (the best, {table[0].feature}, by "
             f"{table[0].strength:.3f}): set `least_correlation` lower"
         )
-    classifier = RandomForestClassifier(
-        n_estimators=settings.trees, min_samples_leaf=settings.leaf, random_state=seed, n_jobs=1
-    )
+    trees, leaf = settings.trees, settings.leaf
+    classifier = RandomForestClassifier(n_estimators=trees, min_samples_leaf=leaf, random_state=seed, n_jobs=1)
     given = augmented.feature[:, [FEATURE_NUMBER[name] for name in names]]
     classifier.fit(given, np.column_stack([augmented.maneuver, augmented.ahead]))
     known = {
@@ -222,16 +183,12 @@ def fit_examples(
         "examples": len(augmented),
         "coefficients": [asdict(row) for row in table],
     }
-    return LaneForest(classifier, names, protocol.rate_hz, list_horizons(protocol), known)
+    horizons_s = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
+    return LaneForest(classifier, names, protocol.rate_hz, horizons_s, known)
 
 
 def _check_header(header: Any) -> None:  # noqa: ANN401  (whatever JSON a file holds)
-    """Refuse a header that is not one of a forest of this version.
-
-    Raises:
-        ValueError: what was expected, and what was found.
-        UsageError: a setting is unknown, of another type, or out of range.
-    """
+    """Raise a ValueError or UsageError where a header is not one of a forest of this version."""
     if not isinstance(header, dict):
         raise ValueError(f"expected a header that is an object, got {type(header).__name__}")
     version, names, facts = header.get("version"), header.get("features"), header.get("facts")
@@ -255,13 +212,7 @@ def _is_positive(value: object) -> bool:
 
 
 def _check_classifier(forest: LaneForest) -> None:
-    """Refuse nodes that do not make trees: a prediction would leave the arrays, or never end.
-
-    Raises:
-        ValueError: what was expected, and what was found.
-        TypeError: an attribute of the classifier is of another type.
-        AttributeError: the classifier or a tree lacks an attribute.
-    """
+    """Raise a ValueError where nodes do not make trees: a prediction would leave the arrays, or never end."""
     classifier, features, outputs = forest.classifier, len(forest.names), 1 + len(forest.horizons_s)
     if type(classifier) is not RandomForestClassifier:
         raise ValueError(f"expected a RandomForestClassifier, got {type(classifier).__name__}")

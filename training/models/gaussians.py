@@ -2,7 +2,7 @@
 
 A negative log likelihood here is the negative logarithm of the density in nats, with every constant, of positions in
 metres, averaged over the known positions: the mean of `-scipy.stats.multivariate_normal.logpdf`, in training as in
-evaluation (`training.evaluation.densities`). The code published with convolutional social pooling differs in two
+evaluation (`training.evaluation.scores`). The code published with convolutional social pooling differs in two
 places: where its test mixes maneuvers, the second axis's square and the term between the axes are halved twice; and to
 turn a density per square foot into one per square metre it subtracts 0.516 = lg 3.2808 instead of 2 ln 3.2808 = 2.376.
 """

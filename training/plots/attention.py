@@ -14,7 +14,7 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Floats
 from tracklake.schemas.chart_theme import INK, MUTED, PAPER
 from tracklake.schemas.files import write_file
-from tracklake.training.data.nearest_vehicles import find_nearest, gather_nearest
+from tracklake.training.data.gathers import find_nearest, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.plots.charts import Drawing, Layers, Row, fix_scale, name_rows

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.batches import SceneBatch
 from tracklake.training.data.gathers import check_numbers, expand_groups, find_nearest, gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import read_samples
@@ -145,7 +144,7 @@ class Picture:
 
     @property
     def own(self) -> Vehicle:
-        """The sample's vehicle."""
+        """The vehicle of the drawn sample."""
         return self.vehicles[0]
 
     @property

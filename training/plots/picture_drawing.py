@@ -41,7 +41,7 @@ ERRORS = {
 
 
 def draw_picture(picture: Picture) -> Drawing:
-    """Draw a sample.
+    """Draw a sample on the road.
 
     Raises:
         UsageError: no model, or more than MOST_MODELS.

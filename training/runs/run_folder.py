@@ -17,8 +17,7 @@ from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Predictor, find_model, require_torch
-from tracklake.training.models import Recipe
+from tracklake.training.models import Predictor, Recipe, find_model, require_torch
 from tracklake.training.runs.checkpoint import DamagedFileError, is_unfinished, load_weights, read_torch_file
 
 if TYPE_CHECKING:

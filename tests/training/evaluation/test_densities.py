@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from tracklake.training.evaluation.densities import find_nll
+from tracklake.training.evaluation.scores import find_nll
 from tracklake.training.models.prediction import Density
 
 

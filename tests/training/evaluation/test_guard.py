@@ -108,6 +108,13 @@ class ReadsTheFutureSpeed(Still):
         return Prediction(said + self.folder.speed_mps[self.folder.sample_row[numbers] + 1][:, None, None])
 
 
+class ReadsTheMappingOfArrays(Still):
+    def predict(self, observed):
+        _, numbers = self.recognise(observed)
+        later = self.folder.sample_row[numbers] + 1
+        return Prediction(super().predict(observed).position_m + self.folder.arrays["speed_mps"][later][:, None, None])
+
+
 class KnowsWhenTheTrackEnds(Still):
     def predict(self, observed):
         _, numbers = self.recognise(observed)
@@ -198,6 +205,7 @@ def test_asking_for_what_comes_is_refused(folder, cheat):
         (LooksUpTheManeuver, "lateral"),
         (IsSureWhereItBrakes, "sigma_m"),
         (ReadsTheFutureSpeed, "position_m"),
+        (ReadsTheMappingOfArrays, "position_m"),
         (KnowsWhenTheTrackEnds, "position_m"),
         (ReadsWhereTheRunEnds, "position_m"),
         (LooksForTheVehicleLater, "position_m"),

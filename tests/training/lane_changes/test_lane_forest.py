@@ -3,7 +3,7 @@
 import json
 import pickle
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,13 +15,14 @@ from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, random_examples, tr
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
-from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.lane_changes.examples import (
     LEFT_OUT,
     STRATA,
     Examples,
+    LaneForestSettings,
     draw_balanced,
     gather_examples,
     label_samples,
@@ -35,7 +36,6 @@ from tracklake.training.lane_changes.forest import (
     fit_examples,
     fit_lane_forest,
 )
-from tracklake.training.lane_changes.settings import LaneForestSettings
 
 FACTS = {"protocol": {"name": "short"}, "blocks": [], "train_subsets": ["highd/a"]}
 FEW = LaneForestSettings(trees=7, leaf=3, augmentation=(), examples=400)
@@ -370,28 +370,6 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path):
     nothing = Examples(np.zeros((9, len(FEATURES)), np.float32), np.zeros(9, np.uint8), np.zeros((9, 2), np.uint8))
     with pytest.raises(TracklakeError, match=r"no feature correlates with the maneuver by 0\.05 or more"):
         fit_examples(nothing, FEW, 0, protocol=BRIEF)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"augmentation": ("rotate",)}, "augmentation: expected mirror, shift; got rotate"),
-        ({"start_s": 0.0}, "start_s: expected more than 0, got 0.0"),
-        ({"shift_m": -1.0}, "shift_m: expected 0 or more, got -1.0"),
-        ({"start_s": float("inf")}, "start_s: expected more than 0, got inf"),
-        ({"shift_m": float("nan")}, "shift_m: expected 0 or more, got nan"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(wrong, message):
-    with pytest.raises(UsageError, match=message):
-        LaneForestSettings(**wrong)
-
-
-def test_stored_settings_are_read_back():
-    asked = LaneForestSettings(start_s=3.0, trees=7, augmentation=("shift",))
-    stored = json.loads(json.dumps(asdict(asked)))
-    assert LaneForestSettings.read(stored) == asked
-    assert LaneForestSettings.read({"start_s": 3}) == LaneForestSettings(start_s=3.0)
 
 
 def test_int16_storage_gives_the_same_examples(tmp_path):

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -14,10 +14,10 @@ from sklearn.ensemble import RandomForestClassifier
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import FutureInputError
-from tracklake.training.lane_changes import LaneForestSettings, evaluate_grid, fit_lane_forest, learn_curve
 from tracklake.training.lane_changes.cells import find_columns, find_rows, measure_rows, number_cells
-from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, label_samples
-from tracklake.training.lane_changes.forest import LaneForest
+from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, LaneForestSettings, label_samples
+from tracklake.training.lane_changes.forest import LaneForest, fit_lane_forest
+from tracklake.training.lane_changes.scores import evaluate_grid, learn_curve
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.run_folder import StaleRunError
@@ -134,7 +134,7 @@ def test_scores_by_hand(one_change):
     assert {row.stratum: row.n for row in scores.maneuvers} == counts
     nobody = by_key(scores, model="straight", column="place", seconds=2.0, stratum="decelerating, changing")
     assert (nobody.n, nobody.cell, nobody.majority) == (0, None, None)
-    json.dumps(scores.to_dict(), allow_nan=False)
+    json.dumps(asdict(scores), allow_nan=False)
 
 
 def test_a_true_place_outside_is_never_right(tmp_path):

@@ -13,7 +13,7 @@ from tensor_tables import write
 
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.lane_changes.labels import find_labelled, find_maneuvers, label_rows
+from tracklake.training.lane_changes.examples import find_labelled, find_maneuvers, label_rows
 
 
 def letters(folder, **settings):

@@ -51,16 +51,16 @@ def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     real = tracklake.training.train.read_samples
 
     def read_slowly(*given):
-        time.sleep(0.02)
+        time.sleep(0.1)
         return real(*given)
 
     monkeypatch.setattr(tracklake.training.train, "read_samples", read_slowly)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
-    assert 0 < metrics["samples_per_s"] < 32 / 0.02
+    assert 0 < metrics["samples_per_s"] < 32 / 0.1
     for row in read_log(tmp_path / "run" / "course.csv"):
         assert 0.5 < float(row["data_share"]) < 1.0
-        assert 0 < float(row["samples_per_s"]) < 32 / 0.02
+        assert 0 < float(row["samples_per_s"]) < 32 / 0.1
 
 
 def test_an_epoch_with_two_losses_is_told_by_its_last(tensors, tmp_path, monkeypatch):

@@ -5,8 +5,7 @@ import xml.etree.ElementTree as ET
 
 import polars as pl
 import pytest
-
-from tracklake.training.plots.error_figure import COLUMNS, MOST_MODELS, draw_error_growth, summarise_seeds
+from study_figure import COLUMNS, MOST_MODELS, draw_error_growth, summarise_seeds
 
 
 def table(*rows):

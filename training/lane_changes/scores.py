@@ -1,11 +1,12 @@
-"""Scores of predicted cells: columns from a model's own places or from the forest, rows from the model's places.
+"""Scores of predicted cells and maneuvers, and the learning curve of the forest.
 
-True places and labels come from the future: predictions are compared with them and grouped by them. Models and the
-forest read only what `training.data.observed` holds.
+Columns of cells are those of a model's own places, or the forest's; rows are those of the model's places. True
+places and labels come from the future: predictions are compared with them and grouped by them. Models and the forest
+read only what `training.data.observed` holds.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,19 @@ from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
+    ALL,
+    LabelledSamples,
+    LaneForestSettings,
     Targets,
     cut_numbers,
+    draw_balanced,
+    gather_examples,
     label_samples,
-    list_horizons,
     read_targets,
 )
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
-from tracklake.training.lane_changes.forest import LaneForest, decide_classes
-from tracklake.training.models import MODELS, Predictor, Reads
+from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
+from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import NotFiniteError, Prediction
@@ -37,25 +42,20 @@ COLUMNS = np.array([{"keep": 0, "left": -1, "right": 1}[name] for name in LATERA
 """Column of each class of the forest."""
 MOST = 200_000
 """Largest number of samples that are scored; of a larger part, so many are drawn."""
+SIZES = (250, 500, 1000, 2000, 4000)
+"""Numbers of examples drawn, before augmentation."""
+MOST_SCORED = 20_000
+"""Largest number of samples that each forest is scored on."""
 
 
 @dataclass(frozen=True)
 class CellScore:
-    """Scores of one model at one horizon, over all samples or one stratum. Shares are None where n is 0.
+    """Scores of one model at one horizon, over all samples or one stratum: shares of n samples, None where n is 0.
 
-    Args:
-        model: name of the model.
-        column: source of the column: `place`, the model's own, or `forest`.
-        seconds: horizon, s.
-        stratum: name from `examples.STRATA`, or `all`.
-        n: number of samples behind each share.
-        cell: share of samples in the predicted cell; a true place outside the nine is never right.
-        row: the same of rows alone.
-        lane: the same of columns alone.
-        cell_clipped: as `cell`, if the outer columns and rows had no end.
-        majority: share of the most frequent true cell: what a constant prediction of it would reach.
-        own_lane: share of true places in the own column.
-        outside: share of true places outside the nine cells.
+    The `column` is that of the model's own `place`, or the `forest`'s. `cell`, `row` and `lane` are samples in the
+    predicted cell, row and column; a true place outside the nine is never right, but in `cell_clipped`, where outer
+    columns and rows have no end. `majority` is the most frequent true cell: what a constant prediction reaches.
+    `own_lane` and `outside` are true places in the own column, and outside the nine cells.
     """
 
     model: str
@@ -76,13 +76,8 @@ class CellScore:
 class ManeuverScore:
     """Scores of the forest's maneuvers, over all samples or one stratum. None: no such sample.
 
-    Args:
-        stratum: as in `CellScore`.
-        n: number of samples.
-        accuracy: share of samples whose most probable maneuver is the label.
-        recall: the same of the samples of each label.
-        balanced: mean of the recalls that are not None.
-        majority: share of the most frequent label.
+    `accuracy` is the share of samples whose most probable maneuver is the label, `recall` the same by label, `balanced`
+    the mean of the recalls, `majority` the share of the most frequent label.
     """
 
     stratum: str
@@ -95,23 +90,12 @@ class ManeuverScore:
 
 @dataclass(frozen=True)
 class GridScores:
-    """Scores of cells and maneuvers on one part.
-
-    Args:
-        cells: scores by model, column, horizon and stratum.
-        maneuvers: scores by stratum.
-        left_out: number of the part's samples that are not scored.
-        left_out_by_reason: the same by `examples.LEFT_OUT`.
-    """
+    """Scores of cells and maneuvers on one part, and the number of its samples that are not scored, by LEFT_OUT."""
 
     cells: list[CellScore]
     maneuvers: list[ManeuverScore]
     left_out: int
     left_out_by_reason: dict[str, int]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to plain values."""
-        return asdict(self)
 
 
 class _ForestPredictor:
@@ -140,17 +124,9 @@ def evaluate_grid(
     """Score models by the cells of their predicted places, at every horizon of the forest.
 
     Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
-    `examples.label_samples`, with the forest's T_d.
-
-    Args:
-        folder: tensors of the protocol that forest and models were made for.
-        predictors: models by name.
-        forest: fitted forest.
-        part: train, val or eval.
-        reads: input of each model; by default as in the registry, or else `grid`.
-        most: largest number of samples.
-        seed: seed of the draw where there are more.
-        on_skip: called with the name of a model that cannot be scored, and the reason. None: the first one is raised.
+    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn. `reads` holds models'
+    inputs, by default `grid`. `on_skip` is called with the name of a model that cannot be scored, and the reason; where
+    it is None, the first refusal is raised.
 
     Raises:
         FutureInputError: the forest or a model sees the future.
@@ -164,17 +140,17 @@ def evaluate_grid(
     if len(samples):
         refuse_future(_ForestPredictor(forest), folder, part, name="lane-forest", reads="scene")
     targets = read_targets(folder, samples.sample, ticks)
-    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, name="straight")
+    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, "straight")
     true = find_cells(targets.place_m, straight_m, targets)
     decided = decide_classes(forest.predict_proba(targets.feature))  # (S, 1 + T)
     forest_column = COLUMNS[decided[:, 1:]]
     strata = samples.find_strata()
-    inputs = {name: MODELS[name].reads if name in MODELS else "grid" for name in predictors} | dict(reads or {})
     cells: list[CellScore] = []
     for name, predictor in predictors.items() if len(samples) else ():
+        kind = (reads or {}).get(name, "grid")
         try:
-            refuse_future(predictor, folder, part, name=name, reads=inputs[name])
-            place_m = predict_places(folder, samples.sample, predictor, ticks, name=name, reads=inputs[name])
+            refuse_future(predictor, folder, part, name=name, reads=kind)
+            place_m = predict_places(folder, samples.sample, predictor, ticks, name, kind)
         except (TracklakeError, FutureInputError, ValueError) as refused:
             if on_skip is None:
                 raise
@@ -189,13 +165,7 @@ def evaluate_grid(
 
 
 def predict_places(
-    folder: TensorFolder,
-    sample: Integers,
-    predictor: Predictor,
-    ticks: tuple[int, ...],
-    *,
-    name: str,
-    reads: Reads = "grid",
+    folder: TensorFolder, sample: Integers, predictor: Predictor, ticks: Sequence[int], name: str, reads: Reads = "grid"
 ) -> Singles:
     """Predict the places of samples (S,) at some ticks ahead (T,): (S, T, 2).
 
@@ -218,13 +188,7 @@ def predict_places(
 
 
 def find_cells(place_m: Singles, straight_m: Singles, targets: Targets) -> Codes:
-    """Find the columns and rows of places: (S, T, 2).
-
-    Args:
-        place_m: (S, T, 2) places relative to the sample's last position.
-        straight_m: (S, T, 2) constant-velocity places.
-        targets: S samples as observed; their true places are not used.
-    """
+    """Find the columns and rows (S, T, 2) of places (S, T, 2), from constant-velocity places and observed targets."""
     speed_mps, ego = (targets.feature[:, FEATURE_NUMBER[name]] for name in ("relative_speed_mps", "ego"))
     column = find_columns(place_m[..., 1], targets.lanes)
     row = find_rows(place_m[..., 0], straight_m[..., 0], measure_rows(speed_mps, ego))
@@ -236,14 +200,9 @@ def score_maneuvers(stratum: str, decided: Bytes, label: Bytes) -> ManeuverScore
     right, of_class = decided == label, {name: label == code for code, name in enumerate(LATERAL_MANEUVERS)}
     recall = {name: _mean(right[of]) for name, of in of_class.items()}
     found = [share for share in recall.values() if share is not None]
-    return ManeuverScore(
-        stratum=stratum,
-        n=len(label),
-        accuracy=_mean(right),
-        recall=recall,
-        balanced=sum(found) / len(found) if found else None,
-        majority=max(float(of.mean()) for of in of_class.values()) if len(label) else None,
-    )
+    balanced = sum(found) / len(found) if found else None
+    majority = max(float(of.mean()) for of in of_class.values()) if len(label) else None
+    return ManeuverScore(stratum, len(label), _mean(right), recall, balanced, majority)
 
 
 def _score_cells(
@@ -257,12 +216,9 @@ def _score_cells(
         for stratum, of in strata.items():
             cells = true_cell[of, horizon]
             inside = np.bincount(cells[cells >= 0], minlength=9)
+            key = (model, source, seconds, stratum, len(cells))
             yield CellScore(
-                model=model,
-                column=source,
-                seconds=seconds,
-                stratum=stratum,
-                n=len(cells),
+                *key,
                 cell=_mean(right[of, horizon].all(axis=-1)),
                 row=_mean(right[of, horizon, 1]),
                 lane=_mean(right[of, horizon, 0]),
@@ -279,15 +235,92 @@ def _mean(flags: Flags) -> float | None:
 
 
 def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:
-    """Convert the forest's horizons to ticks ahead: (T,).
-
-    Raises:
-        TracklakeError: the forest was fitted at another rate, or for horizons that the folder does not score.
-    """
-    protocol, scored = folder.protocol, list_horizons(folder.protocol)
+    """Convert the forest's horizons to ticks ahead (T,); refuse other rates, and horizons the folder does not score."""
+    protocol = folder.protocol
+    scored = tuple(tick / protocol.rate_hz for tick in protocol.scored_ticks)
     if forest.rate_hz != protocol.rate_hz or not set(forest.horizons_s) <= set(scored):
         raise TracklakeError(
             f"the forest was fitted at {forest.rate_hz} Hz for horizons of {forest.horizons_s} s; {folder.path} is of "
             f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
         )
     return tuple(round(seconds * protocol.rate_hz) for seconds in forest.horizons_s)
+
+
+@dataclass(frozen=True)
+class LearningPoint:
+    """Scores on the evaluation part of a forest fitted on `drawn` examples, before augmentation.
+
+    `lane` is the share of `n` samples whose lane at the last horizon is right; see `ManeuverScore` for the others.
+    """
+
+    drawn: int
+    augmented: bool
+    seed: int
+    n: int
+    accuracy: float | None
+    balanced: float | None
+    lane: float
+    majority: float | None
+
+
+def learn_curve(
+    folder: TensorFolder,
+    *,
+    sizes: Sequence[int] = SIZES,
+    seeds: Sequence[int] = (0, 1, 2),
+    settings: LaneForestSettings | None = None,
+) -> list[LearningPoint]:
+    """Fit forests on growing draws from the training part, and score each on the evaluation part.
+
+    All points of a curve have the same mix, equally many examples of each stratum, or the curve would show how the mix
+    changes. So it ends where the smallest stratum is used up; larger sizes are cut to that size, once. The larger draws
+    of a seed hold the smaller ones. Each draw is fitted with the augmentation of the settings, and without.
+
+    Raises:
+        TracklakeError: one of the parts has no samples, or none whose maneuver is known; or see `fit_examples`.
+    """
+    settings = settings or LaneForestSettings()
+    pool, scored = (label_samples(folder, part, settings) for part in ("train", "eval"))
+    _refuse_empty(folder, {"train": pool, "eval": scored}, settings)
+    counts = pool.count_strata()
+    counts = counts[counts > 0]
+    most = int(len(counts) * counts.min())
+    sizes = sorted({min(size, most) for size in sizes})
+    # Samples that any of the draws needs are read once.
+    largest = {seed: draw_balanced(pool.stratum, sizes[-1], np.random.default_rng(seed)) for seed in seeds}
+    needed = np.unique(np.concatenate(list(largest.values())))
+    examples = gather_examples(folder, pool.select(needed))
+    truth = gather_examples(folder, scored.draw(MOST_SCORED, seed=0))
+    points: list[LearningPoint] = []
+    for seed in seeds:
+        of_seed, stratum = np.searchsorted(needed, largest[seed]), pool.stratum[largest[seed]]
+        for size in sizes:
+            drawn = examples.select(of_seed[draw_balanced(stratum, size, np.random.default_rng(seed))])
+            if len(np.unique(drawn.maneuver)) < 2:  # no forest
+                continue
+            for augmentation in dict.fromkeys([(), settings.augmentation]):
+                changed = replace(settings, augmentation=augmentation, examples=size)
+                forest = fit_examples(drawn, changed, seed, protocol=folder.protocol)
+                decided = decide_classes(forest.predict_proba(truth.feature))
+                own = score_maneuvers(ALL, decided[:, 0], truth.maneuver)
+                lane = float((decided[:, -1] == truth.ahead[:, -1]).mean())
+                facts = (len(drawn), bool(augmentation), seed, own.n)
+                points.append(LearningPoint(*facts, own.accuracy, own.balanced, lane, own.majority))
+    return points
+
+
+def _refuse_empty(folder: TensorFolder, pools: dict[str, LabelledSamples], settings: LaneForestSettings) -> None:
+    """Refuse parts without samples, or without samples whose maneuver is known."""
+    empty = [part for part, pool in pools.items() if not len(pool)]
+    without = [part for part in empty if not len(folder.samples_of(part))]
+    if without:
+        raise TracklakeError(
+            f"{folder.path}: a learning curve is fitted on `train` and scored on `eval`, and the split "
+            f"`{folder.split}` has no samples in {' and '.join(f'`{part}`' for part in without)}; with a single "
+            "recording everything trains: add recordings and run `tracklake split`"
+        )
+    if empty:
+        raise TracklakeError(
+            f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
+            f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
+        )
