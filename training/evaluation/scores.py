@@ -61,7 +61,7 @@ class Strata:
     datasets: tuple[str, ...]
 
     def __len__(self) -> int:
-        """Return the number of samples."""
+        """Return the number of different strata."""
         return len(self.vehicle)
 
     def list_groups(self) -> Iterator[tuple[str, str, Flags]]:
