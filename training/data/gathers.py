@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +11,13 @@ from tracklake.schemas.arrays import Bytes, Integers, expand_ranges
 from tracklake.training.data.batches import Array, Batch, SceneBatch
 from tracklake.training.data.observed import ObservedScene, Truth
 
-if TYPE_CHECKING:
-    from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 
-Folder: TypeAlias = "TensorFolder | DeviceFolder"
-"""Holder of the arrays of a tensor folder, all NumPy's or all torch's."""
+class Folder(Protocol):
+    """Holder of the arrays of a tensor folder by their names: all NumPy's (`TensorFolder`) or all torch's tensors."""
+
+    def __getattr__(self, name: str, /) -> Any:  # noqa: ANN401  (an array of either library, or a fact of the folder)
+        """Return an array, or a fact of the folder."""
+        ...
 
 
 def find_namespace(array: Array) -> Any:  # noqa: ANN401  (the module numpy or torch)
@@ -149,7 +151,7 @@ def gather_samples(folder: Folder, sample: Array, *, absolute: bool = False) -> 
     )
 
 
-def gather_scenes(folder: "TensorFolder", scene: Integers, *, absolute: bool = False) -> SceneBatch:
+def gather_scenes(folder: Folder, scene: Integers, *, absolute: bool = False) -> SceneBatch:
     """Read scenes by their numbers (B,), in any order."""
     member, vehicle_scene = expand_groups(folder.scene_offset, scene)
     row, sample = folder.scene_row[member].astype(np.int64), folder.scene_sample[member]
@@ -201,9 +203,7 @@ class NearestVehicles:
     present: Array  # (B, V) True where there is a vehicle
 
 
-def gather_nearest(
-    folder: "TensorFolder", samples: npt.ArrayLike, *, nearest: int
-) -> tuple[ObservedScene[Any], Truth[Any]]:
+def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> tuple[ObservedScene[Any], Truth[Any]]:
     """Read samples (egos, by their numbers (B,)) with the `nearest` vehicles around them, as NumPy arrays.
 
     Every vehicle of the scene counts, sample or not: whether it is one depends on its future. The nearest are those
