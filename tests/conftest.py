@@ -94,7 +94,7 @@ class Command:
 
 @pytest.fixture(scope="session")
 def clean_environment() -> dict[str, str]:
-    """Without whoever runs the tests' settings of Prefect and of tracklake."""
+    """Without who runs the tests' settings of Prefect and of tracklake."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("TRACKLAKE_", "PREFECT_"))}
     return {**kept, "COLUMNS": "200", "PYTHONWARNINGS": "default"}
 

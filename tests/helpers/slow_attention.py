@@ -46,7 +46,7 @@ def find_velocity(history, known, ticks):
 
 def restate(weights, observed, heads, *, ticks, rate_hz, horizon_ticks, residual):
     """Per scene: (vehicles that are there, their means (n, F, 2), covariances (n, F, 2, 2), three lists of weights)."""
-    told = []
+    reported = []
     for scene in range(len(observed.history)):
         there = np.flatnonzero(observed.vehicle_mask[scene])
         histories = [observed.history[scene, v].astype(np.float64) for v in there]
@@ -84,5 +84,5 @@ def restate(weights, observed, heads, *, ticks, rate_hz, horizon_ticks, residual
                 covariance.append([[sx * sx, rho * sx * sy], [rho * sx * sy, sy * sy]])
             means.append(mean)
             covariances.append(covariance)
-        told.append((there, np.array(means), np.array(covariances), (first, second, third)))
-    return told
+        reported.append((there, np.array(means), np.array(covariances), (first, second, third)))
+    return reported

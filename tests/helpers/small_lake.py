@@ -75,7 +75,7 @@ def commit_round(writer: Writer, number: int) -> None:
 
 
 def check_lake(root: Path) -> None:
-    """What every reader may rely on at any moment, whoever was killed doing what."""
+    """What every reader may rely on at any moment, who was killed doing what."""
     import duckdb
 
     manifest = load(root)
@@ -181,7 +181,7 @@ def _obey(root: Path) -> None:
             sys.stdout.flush()
         elif order == "loop":
             sys.stdout.write(f"{child}\n")
-            sys.stdout.flush()  # whoever reads this kills it
+            sys.stdout.flush()  # who reads this kills it
             os.waitpid(child, 0)
 
 

@@ -13,7 +13,7 @@ KINDS = ("recordingMeta", "tracksMeta", "tracks")
 
 
 def write_highd(folder: Path, number: str, *, speed_mps: float = 30.0) -> list[Path]:
-    """The three files of one recording: nobody late, nobody near anybody, nobody changing lanes."""
+    """The three files of one recording: no one late, no one near anybody, no one changing lanes."""
     vehicles, tracks = [], []
     for vehicle in range(1, 2 * VEHICLES + 1):
         upper = vehicle <= VEHICLES

@@ -1,4 +1,4 @@
-"""Settings and protocols: what nobody sets is the protocol's, and what cannot go together is refused."""
+"""Settings and protocols: what no one sets is the protocol's, and what cannot go together is refused."""
 
 import pytest
 from typer.testing import CliRunner

@@ -42,14 +42,14 @@ def learned(tmp_path_factory):
         tables.append((subset, clock, *sample_everything(draw, clock, dataset="highd", subset=subset, protocol=CSP)))
     folder = tmp_path_factory.mktemp("learned")
     splits = pl.concat([split_row("a", "train"), split_row("b", "eval")])
-    tensors, told = write(folder / "tensors", tables, splits, protocol=CSP), []
+    tensors, reported = write(folder / "tensors", tables, splits, protocol=CSP), []
     config = TrainConfig(steps=60, batch_size=64, parameters={"hidden": 16})
-    metrics = train("lstm", tensors, folder / "run", config, lambda spent, loss: told.append((spent, loss)))
-    return folder, metrics, told
+    metrics = train("lstm", tensors, folder / "run", config, lambda spent, loss: reported.append((spent, loss)))
+    return folder, metrics, reported
 
 
 def test_training_reduces_the_loss_and_beats_constant_velocity(learned):
-    folder, metrics, told = learned
+    folder, metrics, reported = learned
     (phase,) = metrics["phases"]
     assert (phase["loss"], phase["steps"], metrics["steps"]) == ("mse", 60, 60)
     assert phase["loss_last"] < 0.5 * phase["loss_first"]
@@ -57,9 +57,9 @@ def test_training_reduces_the_loss_and_beats_constant_velocity(learned):
     better = evaluate("run", folder / "tensors", folder).horizons
     assert [row.n for row in better] == [row.n for row in plain]
     assert better[-1].rmse_m < 0.8 * plain[-1].rmse_m
-    assert len(told) == 61, "once per step, and at the end"
-    assert [spent for spent, _ in told] == sorted(spent for spent, _ in told)
-    assert told[-1][0] == 1.0
+    assert len(reported) == 61, "once per step, and at the end"
+    assert [spent for spent, _ in reported] == sorted(spent for spent, _ in reported)
+    assert reported[-1][0] == 1.0
 
 
 def test_what_is_written_says_how_it_came_about(learned):
@@ -92,7 +92,7 @@ def test_every_model_that_learns_goes_through_the_loop(name, tensors, tmp_path):
 
 
 def epochs_of(network, steps):
-    """The truths shown in each epoch, as sets: a sample is told by where it was in the end."""
+    """The truths shown in each epoch, as sets: a sample is reported by where it was in the end."""
     shown = [[tuple(row.flatten().tolist()) for row in future] for _, training, future in network.seen if training]
     return [[row for batch in shown[first : first + steps] for row in batch] for first in range(0, len(shown), steps)]
 
@@ -369,7 +369,7 @@ def test_a_last_step_that_explodes_leaves_nothing_to_go_on_from(tensors, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "reported"),
     [
         ({"seconds": 0.0}, "expected `seconds` above 0, got 0.0"),
         ({"batch_size": 0}, "expected `batch_size` above 0"),
@@ -385,8 +385,8 @@ def test_a_last_step_that_explodes_leaves_nothing_to_go_on_from(tensors, tmp_pat
         ({"schedule": "linear"}, "expected `schedule` constant or cosine, got 'linear'"),
     ],
 )
-def test_settings_that_cannot_train_are_refused(bad, told):
-    with pytest.raises(UsageError, match=told):
+def test_settings_that_cannot_train_are_refused(bad, reported):
+    with pytest.raises(UsageError, match=reported):
         TrainConfig(**bad)
 
 

@@ -138,8 +138,8 @@ def test_what_is_not_there_is_named_with_what_is(command, lake):
     assert "no run or model `nobody`: expected one of the runs constant-velocity" in nobody.err
     other = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--protocol", "grid-2021")
     assert other.code == 1
-    told = r"another protocol than grid-2021 \(\w{12}\) as it is set now: by csp \(\w{12}\)\. Run `tracklake run`"
-    assert re.search(told, other.err)
+    reported = r"another protocol than grid-2021 \(\w{12}\) as it is set now: by csp \(\w{12}\)\. Run `tracklake run`"
+    assert re.search(reported, other.err)
 
 
 def test_a_model_that_asks_for_the_future_is_not_scored(command, lake, monkeypatch):

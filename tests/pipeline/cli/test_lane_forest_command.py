@@ -109,13 +109,13 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
         if run != kept:
             shutil.rmtree(run)
     assert finished.code == 0, finished.err
-    told = json.loads(finished.out)
-    assert told["forest"] == scored["forest"]
+    reported = json.loads(finished.out)
+    assert reported["forest"] == scored["forest"]
     assert (kept / "forest.skops").read_bytes() == forest
     straight = [own for own in scored["cells"] if own["model"] == "constant-velocity"]
-    assert [own for own in told["cells"] if own["model"] == "good"] == [own | {"model": "good"} for own in straight]
-    assert [own for own in told["cells"] if own["model"] != "good"] == scored["cells"]
-    assert json.loads(alone.out)["cells"] == told["cells"]
+    assert [own for own in reported["cells"] if own["model"] == "good"] == [own | {"model": "good"} for own in straight]
+    assert [own for own in reported["cells"] if own["model"] != "good"] == scored["cells"]
+    assert json.loads(alone.out)["cells"] == reported["cells"]
     assert json.loads(alone.out)["passed_by"] == {}, "it was not asked for"
     assert refused.code == 1
     assert "were in its training part" in refused.err
@@ -125,11 +125,11 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
         "of-an-unknown-model": "unknown model `crystal-ball`",
         "on-these-recordings": "were in its training part",
     }
-    assert told["passed_by"].keys() == reasons.keys()
+    assert reported["passed_by"].keys() == reasons.keys()
     for name, reason in reasons.items():
-        assert reason in told["passed_by"][name]
+        assert reason in reported["passed_by"][name]
         assert f"skipped: {name}: " in finished.err
-    assert written["passed_by"] == told["passed_by"]
+    assert written["passed_by"] == reported["passed_by"]
 
 
 def test_settings_are_the_forests(command, copied, kept):
@@ -145,7 +145,7 @@ def test_settings_are_the_forests(command, copied, kept):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--set", "depth=3"], "the forest has start_s, tolerance_m, shift_m, trees, leaf, least_correlation,"),
         (["--set", "examples=3"], "got 'examples=3'"),
@@ -155,10 +155,10 @@ def test_settings_are_the_forests(command, copied, kept):
         (["--use", "--set", "trees=3"], "--use scores a forest as it is"),
     ],
 )
-def test_what_cannot_be_set_is_told(command, copied, arguments, told):
+def test_what_cannot_be_set_is_told(command, copied, arguments, reported):
     finished = command.here("lane-forest", "--lake", copied, *arguments)
     assert finished.code == 2
-    assert told in " ".join(finished.err.replace("│", " ").split())
+    assert reported in " ".join(finished.err.replace("│", " ").split())
 
 
 def test_a_forest_of_another_protocol_or_none_is_not_used(command, copied, kept):

@@ -21,8 +21,8 @@ def tensors(tmp_path_factory):
 def predict(tensors, tmp_path, monkeypatch):
     """The command on a lake that is nothing but these tensors."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tracklake.pipeline.lake.load", lambda root: root)
-    monkeypatch.setattr("tracklake.pipeline.stages.tensors.tensor_folder", lambda *_: tensors)
+    monkeypatch.setattr("tracklake.pipeline.cli.predict.load", lambda root: root)
+    monkeypatch.setattr("tracklake.pipeline.cli.predict.tensor_folder", lambda *_: tensors)
     (tmp_path / "lake" / "models").mkdir(parents=True)
 
     def run(*arguments):

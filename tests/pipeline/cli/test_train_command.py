@@ -41,11 +41,11 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
 
     @contextmanager
     def interrupting(_terminal, _title):
-        told = []
+        reported = []
 
         def tell(_share, _loss):
-            told.append(1)
-            if len(told) == 2:
+            reported.append(1)
+            if len(reported) == 2:
                 raise KeyboardInterrupt
 
         yield tell
@@ -54,7 +54,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         patch.setattr("tracklake.pipeline.cli.console.Terminal.show_training", interrupting)
         stopped = command.here(*steps)
     assert stopped.code == 1
-    assert "interrupted; the training stands in" in stopped.err
+    assert "interrupted; the checkpoint is" in stopped.err
     assert f"To go on: tracklake train lstm --resume --name half --lake {lake.root}" in stopped.err
     assert [path.name for path in models.iterdir() if "half" in path.name] == [".half.unfinished"]
     judged = command.here("evaluate", "half", "--lake", lake.root)
@@ -62,7 +62,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
     assert "was interrupted; finish it first" in judged.err
     unasked = command.here(*steps)
     assert unasked.code == 1
-    assert "go on with it (`--resume`), or lose it and begin anew (`--anew`)" in unasked.err
+    assert "resume it (`--resume`), or start over with `--anew`" in unasked.err
     other = command.here(*steps, "--resume", "--seed", "9")
     assert other.code == 1
     assert "training.seed 0 then, 9 now" in other.err
@@ -74,7 +74,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (("foo",), "MODEL is one of constant-velocity"),
         (("constant-velocity",), "constant-velocity does not learn"),
@@ -87,10 +87,10 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         (("lstm", "--set", "batch_size=0"), "expected `batch_size` above 0"),
     ],
 )
-def test_words_that_mean_nothing_here_are_usage_errors(arguments, told, command, lake):
+def test_words_that_mean_nothing_here_are_usage_errors(arguments, reported, command, lake):
     done = command.here("train", *arguments, "--lake", lake.root)
     assert done.code == 2
-    assert told in " ".join(done.err.replace("│", " ").split())
+    assert reported in " ".join(done.err.replace("│", " ").split())
 
 
 def test_patience_asks_for_a_validation_part(command, lake):

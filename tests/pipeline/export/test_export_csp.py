@@ -281,9 +281,9 @@ def test_the_same_lake_gives_the_same_bytes_and_a_card_with_the_counts(ngsim, tm
 def test_the_command(command, lake, tmp_path):
     done = command.here("export", "csp", "--lake", lake.root, "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.err
-    told = json.loads(done.out)
-    assert [file["name"] for file in told["files"]] == list(FILES)
-    for file in told["files"]:
+    reported = json.loads(done.out)
+    assert [file["name"] for file in reported["files"]] == list(FILES)
+    for file in reported["files"]:
         assert loadmat(tmp_path / "out" / file["name"])["traj"].shape == (file["samples"], 47)
     again = command.here("export", "csp", "--lake", lake.root, "--out", tmp_path / "out")
     assert (again.code, again.out) == (1, "")

@@ -352,7 +352,7 @@ def test_published_totals_are_the_freeways():
 
 
 def test_published_vehicles_are_ids(tmp_path):
-    """One id stands for two vehicles, told apart by what they announce; each has all of its rows."""
+    """One id stands for two vehicles, distinguished by what they announce; each has all of its rows."""
     rows = [ngsim_row(5, 1, Total_Frames=1), *(ngsim_row(5, frame, Total_Frames=2, v_Class=3) for frame in (7, 8))]
     canonical = ngsim(tmp_path, as_csv(rows))
     assert canonical.subsets[0].vehicles.height == 2

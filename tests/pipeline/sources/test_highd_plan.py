@@ -103,7 +103,7 @@ def test_what_is_excluded_is_not_there(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "reported"),
     [
         ("nowhere", "nowhere: no such file or folder"),
         ("empty", "empty: no metadata of highD there. Expected NN_recordingMeta.csv and NN_tracksMeta.csv"),
@@ -113,7 +113,7 @@ def test_what_is_excluded_is_not_there(run, tmp_path):
         ("mixed", "expected id 7, as the file's name says, got 1"),
     ],
 )
-def test_a_folder_without_the_metadata_is_explained(run, tmp_path, name, told):
+def test_a_folder_without_the_metadata_is_explained(run, tmp_path, name, reported):
     (tmp_path / "empty").mkdir()
     (tmp_path / "ngsim").mkdir()
     (tmp_path / "ngsim" / "i-80.txt").write_text("1 2 3\n")
@@ -124,7 +124,7 @@ def test_a_folder_without_the_metadata_is_explained(run, tmp_path, name, told):
         path.rename(path.with_name(path.name.replace("01_", "07_")))
     found = run(name)
     assert found.exit_code == 1
-    assert told in found.stderr
+    assert reported in found.stderr
     assert found.stdout == ""
 
 

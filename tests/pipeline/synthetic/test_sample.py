@@ -261,11 +261,11 @@ def test_an_earlier_sample_is_replaced_whole(tmp_path):
     out = tmp_path / "raw"
     out.mkdir()
     write_sample(out, formats=("ngsim-csv",), minutes=0.1)
-    told = []
-    write_sample(out, formats=("ngsim-text",), minutes=0.1, progress=told.append)
+    reported = []
+    write_sample(out, formats=("ngsim-text",), minutes=0.1, progress=reported.append)
     assert sorted(path.name for path in out.iterdir()) == ["README.md", "trajectories-us-101-0930.txt", "truth.parquet"]
     assert [path.name for path in tmp_path.iterdir()] == ["raw"]
-    assert told[0] == "simulating 1 carriageways"
+    assert reported[0] == "simulating 1 carriageways"
 
 
 def test_without_sumo_the_message_says_what_to_install(tmp_path, monkeypatch):

@@ -71,7 +71,7 @@ def test_injected_defects_are_found_entry_for_entry_and_nothing_else():
         # Up at 30, down at 31, up at 32: two changes, until the jerk of 30 is ten jerks ago.
         ("jerk_flicker", 3, 32, 39, 8, 2.0),
         ("lane_flicker", 4, 30, 34, 5, 0.5),
-        # 4's leader is in another lane, 50 m ahead, and nobody is in lane 2; 5's is beside while 3 leads it at 100 m.
+        # 4's leader is in another lane, 50 m ahead, and no one is in lane 2; 5's is beside while 3 leads it at 100 m.
         ("leader_mismatch", 4, 30, 34, 5, 50.0),
         ("leader_mismatch", 5, 30, 34, 5, 50.0),
         ("leader_mismatch", 8, 5, 5, 1, 50.0),

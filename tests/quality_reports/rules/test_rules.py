@@ -92,8 +92,8 @@ BOUNDARIES = [
     (
         "leader_mismatch",
         {
-            # right; farther than the nearest; abreast of the nearest; another lane; behind; nobody ahead; unseen;
-            # none recorded: nobody ahead, within 100 m, beyond.
+            # right; farther than the nearest; abreast of the nearest; another lane; behind; no one ahead; unseen;
+            # none recorded: no one ahead, within 100 m, beyond.
             "leader_id": [7, 7, 7, 7, 7, 7, 7, None, None, None],
             "leader_ahead_m": [20, 30, 20, 20, -1, 20, None, None, None, None],
             "nearest_ahead_m": [20, 20, 20, 25, 20, None, 20, None, 100, 100.1],

@@ -65,13 +65,13 @@ def test_the_first_and_the_last_tick_of_a_window_count_and_no_others(tmp_path):
     entries = [(7, tick, 1 + 5 * tick, 10.0 * tick, 5.0, 1, 20.0, 7) for tick in range(8)]
     clock = pl.DataFrame(entries, schema=CLOCK, orient="row")
     drawn = sample_everything(np.random.default_rng(0), clock, dataset="highd", subset="a", left_out=0.0)
-    told = []
+    reported = []
     for frame in (1, 31, 32):
         path = write(
             tmp_path / str(frame), [("a", clock, *drawn)], UNDIVIDED, findings=finding(7, "error", frame, frame)
         )
-        told.append(TensorFolder.open(path).mark_flagged([0], "info").tolist())
-    assert told == [[True], [True], [False]]
+        reported.append(TensorFolder.open(path).mark_flagged([0], "info").tolist())
+    assert reported == [[True], [True], [False]]
 
 
 def test_what_is_none_is_refused(tmp_path):

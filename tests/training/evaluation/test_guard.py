@@ -212,10 +212,10 @@ def test_asking_for_what_comes_is_refused(folder, cheat):
     ],
 )
 def test_a_model_that_reaches_the_tensors_another_way_is_found_out(folder, cheat, array):
-    told = (
+    reported = (
         rf"`cheat` sees the future: its prediction at tick \d+ of highd/b changes .*\(`{array}` of sample \d+, .* apart"
     )
-    with pytest.raises(FutureInputError, match=told):
+    with pytest.raises(FutureInputError, match=reported):
         measure_errors(cheat(folder), folder, "eval", name="cheat")
 
 
@@ -279,11 +279,11 @@ def test_honest_models_pass_and_the_folder_is_as_it_was(stored, reads, part):
         """Every number that it may see counts."""
 
         def predict(self, observed):
-            told = sum(
+            reported = sum(
                 float(np.nan_to_num(values).astype(np.float64).sum())
                 for values in (getattr(observed, name) for name in observed.__dataclass_fields__)
             )
-            return Prediction(super().predict(observed).position_m + told)
+            return Prediction(super().predict(observed).position_m + reported)
 
     before = {array.name: getattr(stored, array.name) for array in ARRAYS}
     copies = {name: values.copy() for name, values in before.items()}
@@ -329,7 +329,7 @@ def test_differences_between_later_rows_change_as_well(name):
 
 
 def test_runs_end_at_the_moment_and_what_can_be_seen_of_them_stays(stored):
-    """Every row keeps its subset, tick and size; later ones are of nobody who was seen."""
+    """Every row keeps its subset, tick and size; later ones are of no one who was seen."""
     for scene in stored.scenes_of("eval"):
         where, begin, after = guard._find_later_rows(stored, scene)
         tick = int(where.split()[2])

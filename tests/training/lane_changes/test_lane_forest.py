@@ -140,7 +140,7 @@ def in_classifier(**changes):
 
 
 class Foreign:
-    """A type that nobody trusts."""
+    """A type that no one trusts."""
 
 
 def flip_byte(file):
@@ -347,8 +347,8 @@ def test_without_evaluation_recordings_the_forest_stays_and_the_curve_is_explain
     draw = np.random.default_rng(5)
     rows = change_lanes(0, 6, to_right=True, draw=draw) + change_lanes(20, 6, to_right=False, draw=draw)
     folder = open_tracks(tmp_path / "t", {"a": rows})
-    monkeypatch.setattr("tracklake.pipeline.lake.load", lambda root: root)
-    monkeypatch.setattr("tracklake.pipeline.stages.tensors.tensor_folder", lambda *_: folder.path)
+    monkeypatch.setattr("tracklake.pipeline.cli.lane_forest.load", lambda root: root)
+    monkeypatch.setattr("tracklake.pipeline.cli.lane_forest.tensor_folder", lambda *_: folder.path)
     settings = [part for own in ("trees=3", "leaf=2", "start_s=3") for part in ("--set", own)]
     asked = ["lane-forest", "--lake", str(tmp_path / "lake"), "--learning-curve", *settings]
     done = CliRunner().invoke(app, asked, catch_exceptions=False)

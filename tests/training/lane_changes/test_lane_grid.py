@@ -175,11 +175,11 @@ def test_places_that_are_none_are_refused_or_their_model_is_passed_by(one_change
     forest, straight = constant_forest("k", "k", "k", "k"), {"straight": ConstantVelocity(SHORT)}
     with pytest.raises(TracklakeError, match=message):
         evaluate_grid(one_change, {"wrong": model}, forest)
-    told = []
+    reported = []
     scores = evaluate_grid(
-        one_change, {"wrong": model, **straight}, forest, on_skip=lambda name, why: told.append((name, why))
+        one_change, {"wrong": model, **straight}, forest, on_skip=lambda name, why: reported.append((name, why))
     )
-    [(name, why)] = told
+    [(name, why)] = reported
     assert (name, re.search(message, why) is not None) == ("wrong", True)
     assert scores == evaluate_grid(one_change, straight, forest)
 
@@ -189,10 +189,10 @@ def test_who_sees_the_future_is_found_out(one_change):
         def predict(self, observed):
             return Prediction(np.zeros((len(observed.history), 4, 2), np.float32) + one_change.position_m[-1, 0])
 
-    told = {}
-    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), on_skip=told.__setitem__)
-    assert (scores.cells, list(told)) == ([], ["peeks"])
-    assert "`peeks` sees the future" in told["peeks"]
+    reported = {}
+    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), on_skip=reported.__setitem__)
+    assert (scores.cells, list(reported)) == ([], ["peeks"])
+    assert "`peeks` sees the future" in reported["peeks"]
     with pytest.raises(FutureInputError, match="`peeks` sees the future"):
         evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest("k", "k", "k", "k"))
 

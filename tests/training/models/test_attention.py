@@ -254,13 +254,13 @@ def test_velocities_are_taken_from_known_ticks():
     history = np.stack([x, 0 * x], axis=-1)[None]
     mask = np.array([[1, 1, 1, 1, 1], [0, 0, 0, 1, 1], [0, 0, 0, 0, 1]], dtype=bool)[None]
     scene = to_tensors(change(observed, history=history, history_mask=mask))
-    told = describe_vehicles(scene, ticks=2, rate_hz=10)
-    assert told.velocity[0, :, 0].tolist() == [3.0, 4.0, 3.5]  # (8 - 2) / 2; (8 - 4) / 1; their mean
-    assert told.place_m[0].tolist() == [[8.0, 0.0]] * 3
-    deviation = told.features[0, 0, 4:14:2] * 5  # x of 5 ticks: 0 1 2 4 8 less -4 -1 2 5 8
+    reported = describe_vehicles(scene, ticks=2, rate_hz=10)
+    assert reported.velocity[0, :, 0].tolist() == [3.0, 4.0, 3.5]  # (8 - 2) / 2; (8 - 4) / 1; their mean
+    assert reported.place_m[0].tolist() == [[8.0, 0.0]] * 3
+    deviation = reported.features[0, 0, 4:14:2] * 5  # x of 5 ticks: 0 1 2 4 8 less -4 -1 2 5 8
     assert deviation.tolist() == pytest.approx([4, 2, 0, -1, 0])
-    assert told.features[0, :, 14:19].tolist() == mask[0].astype(float).tolist()
-    assert told.features[0, :, 2].tolist() == pytest.approx([2.0, 40 / 15, 35 / 15])  # m/s, divided by 15
+    assert reported.features[0, :, 14:19].tolist() == mask[0].astype(float).tolist()
+    assert reported.features[0, :, 2].tolist() == pytest.approx([2.0, 40 / 15, 35 / 15])  # m/s, divided by 15
 
 
 def test_loss_equals_scipy_and_the_plain_distance():

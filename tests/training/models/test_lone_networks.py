@@ -256,7 +256,7 @@ def test_what_is_not_known_of_the_future_teaches_nothing(name):
     garbled = replace(truth, future=np.where(truth.future_mask[..., None], future, np.float32(1e4)))
     network, seen = build(name), to_tensors(observe(history))
     for phase in MODELS[name].recipe.phases:
-        true, other = (network.loss(seen, to_tensors(told), phase.loss).item() for told in (truth, garbled))
+        true, other = (network.loss(seen, to_tensors(reported), phase.loss).item() for reported in (truth, garbled))
         assert true == other
 
 

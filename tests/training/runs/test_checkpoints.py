@@ -49,11 +49,11 @@ def _ctrl_c():
 
 def stop_after(steps, error=KeyboardInterrupt):
     """Told of every step, raises at the end of one."""
-    told = []
+    reported = []
 
     def progress(_spent, _loss):
-        told.append(1)
-        if len(told) == steps:
+        reported.append(1)
+        if len(reported) == steps:
             raise error
 
     return progress
@@ -164,9 +164,9 @@ def test_ctrl_c_waits_for_the_step_and_the_training_goes_on(tensors, tmp_path, u
         train("forgetful", tensors, tmp_path / "run", CONFIG)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     PressesKeys.presses = ()
-    told = []
-    train("forgetful", tensors, tmp_path / "run", None, lambda spent, _: told.append(spent), resume=True)
-    assert told[0] == pytest.approx(4 / 12), "three steps were done before"
+    reported = []
+    train("forgetful", tensors, tmp_path / "run", None, lambda spent, _: reported.append(spent), resume=True)
+    assert reported[0] == pytest.approx(4 / 12), "three steps were done before"
     assert read_run(tmp_path / "run") == undisturbed
 
 
@@ -261,16 +261,16 @@ def test_two_processes_do_not_train_one_run(tensors, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("config", "told"),
+    ("config", "reported"),
     [
         (replace(CONFIG, seed=5), "training.seed 4 then, 5 now"),
         (replace(CONFIG, epochs=4, patience=None), "training.epochs 3 then, 4 now; training.patience 5 then, None now"),
         (replace(CONFIG, parameters={"hidden": 9}), "parameters.hidden 8 then, 9 now; training.parameters.hidden None"),
     ],
 )
-def test_a_training_does_not_go_on_otherwise_than_it_began(config, told, interrupted, tensors, undisturbed):
+def test_a_training_does_not_go_on_otherwise_than_it_began(config, reported, interrupted, tensors, undisturbed):
     run, _ = interrupted
-    with pytest.raises(UnfinishedError, match=f"started with other settings or data: {told}.*`--resume` alone"):
+    with pytest.raises(UnfinishedError, match=f"started with other settings or data: {reported}.*`--resume` alone"):
         train("forgetful", tensors, run, config, resume=True)
     train("forgetful", tensors, run, resume=True)
     assert read_run(run) == undisturbed, "and nothing was lost"
@@ -286,36 +286,36 @@ def test_a_training_does_not_go_on_as_another_model_or_recipe(interrupted, tenso
 
 
 @pytest.mark.parametrize(
-    ("made", "told"),
+    ("made", "reported"),
     [
         ({"seed": 1}, r"data: tensors \w{12} then, \w{12} now\."),
         ({"protocol": replace(TINY, horizon_s=1.0)}, r"data: protocol.digest \w{12} then, \w{12} now; "),
         ({"splits": PARTS[:2], "subsets": "ab"}, "data: other blocks; tensors"),
     ],
 )
-def test_a_training_does_not_go_on_with_other_data(made, told, interrupted, tmp_path):
+def test_a_training_does_not_go_on_with_other_data(made, reported, interrupted, tmp_path):
     run, _ = interrupted
     tensors = write_tiny(tmp_path / "others", **made)
     config = replace(CONFIG, patience=5 if made.get("subsets") is None else None)
-    with pytest.raises(UnfinishedError, match=told):
+    with pytest.raises(UnfinishedError, match=reported):
         train("forgetful", tensors, run, config, resume=True)
 
 
 # Files that are not what was written
 
 
-@pytest.mark.parametrize(("damage", "told"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
-def test_damaged_checkpoints_are_refused_and_run_nothing(damage, told, interrupted, tensors):
+@pytest.mark.parametrize(("damage", "reported"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
+def test_damaged_checkpoints_are_refused_and_run_nothing(damage, reported, interrupted, tensors):
     run, checkpoint = interrupted
     damage(checkpoint)
-    with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {told}.*start over with `--anew`"):
+    with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {reported}.*start over with `--anew`"):
         train("forgetful", tensors, run, resume=True)
     assert not (checkpoint.parent / "was run").exists()
     assert checkpoint.is_file(), "left as it is"
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"version": 0}, "expected version 3 of checkpoints, got 0"),
         ({"more": 1}, "expected a checkpoint, got a file of device_random, more, network"),
@@ -336,10 +336,10 @@ def test_damaged_checkpoints_are_refused_and_run_nothing(damage, told, interrupt
         ({"run": {"training": {"steps": 0}}}, "expected settings .*`steps` above 0"),
     ],
 )
-def test_checkpoints_of_other_contents_are_refused(change, told, interrupted, tensors):
+def test_checkpoints_of_other_contents_are_refused(change, reported, interrupted, tensors):
     run, checkpoint = interrupted
     torch.save(torch.load(checkpoint, weights_only=True) | change, checkpoint)
     for config in (None, CONFIG):
-        with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {told}.*start over with `--anew`"):
+        with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {reported}.*start over with `--anew`"):
             train("forgetful", tensors, run, config, resume=True)
     assert checkpoint.is_file(), "left as it is"

@@ -39,10 +39,10 @@ def finished(trained, tmp_path, monkeypatch):
     return shutil.copytree(trained / "run", tmp_path / "run")
 
 
-@pytest.mark.parametrize(("damage", "told"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
-def test_damaged_weights_are_refused_and_run_nothing(damage, told, finished):
+@pytest.mark.parametrize(("damage", "reported"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
+def test_damaged_weights_are_refused_and_run_nothing(damage, reported, finished):
     damage(finished / "weights.pt")
-    with pytest.raises(StaleRunError, match=f"weights.pt: {told}.*train it again"):
+    with pytest.raises(StaleRunError, match=f"weights.pt: {reported}.*train it again"):
         load_run(finished, TINY)
     assert not (finished / "was run").exists()
 
@@ -68,7 +68,7 @@ def test_another_models_weights_are_refused_by_name_and_shape(finished):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"version": 1}, "expected version 2, got 1; train it again"),
         ({"version": None}, "expected version 2, got None; train it again"),
@@ -80,12 +80,12 @@ def test_another_models_weights_are_refused_by_name_and_shape(finished):
         ({"train_subsets": 3, "blocks": {}}, "expected blocks, train_subsets in it"),
     ],
 )
-def test_runs_of_other_versions_and_broken_ones_are_refused(change, told, finished):
+def test_runs_of_other_versions_and_broken_ones_are_refused(change, reported, finished):
     assert RUN_VERSION == 2
     file = finished / "config.json"
     config = json.loads(file.read_text())
     file.write_text("{" if change is None else json.dumps({**config, **change} if change else change))
-    with pytest.raises(StaleRunError, match=f"config.json: {told}"):
+    with pytest.raises(StaleRunError, match=f"config.json: {reported}"):
         load_run(finished, TINY)
 
 
@@ -105,17 +105,17 @@ def test_a_run_is_not_evaluated_on_what_it_was_trained_on(finished, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"model": "crystal-ball"}, "unknown model `crystal-ball`"),
         ({"parameters": {"hidden": "wide"}}, "run: .*train it again"),
         ({"parameters": {"depth": 3}}, "model `forgetful` has no parameter depth"),
     ],
 )
-def test_runs_that_cannot_be_built_are_refused(change, told, finished):
+def test_runs_that_cannot_be_built_are_refused(change, reported, finished):
     file = finished / "config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    with pytest.raises(StaleRunError, match=told):
+    with pytest.raises(StaleRunError, match=reported):
         load_run(finished, TINY)
 
 
@@ -145,7 +145,7 @@ def test_a_run_meets_new_recordings(finished, tmp_path):
 
 
 def test_a_run_says_what_trained_it_and_is_not_judged_by_it(finished, trained):
-    """Older runs lack the versions, and told their tensors apart by fewer arrays."""
+    """Older runs lack the versions, and reported their tensors apart by fewer arrays."""
     file = finished / "config.json"
     config = json.loads(file.read_text())
     assert config["versions"] == {"tracklake": version("tracklake"), "torch": version("torch")}

@@ -70,8 +70,8 @@ def test_an_epoch_with_two_losses_is_told_by_its_last(tensors, tmp_path, monkeyp
     loss = [float(row["loss"]) for row in read_log(tmp_path / "run" / "course.csv")]
     rows = read_log(tmp_path / "run" / "epochs.csv")
     assert [row["phase"] for row in rows] == ["mse", "distance", "distance"]
-    told = [float(row["loss"]) for row in rows]
-    assert told == pytest.approx([sum(loss[:4]) / 4, (loss[6] + loss[7]) / 2, loss[8]])
+    reported = [float(row["loss"]) for row in rows]
+    assert reported == pytest.approx([sum(loss[:4]) / 4, (loss[6] + loss[7]) / 2, loss[8]])
 
 
 def test_a_device_reader_reads_the_same(tensors):

@@ -66,7 +66,7 @@ def test_a_later_run_gets_an_id_that_no_vehicle_had():
 @given(recordings(), st.sampled_from([None, 6]), st.booleans())
 @settings(max_examples=15, deadline=None)
 def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_future):
-    """Of vehicles without gaps, in one part, with nobody missing around them."""
+    """Of vehicles without gaps, in one part, with no one missing around them."""
     frames = {vehicle: [row[1] for row in rows if row[0] == vehicle] for vehicle, *_ in rows}
     whole = [row for row in rows if max(frames[row[0]]) - min(frames[row[0]]) + 1 == len(frames[row[0]])]
     if not whole:
@@ -76,7 +76,7 @@ def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_f
     expected = np.concatenate([assemble(original, part) for part in (TRAIN, VAL, TEST)])
     assert np.array_equal(assemble(found, TRAIN)[:, :8], expected[:, :8])
     assert found.left_out == {}
-    # Nobody is overwritten: whoever stands in an original grid stands in this one.
+    # Nobody is overwritten: who stands in an original grid stands in this one.
     for mine, theirs in zip(assemble(found, TRAIN)[:, 8:], expected[:, 8:], strict=True):
         assert set(theirs.tolist()) <= set(mine.tolist()) or len(set(mine.tolist())) >= 13
 

@@ -24,7 +24,7 @@ def vehicles(name, ids, weight=10):
 
 
 def test_the_highest_id_decides_and_not_the_count():
-    # Of 10, up to 7 train and up to 8 are val, whoever is there: ids 1, 2, 8 and 10 leave half of the four to train.
+    # Of 10, up to 7 train and up to 8 are val, who is there: ids 1, 2, 8 and 10 leave half of the four to train.
     found = divide_by_id(table(("highd", "a", "01", 4, 0.3)), vehicles("a", [1, 2, 8, 10]))
     assert found.splits.rows() == [
         ("csp-2018", "highd", "a", 0, 1, 100, 1, 2, "train"),

@@ -286,10 +286,10 @@ def test_bad_input_is_refused(change, message):
 def test_shares_are_said_where_they_are_missed():
     rows = [(name, "S", "upper", vehicles, 10, 0.3) for name, vehicles in (("a", 80), ("b", 20))]
     assert allocate_flow_balanced(table(rows)).relaxations == {}
-    told = (
+    reported = (
         "train holds 0.800 of the vehicles instead of 0.700 +- 0.005; eval holds 0.200 of the vehicles instead of 0.300"
     )
-    assert allocate_flow_balanced(table(rows), train_share=0.7).relaxations["highd"].startswith(told)
+    assert allocate_flow_balanced(table(rows), train_share=0.7).relaxations["highd"].startswith(reported)
 
 
 @pytest.mark.parametrize(("share", "validation"), [(1.0, False), (0.0, False), (0.1, True), (1.2, True)])

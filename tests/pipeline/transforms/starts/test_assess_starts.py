@@ -259,7 +259,7 @@ def test_a_vehicle_that_backs_up_and_returns_starts_where_it_first_got():
 
 @pytest.mark.skipif(not US101.exists(), reason=f"the real excerpt {US101.name} is not beside the project")
 def test_us101_excerpt():
-    """The contract's windows cover 95 %; the local regression covers at least as much with far less in vain."""
+    """The contract's windows cover 95 %; the local regression covers at least as much with far less without need."""
     tracks, first_frame = read_us101()
     starts, cutoffs = classify_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=RATE_HZ)
     cutoff_m = cutoffs["cutoff_m"][0]

@@ -1,4 +1,4 @@
-"""Positions as they are stored: exact, or in whole steps with the error that is told."""
+"""Positions as they are stored: exact, or in whole steps with the error that is reported."""
 
 import numpy as np
 import pytest

@@ -126,7 +126,7 @@ def test_leaders_are_the_nearest_ahead_and_followers_the_nearest_behind():
 def test_nobody_leads_or_follows_itself():
     found = identify([entry(5, 1, 0.0, length=3.0, leader=5, follower=5), entry(5, 1, 50.0, leader=5, follower=5),
                       entry(5, 2, 51.0, leader=5, follower=5), entry(6, 2, 9.0, leader=6, follower=6)])  # fmt: skip
-    # In frame 1 each of the two is the other's; in frame 2 there is nobody else.
+    # In frame 1 each of the two is the other's; in frame 2 there is no one else.
     assert found.entries.select("vehicle_id", "frame", "leader_id", "follower_id").rows() == [
         (5, 1, 7, 7), (6, 2, None, None), (7, 1, 5, 5), (7, 2, None, None)]  # fmt: skip
     unsplit = identify([entry(6, 2, 9.0, leader=6, follower=6)])

@@ -1,4 +1,4 @@
-"""Vehicles that share an id are told apart by how they move."""
+"""Vehicles that share an id are distinguished by how they move."""
 
 import pytest
 from hypothesis import given, settings
