@@ -200,6 +200,13 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
         yield
 
 
+@pytest.fixture(scope="module")
+def empty_charts() -> Iterator[None]:
+    """Charts of this process show nothing: for tests of something else, which would spend half their time on them."""
+    with mock.patch("vl_convert.vegalite_to_svg", return_value="<svg ></svg>"):
+        yield
+
+
 @pytest.fixture(scope="session")
 def sample(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default sample, shortened, with its truth.parquet."""

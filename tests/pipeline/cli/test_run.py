@@ -279,7 +279,8 @@ def test_a_model_trains_and_every_run_is_evaluated(command, lake, tmp_path):
 def test_dask_workers_make_the_same_lake(command, tmp_path):
     for number in ("01", "02"):
         write_highd(tmp_path / "raw", number)
-    done = command("ingest", tmp_path / "raw", "--lake", tmp_path / "dask", "--json", TRACKLAKE_RUNNER="dask")
+    to_dask = ("--workers", "1", "--json")
+    done = command("ingest", tmp_path / "raw", "--lake", tmp_path / "dask", *to_dask, TRACKLAKE_RUNNER="dask")
     assert done.code == 0, done.err
     assert json.loads(done.out)["built"] == {"ingest": 2}
     assert command.here("ingest", tmp_path / "raw", "--lake", tmp_path / "threads").code == 0

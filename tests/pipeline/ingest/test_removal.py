@@ -61,9 +61,9 @@ def ingest(prefect_here):
 
 
 @pytest.fixture(scope="module")
-def made(command, prefect_here, tmp_path_factory) -> Path:
+def made(command, prefect_here, empty_charts, tmp_path_factory) -> Path:
     """A folder with raw/ of recordings 01 to 04 and lake/, which the whole pipeline made of them."""
-    del prefect_here
+    del prefect_here, empty_charts
     folder = tmp_path_factory.mktemp("made")
     for number in ("01", "02", "03", "04"):
         write_highd(folder / "raw", number, speed_mps=28.0 + int(number))

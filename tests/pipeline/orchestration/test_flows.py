@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sqlite3
 import time
 from collections import Counter
 from dataclasses import replace
@@ -268,16 +267,6 @@ def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lak
         assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
 
 
-def test_the_embedded_server_takes_the_artifacts_too(command, raw, prefect_home, tmp_path):
-    done = command.alone("run", raw, "--lake", tmp_path / "lake", PREFECT_HOME=str(prefect_home))
-    assert done.code == 0, done.err
-    assert "artifacts" not in done.out
-    with sqlite3.connect(f"file:{prefect_home / 'prefect.db'}?mode=ro", uri=True) as database:
-        keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
-    database.close()
-    assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
-
-
 def test_serve_offers_the_flows_as_deployments(command, tmp_path):
     alone = command.alone("serve")
     assert alone.code == 1
@@ -294,16 +283,3 @@ def test_serve_offers_the_flows_as_deployments(command, tmp_path):
     finally:
         process.kill()
         process.communicate()
-
-
-def test_the_embedded_server_ends_with_its_process(command, raw, tmp_path):
-    process = command.alone.start("ingest", raw, "--lake", tmp_path / "lake", "--quiet")
-    limit = time.monotonic() + 120
-    while not (tmp_path / "lake" / "manifest.json").exists() and time.monotonic() < limit:
-        time.sleep(0.01)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    if children.exists():
-        assert children.read_text().split() == []
-    process.kill()
-    process.communicate(timeout=10)  # returns only when no process holds the pipe any more
-    assert json.loads((tmp_path / "lake" / "manifest.json").read_text())["lake_id"]

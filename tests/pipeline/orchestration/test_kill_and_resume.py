@@ -4,7 +4,10 @@ import json
 import os
 import shutil
 import signal
+import sqlite3
 import time
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -53,17 +56,21 @@ def read_all(root: Path) -> dict[str, pl.DataFrame]:
     return {table.name: tables[table.name].select(*table.dtypes) for table in TABLES}
 
 
-def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(command, raw, undisturbed, tmp_path):
-    root = tmp_path / "lake"
+def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(
+    command, raw, undisturbed, prefect_home, tmp_path
+):
+    root, home = tmp_path / "lake", {"PREFECT_HOME": str(prefect_home)}
     committed: dict[str, str] = {}
     for wanted in (1, 9):
         # The first leaves a server's database behind as well, and the run that goes on from there begins with it.
-        killed = command.alone if wanted == 1 else command
-        process = killed.start("run", raw, "--lake", root, "--quiet")
+        begin = partial(command.alone.start, **home) if wanted == 1 else command.start
+        process = begin("run", raw, "--lake", root, "--quiet")
         reached = wait_until(lambda wanted=wanted: len(entries(root)) >= wanted, process)
         assert reached, process.communicate()[0]
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        assert not children.exists() or children.read_text().split() == [], "a server that outlives its process"
         os.kill(process.pid, signal.SIGKILL)
-        process.communicate()
+        process.communicate(timeout=10)  # returns only when no process holds the pipe any more
         # Nothing that was committed is lost, and every file of it is whole.
         manifest = load(root)
         now = {key: entry.fingerprint for key, entry in manifest.commits.items()}
@@ -76,14 +83,20 @@ def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(command, 
         for table in TABLES:
             assert tables[table.name].height == sum(file.rows for file in manifest.live(table.name)), table.name
     before = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
-    done = command.alone("run", raw, "--lake", root, "--json")
+    done = command.alone("run", raw, "--lake", root, "--json", **home)
     assert done.code == 0, done.err
-    built = json.loads(done.out)["built"]
+    said = json.loads(done.out)
+    built = said["built"]
     assert sum(built.values()) == len(load(root).commits) - len(committed), "only what was missing was made"
     after = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
     assert before.items() <= after.items()
     left = [path for path in root.rglob("*") if ".tmp" in path.name or path.name == ".staging"]
     assert left == []
+    # The embedded server took the report as artifacts, too.
+    assert not any("artifacts" in note for note in said["notes"])
+    with closing(sqlite3.connect(f"file:{prefect_home / 'prefect.db'}?mode=ro", uri=True)) as database:
+        keys = {key.split("-")[1] for (key,) in database.execute("SELECT key FROM artifact_collection")}
+    assert keys == {"findings", "subsets", "ingestion", "completeness", "report"}
     # And it is the lake that an undisturbed run makes.
     expected = read_all(undisturbed)
     for name, table in read_all(root).items():
