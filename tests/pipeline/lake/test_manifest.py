@@ -28,10 +28,10 @@ def test_every_file_ever_committed_is_live_or_retired_with_the_step_that_let_go_
         before = manifest
         if isinstance(step, tuple):
             key, numbers = step
-            manifest = manifest.committing(make_commit(key, numbers), generation)
+            manifest = manifest.add_commit(make_commit(key, numbers), generation)
             now = {**held, key: {f"{'tracks' if n % 2 else 'vehicles'}/{key}/{n}" for n in numbers}}
         else:
-            manifest = manifest.removing(step, generation)
+            manifest = manifest.remove_commits(step, generation)
             now = {key: paths for key, paths in held.items() if key not in step}
         for paths in held.values():
             since.update(dict.fromkeys(paths - {path for kept in now.values() for path in kept}, generation))
@@ -49,4 +49,4 @@ def test_every_file_ever_committed_is_live_or_retired_with_the_step_that_let_go_
 
 @given(st.sets(KEYS))
 def test_removing_what_is_not_there_retires_nothing(keys):
-    assert Manifest().removing(keys, 1).retired == ()
+    assert Manifest().remove_commits(keys, 1).retired == ()

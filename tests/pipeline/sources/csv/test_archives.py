@@ -217,11 +217,11 @@ def test_hashes_of_members_are_remembered_until_the_archive_changes(tmp_path, mo
         return hash_raw(file)
 
     monkeypatch.setattr(discovery_module, "hash_raw", count)
-    monkeypatch.setattr(discovery_module, "_HASHED", {})
+    monkeypatch.setattr(discovery_module, "_HASHES_OF_PROCESS", {})
 
     def look():
         # As a new process would: it knows what stands in the lake.
-        discovery_module._HASHED.clear()
+        discovery_module._HASHES_OF_PROCESS.clear()
         digests = Digests(tmp_path)
         found = discover(path, digest=digests)
         digests.save()
