@@ -54,7 +54,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         patch.setattr("tracklake.pipeline.cli.console.Terminal.measuring", interrupting)
         stopped = command.here(*steps)
     assert stopped.code == 1
-    assert "interrupted; the training stands in" in stopped.err
+    assert "interrupted; the checkpoint is" in stopped.err
     assert f"To go on: tracklake train lstm --resume --name half --lake {lake.root}" in stopped.err
     assert [path.name for path in models.iterdir() if "half" in path.name] == [".half.unfinished"]
     judged = command.here("evaluate", "half", "--lake", lake.root)
@@ -62,7 +62,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
     assert "was interrupted; finish it first" in judged.err
     unasked = command.here(*steps)
     assert unasked.code == 1
-    assert "go on with it (`--resume`), or lose it and begin anew (`--anew`)" in unasked.err
+    assert "resume it (`--resume`), or start over with `--anew`" in unasked.err
     other = command.here(*steps, "--resume", "--seed", "9")
     assert other.code == 1
     assert "training.seed 0 then, 9 now" in other.err
