@@ -15,7 +15,7 @@ from tracklake.schemas import TABLES
 ROOT = Path(__file__).parents[1]
 PAGE = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), flags=re.DOTALL))
 NOTEBOOK = json.loads((ROOT / "examples" / "quickstart.ipynb").read_text())
-CELLS = "\n".join(cell["source"] for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code")
+CELLS = "\n".join("".join(cell["source"]) for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code")
 
 
 @pytest.fixture

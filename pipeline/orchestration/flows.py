@@ -45,6 +45,7 @@ from tracklake.pipeline.orchestration.run_plan import (
     explain_left_out,
     explain_not_rebuilt,
     plan_ingest,
+    remember_hashes,
     remember_places,
     remove_missing,
     survey_source,
@@ -148,6 +149,7 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
         plan = plan_ingest(request, discovery, writer.manifest)
     result.refused += plan.conflicts
     remember_places(writer, request, plan)
+    remember_hashes(writer.root, discovery)
     remove_missing(writer, request, plan, result)
     needed = {
         file.sha256: (job.inputs["dataset"], file)

@@ -149,6 +149,15 @@ def survey_source(request: RunRequest) -> Discovery:
     return discovery
 
 
+def remember_hashes(root: Path, discovery: Discovery) -> None:
+    """Store the hashes of a source's files in a lake that may not have existed when they were computed."""
+    digests = Digests(root)
+    for _, unit in discovery.units:
+        for file in unit.files:
+            digests(file)
+    digests.save()
+
+
 def plan_run(request: RunRequest, discovery: Discovery | None) -> RunPlan:
     """Compare a request with the lake.
 
