@@ -29,7 +29,7 @@ from tracklake.schemas.raw_highd import RAW_TRACKS_FIELDS
 
 REPEATS = 3
 FLOOR_LEVEL = 3
-"""Of zstd: what bare Polars takes where it is told none."""
+"""Level of zstd that bare Polars uses by default."""
 
 
 def main() -> None:

@@ -130,7 +130,7 @@ def ngsim_rows(rows: int, recordings: int) -> pl.DataFrame:
 
 
 TEXT_WIDTHS = (6, 6, 6, 14, 9, 9, 12, 12, 6, 6, 2, 8, 8, 4, 6, 6, 9, 8)
-"""Of the 18 fields; with the blanks between them a line has 156 bytes, the originals' about 160."""
+"""Widths of the 18 fields, in characters; with the blanks between them a line has 156 bytes (originals: 160)."""
 
 
 def write_text(path: Path, rows: pl.DataFrame) -> None:

@@ -18,7 +18,7 @@ from tracklake.schemas.protocols import PROTOCOLS
 
 EVALUATIONS, SCENES, JOBS = "evaluations.csv", "evaluations-{nearest}-around.csv", "jobs.csv"
 GROUPS = "groups.csv"
-"""Of the study's folder: means over seeds of every group of samples; too large to stand beside the page."""
+"""File in the study's folder: means over seeds of every group of samples; too large to stand beside the page."""
 NEAREST = (2, 6, 10, 20)
 """Vehicles around the ego that scene models are shown in evaluation: scenes of 3, 7, 11 and 21."""
 DATASETS = {"ngsim": "NGSIM-like", "highd": "highD-like"}

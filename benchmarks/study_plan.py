@@ -56,7 +56,7 @@ PLAIN = ("constant-velocity", "kalman-cv", "ctrv")
 SLOW = 0.3
 """The encoder-decoder of 256 units takes ten times what the others take."""
 BLOCKS = {"TRACKLAKE_SPLIT": "time-blocks", "TRACKLAKE_SPLITS": '["time-blocks"]', "TRACKLAKE_SPLIT_BLOCK_S": "75"}
-"""Of ten carriageways no two carry the same traffic. Parted as wholes, evaluation would be on traffic that nothing was
+"""No two of ten carriageways carry the same traffic. Parted as wholes, evaluation would be on traffic that nothing was
 trained on; blocks of time have all kinds in both parts, and do not leak either."""
 
 ARMS = (

@@ -51,7 +51,7 @@ from tracklake.training.models import MODELS
 from tracklake.training.train import TrainConfig, train
 
 Digests = dict[str, str | list[str]]
-"""By name; of losses the numbers, ten steps a line."""
+"""Digests by name; losses are kept as numbers, ten steps a line."""
 Run = Callable[..., object]
 """Runs `tracklake` with these arguments."""
 
@@ -249,7 +249,7 @@ def find_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 
 
 def measure_all(folder: Path) -> dict[str, Digests]:
-    """All groups, of lakes made again in an empty folder; without the excerpts where they are not at hand."""
+    """All groups, of new lakes in an empty folder; without the excerpts where they are not at hand."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("TRACKLAKE_", "PREFECT_"))}
     environment = {**kept, "PREFECT_HOME": str(folder / "prefect")}
 

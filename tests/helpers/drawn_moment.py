@@ -20,7 +20,7 @@ PLACES = {
 }
 """(x_m, y_m) by tick; at 2 Hz, so that tick 2 is 1 s after the recording began."""
 SIZES_M = {OWN: (4.1, 1.51), NEAR: (4.2, 1.52)}
-"""As `tensor_tables.sizes_of` gives them."""
+"""Vehicle sizes as `tensor_tables.sizes_of` returns them."""
 OWN_SAMPLE, FAR_SAMPLE = 0, 1
 """Both at tick 2; numbered by vehicle."""
 

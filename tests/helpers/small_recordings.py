@@ -5,9 +5,9 @@ from pathlib import Path
 from highd_files import META_HEADER, TRACKS_HEADER, VEHICLES_HEADER, meta_row, track_row
 
 VEHICLES = 8
-"""Of each of the two carriageways."""
+"""Vehicles on each of the two carriageways."""
 FRAMES = 150
-"""Of each vehicle: 6 s, on its way from the road's one end."""
+"""Frames of each vehicle: 6 s, from one end of the road."""
 ENTRIES = 2 * VEHICLES * FRAMES
 KINDS = ("recordingMeta", "tracksMeta", "tracks")
 

@@ -82,7 +82,7 @@ def split_row(subset, part, *, block=0, first_frame=0, last_frame=10_000, ids=(N
 
 
 def sizes_of(clock):
-    """A length and a width of each vehicle, reported by its id; every fifth has none."""
+    """A length and a width of each vehicle, which tell the vehicles apart; every fifth has none."""
     ids = clock["vehicle_id"].unique().sort()
     known = pl.when(pl.col("vehicle_id") % 5 != 0)
     return pl.DataFrame({"vehicle_id": ids}).with_columns(

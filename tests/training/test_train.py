@@ -92,7 +92,7 @@ def test_every_model_that_learns_goes_through_the_loop(name, tensors, tmp_path):
 
 
 def epochs_of(network, steps):
-    """The truths shown in each epoch, as sets: a sample is reported by where it was in the end."""
+    """The truths shown in each epoch, as sets: a sample is identified by its last position."""
     shown = [[tuple(row.flatten().tolist()) for row in future] for _, training, future in network.seen if training]
     return [[row for batch in shown[first : first + steps] for row in batch] for first in range(0, len(shown), steps)]
 

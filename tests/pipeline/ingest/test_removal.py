@@ -16,7 +16,7 @@ HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
 US_101 = {"us-101-0750": 1_118_846_978_900, "us-101-0805": 1_118_847_842_000}
 """Recordings of NGSIM and milliseconds of the epoch at which they run."""
 ROWS = 20
-"""Of each of them, in a file of `write_ngsim`: two vehicles in ten frames."""
+"""Entries of each recording in a file of `write_ngsim`: two vehicles in ten frames."""
 WHOLE_LAKE = {"split", "tensors", "score", "report"}
 
 

@@ -24,7 +24,7 @@ print(done, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc is reported anything")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 def test_repeated_steps_are_given_no_new_pages():
     run = subprocess.run([sys.executable, "-c", REPEATED], capture_output=True, text=True, check=True)
     done, faults = run.stdout.split()

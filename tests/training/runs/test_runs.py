@@ -145,7 +145,7 @@ def test_a_run_meets_new_recordings(finished, tmp_path):
 
 
 def test_a_run_says_what_trained_it_and_is_not_judged_by_it(finished, trained):
-    """Older runs lack the versions, and reported their tensors apart by fewer arrays."""
+    """Older runs lack the versions, and their digests cover fewer arrays."""
     file = finished / "config.json"
     config = json.loads(file.read_text())
     assert config["versions"] == {"tracklake": version("tracklake"), "torch": version("torch")}
