@@ -2,7 +2,7 @@
 
     python benchmarks/split.py [--seeds N]
 
-117 subsets of six sites with highD's flows (0.12 to 0.50 vehicles per lane and second) and entries (78 k to 0.77 M);
+117 subsets of six sites with 0.12 to 0.50 vehicles per lane and second, as highD has, and entries (78 k to 0.77 M);
 the numbers themselves are drawn. Beside them stands what the study that validates highD published of its own split.
 """
 
@@ -26,23 +26,23 @@ STUDY_MEAN, STUDY_STD = 2e-3, 1e-3
 
 
 def draw_subsets(seed: int) -> pl.DataFrame:
-    """Subsets in highD's proportions: two carriageways per recording, with flows and entries of their own."""
+    """Subsets in highD's proportions: two carriageways per recording, with traffic and entries of their own."""
     draw = random.Random(seed)
     rows = []
     for position in range(SUBSETS):
         if position % 2 == 0:
             site = draw.choices(list(SITES), weights=list(SITES.values()))[0]
-        flow = draw.uniform(LOW, HIGH)
-        entries = round(FEWEST + (flow - LOW) / (HIGH - LOW) * (MOST - FEWEST) * draw.uniform(0.7, 1.0))
-        vehicles = round(flow * 2.4 * 900 * draw.uniform(0.7, 1.2))
+        rate = draw.uniform(LOW, HIGH)
+        entries = round(FEWEST + (rate - LOW) / (HIGH - LOW) * (MOST - FEWEST) * draw.uniform(0.7, 1.0))
+        vehicles = round(rate * 2.4 * 900 * draw.uniform(0.7, 1.2))
         side = ("upper", "lower")[position % 2]
-        rows.append(("highd", f"{position // 2 + 1:02d}-{side}", site, side, vehicles, entries, flow, 1, 22_500))
+        rows.append(("highd", f"{position // 2 + 1:02d}-{side}", site, side, vehicles, entries, rate, 1, 22_500))
     return pl.DataFrame(rows, schema=COLUMNS, orient="row")
 
 
 def differ(allocation: Allocation) -> tuple[float, float]:
-    """Sums over the pairs of parts of the differences of flow's mean and standard deviation, veh/lane/s."""
-    parts = allocation.balance.select("flow_mean", "flow_std").rows()
+    """Sums over the pairs of parts of the differences of vehicles_per_lane_s in mean and standard deviation."""
+    parts = allocation.balance.select("vehicles_per_lane_s_mean", "vehicles_per_lane_s_std").rows()
     pairs = list(combinations(parts, 2))
     return sum(abs(a[0] - b[0]) for a, b in pairs), sum(abs(a[1] - b[1]) for a, b in pairs)
 

@@ -14,7 +14,7 @@ from tracklake.schemas.subsets import SUBSET_STATUS, SUBSETS
 from tracklake.schemas.tracks import TRACKS
 from tracklake.schemas.vehicles import VEHICLE_STARTS, VEHICLES
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the tables below; it grows when an older lake can no longer be read."""
 
 TABLES: tuple[Table, ...] = (

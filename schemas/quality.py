@@ -106,8 +106,10 @@ class SplitBalance(TypedDict):
     vehicle_share: Annotated[float | None, "share of the dataset's vehicles that are in the split"]
     samples: Annotated[int, "samples in the part"]
     sample_share: Annotated[float | None, "share of the split's samples of the dataset"]
-    flow_mean_veh_per_lane_s: Annotated[float | None, "flow of the part's subsets, mean weighted by samples"]
-    flow_std_veh_per_lane_s: Annotated[float | None, "flow of the part's subsets, standard deviation likewise"]
+    vehicles_per_lane_s_mean: Annotated[
+        float | None, "`vehicles_per_lane_s` of the part's subsets, mean weighted by samples", "veh/lane/s"
+    ]
+    vehicles_per_lane_s_std: Annotated[float | None, "the same, standard deviation", "veh/lane/s"]
     relaxed: Annotated[bool, "true: a constraint of the split could not be met"]
     relaxed_reason: Annotated[str | None, "constraint that could not be met"]
 
@@ -126,7 +128,7 @@ class SplitMember(TypedDict):
     first_vehicle_id: Annotated[int | None, "least id of the vehicles in the part; null: all vehicles"]
     last_vehicle_id: Annotated[int | None, "greatest id of the vehicles in the part; null: all vehicles"]
     subset_vehicles: Annotated[int, "vehicles of the whole subset"]
-    flow_veh_per_lane_s: Annotated[float | None, "flow of the whole subset"]
+    vehicles_per_lane_s: Annotated[float | None, "that of the whole subset", "veh/lane/s"]
 
 
 class SplitLeakage(TypedDict):
@@ -171,7 +173,7 @@ class SplitShift(TypedDict):
     dataset: Dataset
     part: FirstPart
     other_part: OtherPart
-    quantity: Annotated[str, "flow (veh/lane/s), speed (m/s), left, right or brake (shares of samples)"]
+    quantity: Annotated[str, "vehicles_per_lane_s (veh/lane/s), speed (m/s), left, right or brake (shares of samples)"]
     mean: Annotated[float, "mean in the first part", "of `quantity`"]
     other_mean: Annotated[float, "mean in the other part", "of `quantity`"]
     std: Annotated[float, "standard deviation in the first part", "of `quantity`"]

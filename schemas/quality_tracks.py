@@ -20,6 +20,8 @@ class Headline(TypedDict):
     entries: Annotated[int, "rows of `tracks`, all subsets"]
     recorded_s: Annotated[float, "length of all recordings; carriageways recorded at the same time count once"]
     driven_m: Annotated[float, "distance of all vehicles from first to last position"]
+    least_flow_vphpl: Annotated[float | None, "least `flow_vphpl` of the subsets", "veh/h/lane"]
+    greatest_flow_vphpl: Annotated[float | None, "greatest `flow_vphpl` of the subsets", "veh/h/lane"]
     excluded_subsets: Annotated[int | None, "subsets kept out of samples and splits; null before validation"]
     vehicles_with_errors: Annotated[int | None, "vehicles with a finding of severity error; null before validation"]
     late_starts: Annotated[int | None, "tracks that begin beyond the cut-off; null where none was judged"]
@@ -60,7 +62,12 @@ class SubsetFacts(TypedDict):
     seconds: Annotated[float, "length of the recording", "s"]
     vehicles: Annotated[int, "tracks"]
     entries: Annotated[int, "rows of `tracks`"]
-    flow_veh_per_lane_s: Annotated[float | None, "vehicles / lanes / seconds; null where the lanes are unknown"]
+    flow_vphpl: Annotated[
+        float | None, "flow by Edie: distance driven on the main lanes / (length * lanes * seconds)", "veh/h/lane"
+    ]
+    vehicles_per_lane_s: Annotated[
+        float | None, "vehicles / lanes / seconds, null where the lanes are unknown: no flow", "veh/lane/s"
+    ]
     mean_speed_mps: Annotated[float | None, "recorded speed, mean over entries"]
     ids_split: Annotated[int, "source ids that stood for more than one vehicle"]
     backward_vehicles: Annotated[int | None, "vehicles with an entry of negative speed; null before validation"]

@@ -4,7 +4,7 @@ import polars as pl
 
 from tracklake.schemas.columns import DATASET, PARTS, Table, column
 
-QUANTITIES = ("flow", "speed", "left", "right", "brake")
+QUANTITIES = ("vehicles_per_lane_s", "speed", "left", "right", "brake")
 """Quantities whose distributions are compared: veh/lane/s, m/s, and 0 or 1 for each sample's maneuver."""
 
 _SPLIT = column(pl.String, "the split's name")
@@ -75,8 +75,8 @@ SPLIT_SHIFTS = Table(
         "other_part": _OTHER,
         "quantity": column(
             pl.String,
-            "flow (of the subset or block, of each sample, veh/lane/s), speed (recorded, of each entry, to 0.1 m/s), "
-            "left, right, brake (1 for samples with that maneuver, else 0)",
+            "vehicles_per_lane_s (of the subset or block, of each sample), speed (recorded, of each entry, to 0.1 "
+            "m/s), left, right, brake (1 for samples with that maneuver, else 0)",
             isin=QUANTITIES,
         ),
         "mean": column(pl.Float64, "in the part; of a maneuver its share"),

@@ -39,10 +39,12 @@ SPLIT_BALANCE = Table(
         "vehicles": column(pl.Int64, "vehicles that give entries to the part, each counted once", ge=0),
         "vehicle_share": column(pl.Float64, "of the vehicles of all parts of the dataset", ge=0, le=1),
         "samples": column(pl.Int64, "kept samples in the part, of vehicles that are not left out of it", ge=0),
-        "flow_mean": column(pl.Float64, "sample-weighted mean of flow", unit="veh/lane/s", nullable=True),
-        "flow_std": column(
+        "vehicles_per_lane_s_mean": column(
+            pl.Float64, "sample-weighted mean of subsets.vehicles_per_lane_s", unit="veh/lane/s", nullable=True
+        ),
+        "vehicles_per_lane_s_std": column(
             pl.Float64,
-            "sample-weighted standard deviation of flow",
+            "sample-weighted standard deviation of subsets.vehicles_per_lane_s",
             unit="veh/lane/s",
             nullable=True,
         ),

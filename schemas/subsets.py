@@ -32,9 +32,17 @@ SUBSETS = Table(
         "last_frame": column(pl.Int32, "the subset's last frame"),
         "vehicles": column(pl.Int32, "tracks in the subset", ge=1),
         "entries": column(pl.Int64, "rows of tracks", ge=1),
-        "flow": column(
+        "flow_vphpl": column(
             pl.Float64,
-            "vehicles / lanes / seconds; null where the lanes are unknown",
+            "flow by Edie's definition: distance driven on the main lanes / (length of the section * lanes * seconds); "
+            "null where the lanes or the length are unknown",
+            unit="veh/h/lane",
+            nullable=True,
+        ),
+        "vehicles_per_lane_s": column(
+            pl.Float64,
+            "vehicles / lanes / seconds, which flow-balanced splits balance; it counts all that were seen, also those "
+            "on the road at the start, and is no flow; null where the lanes are unknown",
             unit="veh/lane/s",
             nullable=True,
         ),

@@ -145,3 +145,16 @@ def test_the_carriageways_flow_is_that_of_all_entries(asked):
     assert row["flow_veh_per_h"] == pytest.approx(3600 * metres / (section * 5), rel=1e-9)
     assert row["density_veh_per_km"] == pytest.approx(1000 * seconds / (section * 5), rel=1e-9)
     assert row["speed_mps"] == pytest.approx(metres / seconds, rel=1e-9)
+
+
+def test_the_flow_of_a_subset_is_the_mean_of_its_main_lanes(asked):
+    """By the macro, over the whole recording; the vehicles seen in a short one are many more."""
+    found = asked.sql(
+        "SELECT s.subset, any_value(flow_vphpl) AS flow, sum(f.flow_veh_per_h) / any_value(s.lanes) AS mean_of_lanes, "
+        "any_value(3600 * vehicles_per_lane_s) AS seen FROM subsets AS s, flow_density(s.subset, 1000000) AS f "
+        "WHERE f.lane BETWEEN 1 AND s.lanes GROUP BY ALL"
+    ).pl()
+    assert found.height >= 5
+    for row in found.iter_rows(named=True):
+        assert row["flow"] == pytest.approx(row["mean_of_lanes"], rel=1e-9), row["subset"]
+        assert row["seen"] > 1.5 * row["flow"], row["subset"]

@@ -35,7 +35,7 @@ ESTIMATED = (
 )
 """Note beside a planned split: what its weights are."""
 
-SHOWN = ("dataset", "subset", "site", "direction", "vehicles", "weight", "flow", "part")
+SHOWN = ("dataset", "subset", "site", "direction", "vehicles", "weight", "vehicles_per_lane_s", "part")
 """Columns of a planned split."""
 
 
@@ -128,12 +128,12 @@ def _show_plan(terminal: Terminal, parts: pl.DataFrame, allocation: Allocation, 
         ]
         print_table(terminal, parts.columns, rows, right=[dtype.is_numeric() for dtype in parts.dtypes])
     for row in allocation.balance.reverse().iter_rows(named=True):
-        if row["flow_mean"] is None:
+        if row["vehicles_per_lane_s_mean"] is None:
             terminal.print_line(f"{row['part']}: nothing")
             continue
         terminal.print_line(
-            f"{row['part']}: {row['subsets']} subsets, {row['vehicle_share']:.2%} of the vehicles, flow "
-            f"{row['flow_mean']:.5f} +- {row['flow_std']:.5f} veh/lane/s"
+            f"{row['part']}: {row['subsets']} subsets, {row['vehicle_share']:.2%} of the vehicles; "
+            f"vehicles_per_lane_s {row['vehicles_per_lane_s_mean']:.5f} +- {row['vehicles_per_lane_s_std']:.5f}"
         )
     for reason in allocation.relaxations.values():
         terminal.print_line(f"note: relaxed: {reason}", style="dim")

@@ -6,6 +6,7 @@ from typing import Any
 import polars as pl
 
 from tracklake.pipeline.sources.source import RawFile, Subset
+from tracklake.pipeline.transforms.tracks.flow import compute_flow
 from tracklake.pipeline.transforms.tracks.gaps import add_gaps
 from tracklake.pipeline.transforms.tracks.kinematics import add_kinematics, central_difference
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
@@ -48,15 +49,18 @@ def assemble_subset(
     vehicles = (
         vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()
     )
-    lanes = facts["lanes"]
+    lanes, last_frame = facts["lanes"], tracks["frame"].max()
+    # A recording may be announced shorter than its tracks are.
+    recorded_s = max(facts["seconds"], tracks.select((pl.col("frame").max() - first_frame + 1) / rate_hz).item())
     row = {
         **facts,
         "dataset": dataset,
         "subset": name,
-        "last_frame": tracks["frame"].max(),
+        "last_frame": last_frame,
         "vehicles": vehicles.height,
         "entries": tracks.height,
-        "flow": None if lanes is None else vehicles.height / lanes / facts["seconds"],
+        "flow_vphpl": compute_flow(tracks, lanes=lanes, rate_hz=rate_hz, seconds=recorded_s),
+        "vehicles_per_lane_s": None if lanes is None else vehicles.height / lanes / facts["seconds"],
         "source_files": [{"file": file.name, "sha256": file.sha256} for file in files],
     }
     return Subset(name, tracks, vehicles, pl.DataFrame([row], schema=SUBSETS.dtypes))

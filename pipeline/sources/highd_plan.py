@@ -77,7 +77,7 @@ def _describe_carriageways(files: dict[str, RawFile], recording: str) -> list[di
                 "direction": side,
                 "vehicles": own.height,
                 "weight": own["numFrames"].cast(pl.Int64).sum(),
-                "flow": own.height / lanes[direction] / meta["duration"],
+                "vehicles_per_lane_s": own.height / lanes[direction] / meta["duration"],
                 "first_frame": FIRST_FRAME,
                 "last_frame": own["finalFrame"].max() or FIRST_FRAME,
                 "recording": recording,

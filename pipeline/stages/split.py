@@ -70,13 +70,15 @@ def gather_subsets(reader: LakeReader, protocol: Protocol) -> pl.DataFrame:
         .filter(~pl.col("excluded"))
         .join(kept, on=["dataset", "subset"], how="left")
         .with_columns(pl.col("weight").fill_null(0))
-        .select(*shown, "flow", "first_frame", "last_frame")
+        .select(*shown, "vehicles_per_lane_s", "first_frame", "last_frame")
         .collect()
     )
 
 
 def _measure_all(inputs: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> dict[SplitRecipe, Leakage]:
-    places = inputs.subsets.select("dataset", "subset", "frame_rate_hz", "flow", subset_first_frame="first_frame")
+    places = inputs.subsets.select(
+        "dataset", "subset", "frame_rate_hz", "vehicles_per_lane_s", subset_first_frame="first_frame"
+    )
     with open_tables(inputs.reader.root, inputs.reader.manifest) as connection:
         return {
             recipe: measure_leakage(
@@ -86,7 +88,7 @@ def _measure_all(inputs: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> d
                 places,
                 recipe=recipe,
                 protocol=inputs.protocol.name,
-                flows=split.flows,
+                rates=split.rates,
             )
             for recipe, split in made.items()
         }

@@ -104,7 +104,7 @@ def measure_leakage(
     *,
     recipe: SplitRecipe,
     protocol: str,
-    flows: pl.DataFrame | None = None,
+    rates: pl.DataFrame | None = None,
 ) -> Leakage:
     """Count what the parts of one split share.
 
@@ -112,12 +112,12 @@ def measure_leakage(
         connection: with the views tracks, samples and neighbors.
         splits: its rows of `schemas.splits.SPLITS`.
         left_out: its rows of `SPLIT_LEFT_OUT`.
-        subsets: dataset, subset, frame_rate_hz, subset_first_frame, flow.
+        subsets: dataset, subset, frame_rate_hz, subset_first_frame, vehicles_per_lane_s.
         recipe: what the split is made by.
         protocol: whose samples and neighbors are counted.
-        flows: dataset, subset, block, flow, where a block's is not that of its subset.
+        rates: dataset, subset, block, vehicles_per_lane_s, where a block's is not that of its subset.
     """
-    frames = _locate_blocks(splits, subsets, recipe, flows)
+    frames = _locate_blocks(splits, subsets, recipe, rates)
     present = {str(name): set(rows["part"]) for (name,), rows in splits.group_by("dataset")}
     pairs = [
         (name, *pair) for name in sorted(present) for pair in combinations([p for p in PARTS if p in present[name]], 2)
@@ -156,7 +156,7 @@ def refuse_leaks(measured: Mapping[SplitRecipe, Leakage]) -> None:
 
 
 def _locate_blocks(
-    splits: pl.DataFrame, subsets: pl.DataFrame, recipe: SplitRecipe, flows: pl.DataFrame | None
+    splits: pl.DataFrame, subsets: pl.DataFrame, recipe: SplitRecipe, rates: pl.DataFrame | None
 ) -> pl.DataFrame:
     """Return the split's rows with what SQL needs to place ticks in them: `blocks`."""
     at = pl.col("frame_rate_hz") / recipe.rate_hz
@@ -171,9 +171,9 @@ def _locate_blocks(
             future_frames=recipe.min_future_ticks * at,
         )
     )
-    if flows is None:
+    if rates is None:
         return placed
-    return placed.drop("flow").join(flows, on=["dataset", "subset", "block"], how="left")
+    return placed.drop("vehicles_per_lane_s").join(rates, on=["dataset", "subset", "block"], how="left")
 
 
 def _run_statement(connection: "duckdb.DuckDBPyConnection", name: str, protocol: str) -> "duckdb.DuckDBPyConnection":

@@ -47,12 +47,12 @@ class SplitResult:
     Args:
         allocation: its rows of `splits` and `split_balance`.
         left_out: its rows of `split_left_out`.
-        flows: dataset, subset, block, flow where blocks have a flow of their own; else None.
+        rates: dataset, subset, block, vehicles_per_lane_s, where blocks have one of their own; else None.
     """
 
     allocation: Allocation
     left_out: pl.DataFrame
-    flows: pl.DataFrame | None = None
+    rates: pl.DataFrame | None = None
 
 
 def make_split(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
@@ -107,7 +107,7 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     written = tabulate_allocation(
         recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation
     )
-    return SplitResult(written, left_out, units.select("dataset", "subset", "block", "flow"))
+    return SplitResult(written, left_out, units.select("dataset", "subset", "block", "vehicles_per_lane_s"))
 
 
 def _make_csp(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:

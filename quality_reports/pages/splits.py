@@ -47,7 +47,7 @@ def render_splits(quality: Quality) -> str | None:
                         name: [row for row in splits[name] if row["split"] == recipe["split"]]
                         for name in ("balance", "members", "leakage", "context", "shifts", "left_out")
                     },
-                    "flows": [
+                    "rates": [
                         (dataset, Markup(plots.draw_split(splits["members"], splits["balance"], name, dataset)))
                         for name, dataset in _list_datasets(splits["balance"], recipe["split"])
                     ],
@@ -63,8 +63,8 @@ def compare_splits(splits: Splits) -> list[Row]:
 
     Returns:
         split, dataset, claims_no_leakage, trains, the columns of split_leakage.sql, cut_share of eval's neighbors,
-        left_out (vehicles), and the shifts of flow, speed, lane changes (the greater of left and right) and braking;
-        one row per dataset and split, in the order of the recipes.
+        left_out (vehicles), and the shifts of vehicles_per_lane_s (rate_shift), speed, lane changes (the greater of
+        left and right) and braking; one row per dataset and split, in the order of the recipes.
     """
     order = [row["split"] for row in splits["recipes"]]
     claims = {row["split"]: {name: row[name] for name in ("claims_no_leakage", "trains")} for row in splits["recipes"]}
@@ -87,7 +87,7 @@ def compare_splits(splits: Splits) -> list[Row]:
                 **claims[row["split"]],
                 "cut_share": cut.get(key),
                 "left_out": left_out.get(key, 0),
-                "flow_shift": shifts.get((*key, "flow")),
+                "rate_shift": shifts.get((*key, "vehicles_per_lane_s")),
                 "speed_shift": shifts.get((*key, "speed")),
                 "lane_change_shift": max(changes, default=None),
                 "brake_shift": shifts.get((*key, "brake")),

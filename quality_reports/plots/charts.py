@@ -21,7 +21,7 @@ Row = Mapping[str, Any]
 SERIES = (BLUE, ORANGE, GREEN)
 
 FLOW = (
-    ("flow_veh_per_h", "flow (veh/h)"),
+    ("flow_veh_per_h", "flow (veh/h/lane)"),
     ("density_veh_per_km", "density (veh/km)"),
     ("speed_mps", "speed (m/s)"),
 )
@@ -192,7 +192,7 @@ def name_estimator(name: str) -> str:
 
 
 def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, dataset: str) -> str:
-    """Draw the flow of a split's subsets by part, with each part's weighted mean and deviation.
+    """Draw vehicles_per_lane_s of a split's subsets by part, with each part's weighted mean and deviation.
 
     Args:
         members: rows of split_members.sql.
@@ -201,16 +201,16 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
         dataset: whose parts.
     """
     parts = ["train", "val", "eval"]
-    flow = "flow_veh_per_lane_s"
-    stands = [row for row in members if (row["split"], row["dataset"]) == (split, dataset) and row[flow] is not None]
+    rate = "vehicles_per_lane_s"
+    stands = [row for row in members if (row["split"], row["dataset"]) == (split, dataset) and row[rate] is not None]
     weighed = [
         {
             **row,
-            "from": row["flow_mean_veh_per_lane_s"] - (row["flow_std_veh_per_lane_s"] or 0),
-            "to": row["flow_mean_veh_per_lane_s"] + (row["flow_std_veh_per_lane_s"] or 0),
+            "from": row[f"{rate}_mean"] - (row[f"{rate}_std"] or 0),
+            "to": row[f"{rate}_mean"] + (row[f"{rate}_std"] or 0),
         }
         for row in balance
-        if (row["split"], row["dataset"]) == (split, dataset) and row["flow_mean_veh_per_lane_s"] is not None
+        if (row["split"], row["dataset"]) == (split, dataset) and row[f"{rate}_mean"] is not None
     ]
     present = [part for part in parts if part in {row["part"] for row in [*stands, *weighed]}]
     axis = alt.Y("part:N", title=None, scale=alt.Scale(domain=present, padding=0.5))
@@ -219,9 +219,7 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
         alt.Chart(_data(stands))
         .mark_point(filled=True, opacity=0.7, size=90)
         .encode(
-            x=alt.X(
-                f"{flow}:Q", title="flow (vehicles per lane and second)", scale=x_scale, axis=alt.Axis(tickCount=8)
-            ),
+            x=alt.X(f"{rate}:Q", title="vehicles per lane and second", scale=x_scale, axis=alt.Axis(tickCount=8)),
             y=axis,
             color=alt.Color("part:N", scale=alt.Scale(domain=parts, range=list(SERIES)), legend=None),
             shape=alt.Shape(
@@ -231,7 +229,7 @@ def draw_split(members: Sequence[Row], balance: Sequence[Row], split: str, datas
     )
     spread = alt.Chart(_data(weighed)).encode(y=axis)
     deviation = spread.mark_rule(color=INK, yOffset=17).encode(x=alt.X("from:Q", scale=x_scale), x2="to:Q")
-    mean = spread.mark_tick(color=INK, thickness=2, size=12, yOffset=17).encode(x="flow_mean_veh_per_lane_s:Q")
+    mean = spread.mark_tick(color=INK, thickness=2, size=12, yOffset=17).encode(x=f"{rate}_mean:Q")
     return _svg((subsets + deviation + mean).properties(width=WIDTH, height=52 * max(1, len(present))))
 
 
@@ -308,7 +306,7 @@ def draw_fundamental(intervals: Sequence[Row]) -> str:
         .mark_point(filled=True, size=42, stroke=MUTED, strokeWidth=0.5, opacity=1)
         .encode(
             x=alt.X("density_veh_per_km:Q", title="density (veh/km)", axis=alt.Axis(tickCount=4)),
-            y=alt.Y("flow_veh_per_h:Q", title="flow (veh/h)", axis=alt.Axis(tickCount=4)),
+            y=alt.Y("flow_veh_per_h:Q", title="flow (veh/h/lane)", axis=alt.Axis(tickCount=4)),
             color=alt.Color(
                 "speed_mps:Q",
                 title="speed (m/s)",

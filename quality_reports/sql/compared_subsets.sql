@@ -9,7 +9,7 @@ windows AS (
 )
 SELECT
     subsets.dataset, subsets.subset, recording, site, direction, freeway, frame_rate_hz, lanes, seconds,
-    vehicles, subsets.entries, flow AS flow_veh_per_lane_s, ids_split, columns_missing, mean_speed_mps, mean_x_m,
+    vehicles, subsets.entries, flow_vphpl, vehicles_per_lane_s, ids_split, columns_missing, mean_speed_mps, mean_x_m,
     backward_vehicles, excluded, excluded_reason,
     cutoff_m, eligible AS eligible_starts, late AS late_starts, fully_tracked, frames_missing,
     rules_unchecked, share_without_error, share_without_warning, vehicles_without_error, vehicles_without_warning,

@@ -7,6 +7,8 @@ SELECT
     (SELECT coalesce(sum(entries), 0)::BIGINT FROM subsets) AS entries,
     (SELECT coalesce(sum(seconds), 0) FROM (SELECT max(seconds) AS seconds FROM subsets GROUP BY dataset, recording))
         AS recorded_s,
+    (SELECT min(flow_vphpl) FROM subsets) AS least_flow_vphpl,
+    (SELECT max(flow_vphpl) FROM subsets) AS greatest_flow_vphpl,
     (SELECT coalesce(sum(end_x_m - start_x_m), 0) FROM vehicles) AS driven_m,
     (SELECT CASE WHEN count(excluded) > 0 THEN count(*) FILTER (excluded) END FROM subsets) AS excluded_subsets,
     (SELECT CASE WHEN count(excluded) > 0

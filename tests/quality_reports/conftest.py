@@ -137,8 +137,8 @@ def small_lake() -> dict[str, list[dict]]:
             at(*upper, vehicle_id=1, **{**starts, "eligible": False}),
         ],
         "subsets": [
-            a_subset(*lower, vehicles=2, entries=4, flow=0.1),
-            a_subset(*upper, vehicles=1, entries=2, flow=0.05),
+            a_subset(*lower, vehicles=2, entries=4, flow_vphpl=90.0, vehicles_per_lane_s=0.1),
+            a_subset(*upper, vehicles=1, entries=2, flow_vphpl=45.0, vehicles_per_lane_s=0.05),
             a_subset(
                 *arterial,
                 recording="peachtree",
@@ -218,8 +218,8 @@ def small_lake() -> dict[str, list[dict]]:
                 "vehicles": 2,
                 "vehicle_share": 1.0,
                 "samples": 3,
-                "flow_mean": 0.1,
-                "flow_std": 0.0,
+                "vehicles_per_lane_s_mean": 0.1,
+                "vehicles_per_lane_s_std": 0.0,
                 "relaxed": True,
                 "relaxed_reason": "one subset only",
             }

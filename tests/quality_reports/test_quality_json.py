@@ -67,7 +67,7 @@ def test_every_row_of_the_tables_is_understood():
 
 def test_units_follow_from_names_unless_declared():
     units = {row["key"]: row["unit"] for row in ROW.finditer(PAGE)}
-    assert units["subsets[].flow_veh_per_lane_s"] == "veh/lane/s"
+    assert (units["subsets[].flow_vphpl"], units["subsets[].vehicles_per_lane_s"]) == ("veh/h/lane", "veh/lane/s")
     assert units["subset_scores[].worst_jerk_mps3"] == "m/s³"
     assert units["subset_scores[].share_without_error"] == "0 to 1"
     assert units["recordings[].seconds"] == "s"

@@ -2,7 +2,7 @@
 CREATE OR REPLACE TEMP TABLE part_samples AS
 SELECT
     sample.dataset, sample.subset, sample.tick, sample.lateral_maneuver, sample.longitudinal_maneuver,
-    blocks.part, blocks.flow
+    blocks.part, blocks.vehicles_per_lane_s
 FROM samples AS sample
 JOIN blocks ON sample.dataset = blocks.dataset AND sample.subset = blocks.subset
     AND blocks.tick_0 + sample.tick * blocks.stride - blocks.history_frames >= blocks.first_frame - 1e-6

@@ -1,7 +1,7 @@
 """The flow-balanced allocation of subsets to parts.
 
 No subset is in two parts, so the evaluation data cannot be reached from the training data. Among such allocations the
-one is chosen whose parts differ least in the sample-weighted mean and standard deviation of flow.
+one is chosen whose parts differ least in the sample-weighted mean and standard deviation of `vehicles_per_lane_s`.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def allocate_flow_balanced(
     seed: int = 0,
     restarts: int = 200,
 ) -> Allocation:
-    """Divide the subsets of each dataset into train and eval (and val), so that their flows are alike.
+    """Divide the subsets of each dataset into train and eval (and val) of alike traffic.
 
     Constraints, the most important first: train and eval each hold a subset with samples; each (site, direction) with
     at least two subsets has one in train and one in eval; val holds a subset with samples; train holds `train_share`
@@ -39,7 +39,8 @@ def allocate_flow_balanced(
     Coverage is counted in missing (site, direction, part), shares in vehicles. A constraint that cannot be met is
     `relaxed`, with the reason. Among the allocations that meet the constraints best, the one is chosen with the least
     sum, over pairs of parts, of the absolute differences of the weighted mean and of the weighted population standard
-    deviation of flow; among equals the one with the larger standard deviation in eval.
+    deviation of `vehicles_per_lane_s`, which the study calls flow; among equals the one with the larger standard
+    deviation in eval.
 
     If subsets are given in blocks, all of this applies to blocks.
 
@@ -48,15 +49,16 @@ def allocate_flow_balanced(
     part) and swaps (two subsets of different parts) until none improves. It then starts twice as often from the best
     allocation with a dozen subsets exchanged, which halves the remaining difference of three parts. The sums behind the
     two moments are additive over subsets, so a step over all moves is a few array operations. Why it suffices: with
-    flows of standard deviation s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and there
-    are about n^2 / 6 swaps, so a descent in the plane of the two moments ends about 12 s / n^2 from the target and the
-    best of R descents about 12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No difference is below 0, so
-    the difference found bounds its distance from the optimum.
+    values of standard deviation s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and
+    there are about n^2 / 6 swaps, so a descent in the plane of the two moments ends about 12 s / n^2 from the target
+    and the best of R descents about 12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No difference is
+    below 0, so the difference found bounds its distance from the optimum.
 
     Args:
         subsets: one row per freeway subset that is not excluded, in any order: the columns of `splits.tables.COLUMNS`,
             and `block` if a subset has several rows. `weight` is the number of kept samples (of entries, before samples
-            exist). A subset with null flow or weight 0 counts for shares and coverage, not for the moments of flow.
+            exist). A subset without vehicles_per_lane_s or with weight 0 counts for shares and coverage, not for
+            the moments.
         split: name of the split in the tables.
         train_share: share of the vehicles in train if there is no `val`.
         validation: whether there is a third part, `val`.
@@ -113,38 +115,39 @@ def _check_subsets(subsets: pl.DataFrame) -> pl.DataFrame:
         *(pl.col(name).cast(dtype) for name, dtype in COLUMNS.items()), pl.col("block").cast(pl.Int32)
     )
     bad = table.filter(
-        pl.any_horizontal(pl.exclude("flow").is_null())
+        pl.any_horizontal(pl.exclude("vehicles_per_lane_s").is_null())
         | (pl.col("vehicles") < 0)
         | (pl.col("weight") < 0)
-        | (pl.col("flow") < 0)
-        | pl.col("flow").is_infinite()
+        | (pl.col("vehicles_per_lane_s") < 0)
+        | pl.col("vehicles_per_lane_s").is_infinite()
     )
     if bad.height:
         raise ValueError(
-            "a subset needs a site, a direction, frames, a flow that is null or not negative, and counts that are not "
-            f"negative: got {bad.row(0, named=True)} ({bad.height} such row(s))"
+            "a subset needs a site, a direction, frames, vehicles_per_lane_s that is null or not negative, and counts "
+            f"that are not negative: got {bad.row(0, named=True)} ({bad.height} such row(s))"
         )
     twice = table.filter(pl.struct("dataset", "subset", "block").is_duplicated())
     if twice.height:
         raise ValueError(f"the subset {twice['dataset'][0]}/{twice['subset'][0]} has more than one row")
-    return table.with_columns(pl.col("flow").fill_nan(None)).sort("dataset", "site", "direction", "subset", "block")
+    table = table.with_columns(pl.col("vehicles_per_lane_s").fill_nan(None))
+    return table.sort("dataset", "site", "direction", "subset", "block")
 
 
 def _build_problem(rows: pl.DataFrame, shares: dict[str, int]) -> Problem:
     """Build the arrays of one dataset's subsets."""
     weight = rows["weight"].to_numpy().astype(np.float64)
-    flow = rows["flow"].to_numpy().astype(np.float64)
-    known = np.where(np.isnan(flow), 0.0, weight)
-    flow = np.nan_to_num(flow)
+    rate = rows["vehicles_per_lane_s"].to_numpy().astype(np.float64)
+    known = np.where(np.isnan(rate), 0.0, weight)
+    rate = np.nan_to_num(rate)
     # Centred, so that the variance is not a small difference of large numbers.
-    flow = flow - (flow @ known / known.sum() if known.sum() > 0 else 0.0)
+    rate = rate - (rate @ known / known.sum() if known.sum() > 0 else 0.0)
     # If fewer than two subsets have samples, no part can be required to have some: then every subset counts as filled.
     filled = weight > 0 if (weight > 0).sum() > 1 else np.ones(len(weight), dtype=np.bool_)
     group = rows.select(pl.struct("site", "direction").rank("dense")).to_series().to_numpy().astype(np.intp) - 1
     return Problem(
         shares=np.array(list(shares.values()), dtype=np.float64),
         facts=np.stack(
-            [rows["vehicles"].to_numpy().astype(np.float64), filled, known, known * flow, known * flow**2], axis=1
+            [rows["vehicles"].to_numpy().astype(np.float64), filled, known, known * rate, known * rate**2], axis=1
         ),
         group=group,
         paired=np.bincount(group) > 1,

@@ -23,7 +23,7 @@ KICKS, KICKED = 2, 12
 """Descents per random start from the best allocation so far, and subsets whose parts are exchanged before each."""
 
 TIE = 1e-8
-"""Difference of flow (veh/lane/s) below which two are equal; sums of squares carry no more digits."""
+"""Difference of vehicles_per_lane_s below which two are equal; sums of squares carry no more digits."""
 
 VEHICLES, FILLED, WEIGHT, FLOW, FLOW2 = range(5)
 """Columns of `Problem.facts`."""
@@ -37,7 +37,8 @@ class Problem:
 
     Args:
         shares: (P,) thousandths of the vehicles; the first part is train, the last eval.
-        facts: (n, 5) vehicles, filled (1 = has samples), weight, weight * flow, weight * flow^2; flow is centred.
+        facts: (n, 5) vehicles, filled (1 = has samples), weight, weight * rate, weight * rate^2; rate is
+            vehicles_per_lane_s, centred.
         group: (n,) number of the subset's (site, direction).
         paired: (G,) whether that (site, direction) has at least two subsets.
     """
@@ -66,8 +67,8 @@ class Scores:
         broken: broken constraints: an empty train or eval part counts most, then each (site, direction) without a
             subset in one of the two, then an empty val part.
         share: vehicles (in thousandths) by which the parts' shares lie outside their bands, in total.
-        difference: sum of the absolute differences of flow's mean and standard deviation; infinite if undefined.
-        eval_std: standard deviation of flow in eval, which decides ties.
+        difference: sum of the absolute differences of vehicles_per_lane_s in mean and deviation; infinite if undefined.
+        eval_std: standard deviation of vehicles_per_lane_s in eval, which decides ties.
     """
 
     broken: Floats
@@ -220,7 +221,7 @@ def _descend(problem: Problem, part: Indices, random: np.random.Generator) -> In
         )
         scores = _score_sums(problem, sums, uncovered)
         move = scores.find_steepest()
-        # The sums are exact for whole numbers but not for flow, so an improvement must exceed rounding errors.
+        # The sums are exact for whole numbers but not for rates, so an improvement must exceed rounding errors.
         broken, share, difference = scores.get_key(move)
         if (broken, share, difference + TIE / 100) >= here:
             return part

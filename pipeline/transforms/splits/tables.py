@@ -18,11 +18,11 @@ COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
     "direction": pl.String,
     "vehicles": pl.Int64,
     "weight": pl.Int64,
-    "flow": pl.Float64,
+    "vehicles_per_lane_s": pl.Float64,
     "first_frame": pl.Int32,
     "last_frame": pl.Int32,
 }
-"""Columns of a unit: counts, flow and frames."""
+"""Columns of a unit: counts, vehicles per lane and second, and frames."""
 
 WHOLE: dict[str, pl.Expr] = {
     "block": pl.lit(0, pl.Int32),
@@ -95,8 +95,8 @@ def _compare_parts(rows: pl.DataFrame, split: str, parts: Sequence[str], reason:
                 "vehicles": members["vehicles"].sum(),
                 "vehicle_share": members["vehicles"].sum() / total,
                 "samples": members["weight"].sum(),
-                "flow_mean": mean,
-                "flow_std": std,
+                "vehicles_per_lane_s_mean": mean,
+                "vehicles_per_lane_s_std": std,
                 "relaxed": reason is not None,
                 "relaxed_reason": reason,
             }
@@ -105,10 +105,10 @@ def _compare_parts(rows: pl.DataFrame, split: str, parts: Sequence[str], reason:
 
 
 def _compute_moments(members: pl.DataFrame) -> tuple[float, float] | tuple[None, None]:
-    """Compute the weighted mean and population standard deviation of flow, in two passes for accuracy."""
-    known = members.filter(pl.col("flow").is_not_null())
-    weight, flow = known["weight"].to_numpy().astype(np.float64), known["flow"].to_numpy()
+    """Compute the weighted mean and population standard deviation of vehicles_per_lane_s, in two passes."""
+    known = members.filter(pl.col("vehicles_per_lane_s").is_not_null())
+    weight, values = known["weight"].to_numpy().astype(np.float64), known["vehicles_per_lane_s"].to_numpy()
     if weight.sum() == 0:
         return None, None
-    mean = float(np.average(flow, weights=weight))
-    return mean, float(np.sqrt(np.average((flow - mean) ** 2, weights=weight)))
+    mean = float(np.average(values, weights=weight))
+    return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weight)))

@@ -130,7 +130,7 @@ def describe_blocks(
 ) -> pl.DataFrame:
     """Describe each block for the allocation: the columns of `splits.tables.COLUMNS` and `block`.
 
-    Flow is the block's own: vehicles with an entry in it / lanes / its length in s.
+    `vehicles_per_lane_s` is the block's own: vehicles with an entry in it / lanes / its length in s.
 
     Args:
         blocks: rows of `cut_blocks`.
@@ -147,7 +147,7 @@ def describe_blocks(
         .join(visits.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
         .join(weights.group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
         .with_columns(pl.col("vehicles", "weight").fill_null(0))
-        .with_columns(flow=pl.col("vehicles") / pl.col("lanes") / seconds)
+        .with_columns(vehicles_per_lane_s=pl.col("vehicles") / pl.col("lanes") / seconds)
         .drop("lanes", "frame_rate_hz")
         .sort(key)
     )

@@ -50,7 +50,9 @@ def test_golden_numbers_of_the_upper_carriageway(tmp_path):
     facts = subset.facts.row(0, named=True)
     assert facts["lane_markings_m"] == close([0, 4, 8])
     assert facts["seconds"] == close(901.56)
-    assert facts["flow"] == close(2 / 2 / 901.56)
+    assert facts["vehicles_per_lane_s"] == close(2 / 2 / 901.56)
+    # 25 + 25 + 25 - 1 m/s for 1/25 s each, on 41 m of two lanes.
+    assert facts["flow_vphpl"] == pytest.approx(3600 * 74 / 25 / (41 * 2 * 901.56), rel=1e-5)
     assert (facts["lanes"], facts["site"], facts["direction"], facts["frame_rate_hz"], facts["first_frame"]) == (
         2, "location-3", "upper", 25, 1)  # fmt: skip
     assert subset.vehicles["length_m"].to_list() == [4, 5]

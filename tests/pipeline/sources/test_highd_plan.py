@@ -34,17 +34,17 @@ def test_subsets_by_hand(tmp_path):
     write_metadata(tmp_path / "deep" / "er")
     announced = announce_subsets(recognise(tmp_path, "highd"))
     assert announced.refusals == ()
-    flow = pytest.approx(2 / 2 / 901.56)
+    rate = pytest.approx(2 / 2 / 901.56)
     assert announced.subsets.rows() == [
-        ("highd", "01-upper", "location-3", "upper", 2, 4, flow, 1, 2, "01", 2, 901.56),
-        ("highd", "01-lower", "location-3", "lower", 2, 3, flow, 1, 2, "01", 2, 901.56),
+        ("highd", "01-upper", "location-3", "upper", 2, 4, rate, 1, 2, "01", 2, 901.56),
+        ("highd", "01-lower", "location-3", "lower", 2, 3, rate, 1, 2, "01", 2, 901.56),
     ]
 
 
 def test_lanes_differ_by_carriageway_and_one_without_vehicles_is_none(tmp_path):
     write_metadata(tmp_path, meta=meta_row(1, upper="8;12;16;20", duration="100", vehicles=2), vehicles=VEHICLES[:2])
     (row,) = announce_subsets(recognise(tmp_path, "highd")).subsets.iter_rows(named=True)
-    assert (row["subset"], row["lanes"], row["flow"]) == ("01-upper", 3, pytest.approx(2 / 3 / 100))
+    assert (row["subset"], row["lanes"], row["vehicles_per_lane_s"]) == ("01-upper", 3, pytest.approx(2 / 3 / 100))
 
 
 def test_archives_and_gzipped_files_are_read(tmp_path):
@@ -73,7 +73,8 @@ def test_csv_json_and_table_tell_the_same(run, tmp_path):
         frames = [vehicle_row(vehicle, 4, 2, 10 * int(number) + vehicle, 1 + vehicle % 2) for vehicle in range(1, 11)]
         write_metadata(tmp_path, number=number, meta=meta_row(int(number), vehicles=10), vehicles=frames)
     rows = list(csv.DictReader(io.StringIO(run(tmp_path, "--format", "csv").stdout)))
-    assert list(rows[0]) == ["dataset", "subset", "site", "direction", "vehicles", "weight", "flow", "part"]
+    shown = ["dataset", "subset", "site", "direction", "vehicles", "weight", "vehicles_per_lane_s", "part"]
+    assert list(rows[0]) == shown
     assert len(rows) == 6
     # 30 vehicles, five of each carriageway: one must evaluate of each direction, which is 10 of them.
     assert sorted((row["direction"], row["part"]) for row in rows).count(("upper", "eval")) == 1

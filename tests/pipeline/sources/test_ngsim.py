@@ -84,7 +84,9 @@ def test_golden_numbers(tmp_path):
     facts = subset.facts.row(0, named=True)
     assert (facts["site"], facts["direction"], facts["freeway"], facts["lanes"]) == ("us-101", "south", True, 5)
     assert facts["seconds"] == close(0.4)
-    assert facts["flow"] == close(2 / 5 / 0.4)
+    assert facts["vehicles_per_lane_s"] == close(2 / 5 / 0.4)
+    # Five entries of 15.24 m/s for 0.1 s each are 7.62 m, on five lanes of 18.288 m (60 ft) in 0.4 s.
+    assert facts["flow_vphpl"] == pytest.approx(3600 * 7.62 / (5 * 18.288 * 0.4))
     assert facts["on_ramp_lanes"] == [7]
     assert (facts["ids_split"], facts["columns_missing"]) == (0, [])
     check_accounts(canonical, entries_from=["trajectories.csv"])
@@ -245,7 +247,9 @@ def test_directions_of_an_arterial(tmp_path):
         "peachtree-1600-unknown": [(0.6096, 0.3048), (0.9144, 0.3048), (0.9144, 0.3048)],
     }
     assert {subset.facts["freeway"][0] for subset in canonical.subsets} == {False}
-    assert {subset.facts["flow"][0] for subset in canonical.subsets} == {None}
+    assert {subset.facts.select("flow_vphpl", "vehicles_per_lane_s").row(0) for subset in canonical.subsets} == {
+        (None,) * 2
+    }
     check_accounts(canonical, entries_from=["trajectories.csv"])
 
 

@@ -36,7 +36,7 @@ SUBSETS = pl.DataFrame(
         "subset": NAMES,
         "frame_rate_hz": [FRAME_RATE_HZ] * 2,
         "subset_first_frame": [1, 1],
-        "flow": [0.2, 0.4],
+        "vehicles_per_lane_s": [0.2, 0.4],
     }
 )
 
@@ -111,7 +111,7 @@ def expect(scene, split):
         return block_of(row["subset"], row["vehicle_id"], at - HISTORY_FRAMES, at + FUTURE_FRAMES)
 
     vehicles, frames, scenes = ({part: set() for part in PARTS} for _ in range(3))
-    speeds, flows, left, right, brake = ({part: [] for part in PARTS} for _ in range(5))
+    speeds, rates, left, right, brake = ({part: [] for part in PARTS} for _ in range(5))
     for row in tracks:
         part = block_of(row["subset"], row["vehicle_id"], row["frame"], row["frame"])[1]
         if part is not None:
@@ -124,7 +124,7 @@ def expect(scene, split):
         if part is not None and row["protocol"] == "p":
             scenes[part].add((row["subset"], row["tick"]))
             given_samples[part] += 1
-            flows[part].append({"a": 0.2, "b": 0.4}[row["subset"]])
+            rates[part].append({"a": 0.2, "b": 0.4}[row["subset"]])
             left[part].append(float(row["lateral_maneuver"] == "left"))
             right[part].append(float(row["lateral_maneuver"] == "right"))
             brake[part].append(float(row["longitudinal_maneuver"] == "brake"))
@@ -139,7 +139,7 @@ def expect(scene, split):
             elsewhere[part] += its_part is not None and beside != number
     # As the table rounds them: to 0.1 m/s, halves away from zero.
     speeds = {part: [math.floor(10 * value + 0.5) / 10 for value in values] for part, values in speeds.items()}
-    values = {"flow": flows, "speed": speeds, "left": left, "right": right, "brake": brake}
+    values = {"vehicles_per_lane_s": rates, "speed": speeds, "left": left, "right": right, "brake": brake}
     return vehicles, frames, scenes, context, elsewhere, given_samples, values
 
 
@@ -239,5 +239,5 @@ def test_parts_that_never_meet_are_compared_all_the_same():
     assert row["nearest_s"] is None
     assert (row["vehicles_shared"], row["frames_shared"], row["scenes_shared"], row["context_shared"]) == (0, 0, 0, 0)
     assert row["vehicles"] == 6
-    (flow,) = found.shifts.filter(pl.col("quantity") == "flow").iter_rows(named=True)
-    assert (flow["mean"], flow["other_mean"], flow["std"], flow["shift"]) == (0.2, 0.4, 0.0, 1.0)
+    (rate,) = found.shifts.filter(pl.col("quantity") == "vehicles_per_lane_s").iter_rows(named=True)
+    assert (rate["mean"], rate["other_mean"], rate["std"], rate["shift"]) == (0.2, 0.4, 0.0, 1.0)

@@ -26,6 +26,8 @@ def test_headline(report):
         "entries": 7,
         "recorded_s": 70.0,  # one highD recording of 10 s, although it has two carriageways, and 60 s
         "driven_m": 160.0,
+        "least_flow_vphpl": 45.0,
+        "greatest_flow_vphpl": 90.0,
         "excluded_subsets": 1,
         "vehicles_with_errors": 2,
         "late_starts": 1,
@@ -40,7 +42,8 @@ def test_overview(report):
     subsets = report.quality["subsets"]
     assert [each["subset"] for each in subsets] == ["01-lower", "01-upper", "peachtree-north"]
     assert [each["mean_speed_mps"] for each in subsets] == [25.0, 1.0, 5.0]
-    assert [each["flow_veh_per_lane_s"] for each in subsets] == [0.1, 0.05, None]
+    assert [each["flow_vphpl"] for each in subsets] == [90.0, 45.0, None]
+    assert [each["vehicles_per_lane_s"] for each in subsets] == [0.1, 0.05, None]
     assert [each["excluded"] for each in subsets] == [False, True, False]
     assert subsets[1]["excluded_reason"] == "1 of 1 vehicles reverse"
 

@@ -65,7 +65,7 @@ def test_every_axis_has_its_unit(report):
         "recorded speed (m/s)",
         "share of entries (%)",
         "x of the first entry (m)",
-        "flow (vehicles per lane",
+        "vehicles per lane and second",
     ):
         assert title in report.html
 

@@ -154,7 +154,7 @@ def test_diagrams_axes_and_units(open_lake, road):
     for title in (
         "position (m)",
         "time since the recording began (s)",
-        "flow (veh/h)",
+        "flow (veh/h/lane)",
         "density (veh/km)",
         "speed (m/s)",
         "acceleration (m/s²)",

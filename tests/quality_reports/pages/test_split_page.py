@@ -18,8 +18,8 @@ def recipe(split, *, trains, claims):
 
 def part_of(split, part, **values):
     known = {"split": split, "dataset": "highd", "part": part}
-    return {**known, "subsets": 1, "vehicles": 2, "vehicle_share": 0.5, "samples": 3, "flow_mean": 0.1,
-            "flow_std": 0.0, "relaxed": False, **values}  # fmt: skip
+    return {**known, "subsets": 1, "vehicles": 2, "vehicle_share": 0.5, "samples": 3, "vehicles_per_lane_s_mean": 0.1,
+            "vehicles_per_lane_s_std": 0.0, "relaxed": False, **values}  # fmt: skip
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def tables(small_lake):
         "split_shifts": [
             {"split": split, **PAIR, "quantity": quantity, **shift, "shift": value}
             for split, values in ((CSP, (0.01, 0.02, 0.03, 0.04, 0.05)), (BALANCED, (0.1, 0.2, 0.3, 0.25, 0.5)))
-            for quantity, value in zip(("flow", "speed", "left", "right", "brake"), values, strict=True)
+            for quantity, value in zip(("vehicles_per_lane_s", "speed", "left", "right", "brake"), values, strict=True)
         ],
         "split_left_out": [
             {"split": "csp-2018", "dataset": "highd", "subset": "01-lower", "vehicle_id": vehicle, "entries": 100}

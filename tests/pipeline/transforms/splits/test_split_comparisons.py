@@ -34,7 +34,8 @@ def test_the_highest_id_decides_and_not_the_count():
     SPLITS.validate(found.splits, where="test")
     SPLIT_BALANCE.validate(found.balance, where="test")
     balance = {row["part"]: row for row in found.balance.iter_rows(named=True)}
-    assert {part: (row["vehicles"], row["samples"], row["flow_mean"]) for part, row in balance.items()} == {
+    shown = ("vehicles", "samples", "vehicles_per_lane_s_mean")
+    assert {part: tuple(row[name] for name in shown) for part, row in balance.items()} == {
         "train": (2, 20, 0.3),
         "val": (1, 10, 0.3),
         "eval": (1, 10, 0.3),

@@ -204,9 +204,10 @@ def test_tables_keep_their_schemas_and_the_balance_adds_up():
     # Mean (10 * 0.2 + 30 * 0.4) / 40 = 0.35; variance (10 * 0.15^2 + 30 * 0.05^2) / 40 = 0.0075.
     assert (train["part"], train["subsets"], train["vehicles"], train["samples"]) == ("train", 2, 800, 40)
     assert train["vehicle_share"] == pytest.approx(0.8)
-    assert train["flow_mean"] == pytest.approx(0.35)
-    assert train["flow_std"] == pytest.approx(math.sqrt(0.0075))
-    assert (evaluation["part"], evaluation["flow_mean"], evaluation["flow_std"]) == ("eval", 0.35, 0.0)
+    assert train["vehicles_per_lane_s_mean"] == pytest.approx(0.35)
+    assert train["vehicles_per_lane_s_std"] == pytest.approx(math.sqrt(0.0075))
+    assert (evaluation["part"], evaluation["vehicles_per_lane_s_mean"]) == ("eval", 0.35)
+    assert evaluation["vehicles_per_lane_s_std"] == 0.0
     assert not train["relaxed"]
     assert train["relaxed_reason"] is None
 
@@ -233,7 +234,7 @@ def test_one_subset_trains_and_says_so():
     assert parts_of(allocation) == {"a": "train"}
     SPLIT_BALANCE.validate(allocation.balance, where="test")
     evaluation, train = allocation.balance.rows(named=True)
-    assert (evaluation["subsets"], evaluation["vehicles"], evaluation["flow_mean"]) == (0, 0, None)
+    assert (evaluation["subsets"], evaluation["vehicles"], evaluation["vehicles_per_lane_s_mean"]) == (0, 0, None)
     assert train["relaxed"]
     assert evaluation["relaxed"]
     assert train["relaxed_reason"].startswith("eval without samples (1 subset(s) to allocate); train holds 1.000")
@@ -249,7 +250,7 @@ def test_a_subset_without_flow_counts_for_shares_and_not_for_flow():
     rows = [("a", "S", "upper", 800, 10, 0.3), ("b", "S", "lower", 100, 10, 0.3), ("c", "T", "upper", 100, 10, None)]
     allocation = allocate_flow_balanced(table(rows))
     assert parts_of(allocation) == {"a": "train", "b": "eval", "c": "eval"}
-    assert allocation.balance["flow_mean"].to_list() == pytest.approx([0.3, 0.3])
+    assert allocation.balance["vehicles_per_lane_s_mean"].to_list() == pytest.approx([0.3, 0.3])
     assert allocation.balance["samples"].to_list() == [20, 10]
 
 
@@ -272,7 +273,7 @@ def test_no_subsets_give_empty_tables():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda frame: frame.drop("flow", "site"), "lacks the column\\(s\\) site, flow"),
+        (lambda frame: frame.drop("vehicles_per_lane_s", "site"), "lacks the column\\(s\\) site, vehicles_per"),
         (lambda frame: pl.concat([frame, frame]), "highd/a has more than one row"),
         (lambda frame: frame.with_columns(vehicles=pl.lit(-1)), "'vehicles': -1"),
         (lambda frame: frame.with_columns(site=pl.lit(None)), "needs a site"),

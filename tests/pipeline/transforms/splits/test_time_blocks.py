@@ -106,7 +106,7 @@ def test_vehicles_in_two_parts_are_those_that_a_loop_finds(seed, validation):
         count = sum((row["subset"], row["block"]) == key[:2] for key in inside)
         seconds = (row["last_frame"] - row["first_frame"] + 1) / 10
         assert (row["vehicles"], row["weight"]) == (count, 0)
-        assert row["flow"] == pytest.approx(count / 2 / seconds)
+        assert row["vehicles_per_lane_s"] == pytest.approx(count / 2 / seconds)
 
     splits = allocate_flow_balanced(units, split="time-blocks", validation=validation, restarts=3).splits
     SPLITS.validate(splits, where="test")
@@ -172,7 +172,7 @@ def test_parts_count_vehicles_once_and_no_samples_of_those_left_out():
     # One sample of the first, two of the second, four of the third ...: every sum names its terms.
     weights = pl.DataFrame([{**row, "weight": 2**place} for place, row in enumerate(rows)], schema=WEIGHTS)
     blocks = pl.DataFrame({"block": range(5), "part": parts}, schema={"block": pl.Int32, "part": pl.String})
-    known = {"site": "S", "direction": "south", "flow": 0.5, "first_frame": 1, "last_frame": 2}
+    known = {"site": "S", "direction": "south", "vehicles_per_lane_s": 0.5, "first_frame": 1, "last_frame": 2}
     units = blocks.drop("part").with_columns(
         **{name: pl.lit(value) for name, value in {**key, **known}.items()}, vehicles=pl.lit(7), weight=pl.lit(7)
     )
@@ -224,4 +224,4 @@ def test_sums_of_recounted_blocks_are_those_of_a_loop(seed):
     counted = dict(found.group_by("part").agg(pl.col("vehicles").sum()).iter_rows())
     assert counted == {name: len(vehicles.get(name, ())) for name in set(drawn)}
     assert {row[:2]: row[2] for row in found.select("subset", "block", "weight").iter_rows() if row[2]} == samples
-    assert found["flow"].to_list() == units["flow"].to_list()
+    assert found["vehicles_per_lane_s"].to_list() == units["vehicles_per_lane_s"].to_list()
