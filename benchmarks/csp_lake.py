@@ -127,7 +127,8 @@ def make_subset(number: int, name: str, entries: int) -> Subset:
     frames = int(tracks["frame"].max()) - int(tracks["frame"].min()) + 1
     facts = {
         "recording": name, "site": "us-101" if name.startswith("us") else "i-80", "direction": "south",
-        "freeway": True, "frame_rate_hz": float(RATE_HZ), "lanes": LANES, "seconds": frames / RATE_HZ,
+        "origin": "synthetic", "freeway": True, "frame_rate_hz": float(RATE_HZ), "lanes": LANES,
+        "seconds": frames / RATE_HZ,
         "first_frame": int(tracks["frame"].min()), "on_ramp_lanes": [7], "lane_markings_m": None, "ids_split": 0,
         "columns_missing": [],
     }  # fmt: skip

@@ -182,8 +182,8 @@ def make_subset(
     site = pl.DataFrame(
         {
             "recording": f"{number:02}", "site": f"location-{1 + number % 6}", "direction": direction, "freeway": True,
-            "frame_rate_hz": float(RATE_HZ), "lanes": LANES, "seconds": seconds, "first_frame": 1,
-            "last_frame": last_frame, "vehicles": vehicles, "entries": count, "flow_vphpl": None,
+            "origin": "synthetic", "frame_rate_hz": float(RATE_HZ), "lanes": LANES, "seconds": seconds,
+            "first_frame": 1, "last_frame": last_frame, "vehicles": vehicles, "entries": count, "flow_vphpl": None,
             "vehicles_per_lane_s": vehicles / LANES / seconds,
             "ids_split": 0, "on_ramp_lanes": [[]], "lane_markings_m": [[0.0, 3.75, 7.5, 11.25]],
             "columns_missing": [[]], "source_files": [[{"file": f"{number:02}_tracks.csv", "sha256": "00"}]],

@@ -21,6 +21,8 @@ FOOT_M = 0.3048
 
 Dataset = Literal["ngsim", "highd"]
 DATASETS: tuple[Dataset, ...] = get_args(Dataset)
+Origin = Literal["recorded", "synthetic"]
+ORIGINS: tuple[Origin, ...] = get_args(Origin)
 VEHICLE_CLASSES = ("car", "truck", "motorcycle")
 SEVERITIES = ("error", "warning", "info")
 PARTS = ("train", "val", "eval")

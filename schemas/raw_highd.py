@@ -75,6 +75,7 @@ RAW_HIGHD_RECORDING = Table(
         "id": column(pl.Int32, "of the recording", ge=1),
         "frameRate": column(pl.Float64, "of the camera", unit="Hz", ge=1, le=1_000),
         "locationId": column(pl.Int32, "of the site", ge=0),
+        "weekDay": column(pl.String, "of the recording; `synthetic` marks generated files", nullable=True),
         "duration": column(pl.Float64, "of the recording", unit="s", ge=0.01),
         "numVehicles": column(pl.Int32, "in both carriageways", ge=0),
         "numCars": column(pl.Int32, "of them, cars", ge=0, nullable=True),

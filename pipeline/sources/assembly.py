@@ -31,7 +31,7 @@ def assemble_subset(
         sizes: one row per vehicle_id: source_vehicle_id, class, length_m, width_m, entries_announced.
         dataset: name of the dataset.
         name: name of the subset.
-        facts: recording, site, direction, freeway, frame_rate_hz, lanes, seconds, first_frame, on_ramp_lanes,
+        facts: recording, site, origin, direction, freeway, frame_rate_hz, lanes, seconds, first_frame, on_ramp_lanes,
             lane_markings_m, ids_split, columns_missing.
         use_recorded_headway: whether a recorded headway replaces a missing leader; see `add_gaps`.
         files: raw files of the recording.

@@ -14,6 +14,7 @@ from tracklake.pipeline.sources.highd_rows import DIRECTION, add_directions, spl
 from tracklake.pipeline.sources.levelx import RECORDING, TRACKS, VEHICLES, LevelxFormat
 from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, SourceError, Subset
 from tracklake.pipeline.transforms.tracks.orientation import LOWER, UPPER, orient_highd
+from tracklake.schemas.columns import Origin
 from tracklake.schemas.completeness import RECORDING_META, TRACKS_META
 from tracklake.schemas.raw_highd import (
     RAW_HIGHD_RECORDING,
@@ -34,6 +35,9 @@ HIGHD_FORMAT = LevelxFormat(
 
 FIRST_FRAME = 1
 """Number of a recording's first frame, where time_s = 0 even if the first vehicle appears later."""
+
+SYNTHETIC_DAY = "synthetic"
+"""Value of recordingMeta's weekDay that marks a generated recording."""
 
 CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
 """Carriageways by drivingDirection."""
@@ -81,6 +85,11 @@ def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[st
     meta, vehicles = HIGHD_FORMAT.read_metadata(files, recording)
     markings = _read_markings(meta, files[RECORDING])
     return meta, {direction: len(marked) - 1 for direction, marked in markings.items()}, vehicles
+
+
+def find_origin(meta: Mapping[str, Any]) -> Origin:
+    """Tell by the row of recordingMeta whether a recording was generated."""
+    return "synthetic" if (meta["weekDay"] or "").strip().lower() == SYNTHETIC_DAY else "recorded"
 
 
 def _read_markings(meta: dict[str, Any], file: RawFile) -> dict[int, list[float]]:
@@ -139,6 +148,7 @@ def _to_subset(
         facts={
             "recording": recording,
             "site": f"location-{meta['locationId']}",
+            "origin": find_origin(meta),
             "direction": CARRIAGEWAYS[direction],
             "freeway": True,
             "frame_rate_hz": meta["frameRate"],
@@ -174,7 +184,7 @@ HIGHD = Source(
     citation="Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset. IEEE ITSC. "
     "doi.org/10.1109/ITSC.2018.8569552",
     signature="highD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with the headers as shipped",
-    version=1,
+    version=2,
     detect=HIGHD_FORMAT.detect,
     group=HIGHD_FORMAT.group,
     to_canonical=to_canonical,

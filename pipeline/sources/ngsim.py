@@ -12,7 +12,15 @@ from tracklake.pipeline.sources.assembly import assemble_subset
 from tracklake.pipeline.sources.completeness import Announced, compare_counts
 from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, Chunk, map_chunks, read_head
 from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
-from tracklake.pipeline.sources.ngsim_dialects import SITES, Site, build_layout, detect, find_site, name_recording
+from tracklake.pipeline.sources.ngsim_dialects import (
+    SITES,
+    Site,
+    build_layout,
+    detect,
+    find_origin,
+    find_site,
+    name_recording,
+)
 from tracklake.pipeline.sources.source import (
     Canonical,
     Grouping,
@@ -38,6 +46,9 @@ DECIMALS = 6
 
 CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
 """Columns that are equal in all rows of one vehicle, so they distinguish vehicles that share an id."""
+
+KEY = pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64)
+"""Time of frame 0, ms: constant within a recording, which it identifies."""
 
 PARSING_THREADS = 3
 """Chunks of one file parsed at once; more threads cost memory and help little, since the parser is threaded too."""
@@ -113,7 +124,7 @@ def _split_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
 
     Only some dialects have the site, so the column is dropped: rows that differ only in it are repetitions.
     """
-    rows = rows.with_columns(key=pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64))
+    rows = rows.with_columns(key=KEY)
     for part in rows.partition_by("key", "Location"):
         key, location = part.head(1).select("key", pl.col("Location").str.to_lowercase()).row(0)
         yield name_recording(key, location), part.drop("key", "Location")
@@ -138,6 +149,7 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     recording_facts: dict[str, Any] = {
         "recording": recording,
         "site": site.name,
+        "origin": find_origin(rows.select(KEY.unique()).to_series().to_list()),
         "freeway": site.freeway,
         "frame_rate_hz": FRAME_RATE_HZ,
         "lanes": site.lanes,
@@ -228,7 +240,7 @@ NGSIM = Source(
     "(NGSIM) Vehicle Trajectories and Supporting Data. doi.org/10.21949/1504477",
     signature="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
     "Global_Time, Local_X, Local_Y, v_Vel",
-    version=2,
+    version=3,
     detect=detect,
     group=group,
     to_canonical=to_canonical,

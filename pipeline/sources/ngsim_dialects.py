@@ -1,5 +1,6 @@
 """NGSIM's dialects as data: the fields of a file, their names, and the names of recordings."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -7,6 +8,7 @@ from zoneinfo import ZoneInfo
 
 from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Layout
 from tracklake.pipeline.sources.source import SourceError
+from tracklake.schemas.columns import Origin
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 TEXT_FIELDS = (
@@ -97,6 +99,10 @@ Peachtree's clock counts seconds since 1970 (shifted by a time zone) but advance
 apart, the 3 h 15 min between its two periods.
 """
 
+SYNTHETIC_MS = 42
+"""Milliseconds past a tenth of a second at which all times of generated files lie; recorded ones lie on the tenth."""
+
+DAY_MS = 86_400_000
 UNKNOWN = "unknown"
 _LOCAL = ZoneInfo("America/Los_Angeles")
 
@@ -110,7 +116,7 @@ def name_recording(key: int, location: str | None) -> str:
     """
     if key in RECORDINGS:
         return RECORDINGS[key]
-    start_ms = key + 100
+    start_ms = key + 100 - (SYNTHETIC_MS if _is_synthetic(key) else 0)
     try:
         start = datetime.fromtimestamp(start_ms / 1000, tz=UTC).astimezone(_LOCAL)
     except (OverflowError, ValueError, OSError):
@@ -120,6 +126,18 @@ def name_recording(key: int, location: str | None) -> str:
     rest = f"-{start_ms % 1000:03d}" if start_ms % 1000 else ""
     again = "-again" if start.fold else ""  # the hour repeated at the end of summer time
     return f"{site}-{start:%Y%m%d-%H%M%S}{rest}{again}"
+
+
+def find_origin(keys: Iterable[int]) -> Origin:
+    """Tell by a recording's values of Global_Time - 100 * Frame_ID whether it was generated."""
+    return "synthetic" if any(map(_is_synthetic, keys)) else "recorded"
+
+
+def _is_synthetic(key: int) -> bool:
+    """Tell whether a time has the generator's milliseconds and day, which is that of US-101's recordings."""
+    return key % 100 == SYNTHETIC_MS and any(
+        name.startswith("us-101") and abs(key - known) < DAY_MS for known, name in RECORDINGS.items()
+    )
 
 
 def find_site(recording: str) -> str:

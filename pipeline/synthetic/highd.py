@@ -20,6 +20,8 @@ from tracklake.schemas.arrays import Floats
 
 UPPER_FIRST_MARKING_M = 8.5
 MEDIAN_M = 4.2
+WEEK_DAY = "synthetic"
+"""Value of weekDay in recordingMeta: the mark of generated data, which every copy of the file has."""
 CLASSES = {1: "Car", 2: "Car", 3: "Truck"}
 """highD knows no motorcycles."""
 
@@ -186,7 +188,7 @@ def build_recording(scenario: HighdScenario, upper: pl.DataFrame, lower: pl.Data
         "locationId": str(scenario.location_id),
         "speedLimit": "-1.00",
         "month": scenario.month,
-        "weekDay": scenario.week_day,
+        "weekDay": WEEK_DAY,
         "startTime": scenario.start_time,
         "duration": f"{duration:.6e}" if scenario.exponent else f"{duration:.2f}",
         "totalDrivenDistance": f"{tracks_meta['traveledDistance'].sum():.2f}",

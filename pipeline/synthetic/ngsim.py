@@ -18,6 +18,9 @@ FOOT_M = 0.3048
 LOCATION = "us-101"
 DAY = "2005-06-15"
 ZONE = ZoneInfo("America/Los_Angeles")
+MARK_MS = 42
+"""Milliseconds past the full second of frame 1, and so past the tenth in every Global_Time: the mark of generated data.
+Recorded times end in 00."""
 STANDING_HEADWAY = 9999.99
 ORIGIN_FT = (6_451_110.0, 1_873_360.0)
 HEADING_RAD = -0.7653
@@ -43,9 +46,9 @@ TEXT_WIDTHS = (5, 6, 6, 14, 8, 9, 12, 12, 5, 5, 2, 6, 7, 3, 6, 6, 9, 8)
 
 
 def compute_time_key(start_time: str) -> int:
-    """Compute Global_Time - 100 * Frame_ID of a recording whose frame 1 is at a local time (`HH:MM`) of the day."""
+    """Compute Global_Time - 100 * Frame_ID of a recording by the local time of frame 1 (`HH:MM`), less its MARK_MS."""
     local = datetime.fromisoformat(f"{DAY}T{start_time}").replace(tzinfo=ZONE)
-    return round(local.timestamp() * 1000) - 100
+    return round(local.timestamp() * 1000) + MARK_MS - 100
 
 
 def name_recording(start_time: str) -> str:

@@ -99,7 +99,6 @@ class HighdScenario:
         road: each carriageway.
         share: its length in units of `minutes`.
         month: `MM.YYYY`.
-        week_day: three letters.
         start_time: `HH:MM`.
         upper: traffic driving left.
         lower: traffic driving right.
@@ -112,7 +111,6 @@ class HighdScenario:
     road: Road
     share: float
     month: str
-    week_day: str
     start_time: str
     upper: Traffic
     lower: Traffic
@@ -150,21 +148,21 @@ _MISREAD = Plan(jumps=1, wrong_leaders=1, wrong_headways=2, lane_flickers=2)
 
 HIGHD = (
     HighdScenario(
-        "01", 1, TWO_LANES, 1.9, "09.2017", "Tue", "08:38",
+        "01", 1, TWO_LANES, 1.9, "09.2017", "08:38",
         Traffic(0.25, plan=_MISREAD), Traffic(0.36, trucks=0.2, plan=_MISREAD),
     ),
     HighdScenario(
-        "02", 2, THREE_LANES, 1.1, "10.2017", "Wed", "11:10",
+        "02", 2, THREE_LANES, 1.1, "10.2017", "11:10",
         Traffic(0.30),
         Traffic(0.42, trucks=0.12, bottleneck_mps=11.0, plan=Plan(backward_share=0.01)),
         exponent=True, damaged=True,
     ),
     HighdScenario(
-        "03", 1, TWO_LANES, 0.5, "09.2017", "Tue", "16:52",
+        "03", 1, TWO_LANES, 0.5, "09.2017", "16:52",
         Traffic(0.40, bottleneck_mps=2.5, pulsing=True, plan=Plan(backward_share=0.12)),
         Traffic(0.30),
     ),
-    HighdScenario("04", 2, THREE_LANES, 0.35, "11.2017", "Fri", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
+    HighdScenario("04", 2, THREE_LANES, 0.35, "11.2017", "15:25", Traffic(0.22), Traffic(0.32), damaged=True),
 )  # fmt: skip
 
 _NGSIM_PLAN = Plan(

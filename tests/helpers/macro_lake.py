@@ -52,7 +52,8 @@ def put_subset(
         for (vehicle,), own in tracks.group_by("vehicle_id", maintain_order=True)
     ]  # fmt: skip
     facts = {
-        "recording": subset, "site": "1", "direction": "upper", "freeway": True, "frame_rate_hz": 2.0, "lanes": 2,
+        "recording": subset, "site": "1", "origin": "recorded", "direction": "upper",
+        "freeway": True, "frame_rate_hz": 2.0, "lanes": 2,
         "seconds": seconds, "first_frame": 1, "last_frame": tracks["frame"].max(), "vehicles": len(vehicles),
         "entries": tracks.height, "ids_split": 0, "on_ramp_lanes": [], "columns_missing": [],
         "source_files": [{"file": "a.csv", "sha256": "00"}],

@@ -73,6 +73,7 @@ def a_subset(dataset: str, subset: str, **values) -> dict:
     usual = {
         "recording": subset[:2],
         "site": "site-1",
+        "origin": "recorded",
         "direction": subset[3:],
         "freeway": True,
         "frame_rate_hz": 25.0,

@@ -47,10 +47,10 @@ def make_vehicles(rows: int, subset: str = "01-upper") -> pl.DataFrame:
 
 def make_subset(subset: str = "01-upper") -> pl.DataFrame:
     facts = {
-        "dataset": "highd", "subset": subset, "recording": "01", "site": "1", "direction": "upper", "freeway": True,
-        "frame_rate_hz": 25.0, "lanes": 2, "seconds": 9.0, "first_frame": 1, "last_frame": 9, "vehicles": 3,
-        "entries": 27, "flow_vphpl": None, "vehicles_per_lane_s": None, "ids_split": 0, "on_ramp_lanes": [],
-        "lane_markings_m": [0.0, 3.75],
+        "dataset": "highd", "subset": subset, "recording": "01", "site": "1", "origin": "recorded",
+        "direction": "upper", "freeway": True, "frame_rate_hz": 25.0, "lanes": 2, "seconds": 9.0, "first_frame": 1,
+        "last_frame": 9, "vehicles": 3, "entries": 27, "flow_vphpl": None, "vehicles_per_lane_s": None, "ids_split": 0,
+        "on_ramp_lanes": [], "lane_markings_m": [0.0, 3.75],
         "columns_missing": ["lane"], "source_files": [{"file": "a.csv", "sha256": "00"}],
     }  # fmt: skip
     return pl.DataFrame([facts], schema=SUBSETS_TABLE.dtypes)

@@ -30,7 +30,7 @@ from tracklake.pipeline.lake import (
     scan,
     write_folder,
 )
-from tracklake.schemas import SUBSET_STATUS
+from tracklake.schemas import SCHEMA_VERSION, SUBSET_STATUS
 from tracklake.schemas.errors import FileAccessError
 
 UPPER = {"dataset": "highd", "subset": "01-upper"}
@@ -338,12 +338,12 @@ def test_a_file_or_an_impossible_place_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"[]", b"{}", b"null", b'{"name": "a web page"}', b"\xff\xfe\x00", b'{"schema_version": 1}',
-     b'{"schema_version": 1, "lake_id": "a", "generation": 1, "sources": {}, "retired": [], "entries": []}',
-     b'{"schema_version": 1, "lake_id": "a", "generation": 1, "sources": {}, "retired": [{}], "entries": {}}'],
+    [b"", b"{", b"[]", b"{}", b"null", b'{"name": "a web page"}', b"\xff\xfe\x00", b'{"schema_version": VERSION}',
+     b'{"schema_version": VERSION, "lake_id": "a", "generation": 1, "sources": {}, "retired": [], "entries": []}',
+     b'{"schema_version": VERSION, "lake_id": "a", "generation": 1, "sources": {}, "retired": [{}], "entries": {}}'],
 )  # fmt: skip
 def test_a_manifest_that_is_none_is_named_and_nothing_is_touched(tmp_path: Path, content: bytes):
-    (tmp_path / "manifest.json").write_bytes(content)
+    (tmp_path / "manifest.json").write_bytes(content.replace(b"VERSION", b"%d" % SCHEMA_VERSION))
     (tmp_path / ".staging").mkdir()
     for use in (load, connect, lambda root: open_for_writing(root).__enter__()):
         with pytest.raises(LakeError, match=r"manifest\.json: not a manifest of tracklake"):

@@ -28,6 +28,12 @@ def by_name(canonical):
     return {subset.name: subset for subset in canonical.subsets}
 
 
+@pytest.mark.parametrize(("week_day", "origin"), [("Tue", "recorded"), ("", "recorded"), ("synthetic", "synthetic")])
+def test_the_origin_of_a_recording_is_its_week_day(tmp_path, week_day, origin):
+    canonical = read_highd(write_recording(tmp_path, meta=meta_row().replace("Tue", week_day)))
+    assert [subset.facts["origin"][0] for subset in by_name(canonical).values()] == [origin, origin]
+
+
 def test_golden_numbers_of_the_upper_carriageway(tmp_path):
     canonical = read_highd(write_recording(tmp_path))
     subset = by_name(canonical)["01-upper"]

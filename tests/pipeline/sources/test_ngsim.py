@@ -184,6 +184,8 @@ def test_a_last_column_of_no_meaning_does_not_hide_a_cut_line(tmp_path):
         (1118853000000 - 100, "us-101", "us-101-20050615-093000", "us-101"),
         (1118853000000 - 100, None, "us-101-20050615-093000", "us-101"),
         (1118853000123 - 100, None, "us-101-20050615-093000-123", "us-101"),
+        # Generated times lie 42 ms past the tenth of a second, which the name leaves out.
+        (1118853000042 - 100, None, "us-101-20050615-093000", "us-101"),
         # 2020-01-01 00:00:00 UTC: nothing was recorded then.
         (1577836800000 - 100, None, "unknown-20191231-160000", "unknown"),
         (1577836800000 - 100, "lankershim", "lankershim-20191231-160000", "lankershim"),
@@ -196,6 +198,22 @@ def test_a_last_column_of_no_meaning_does_not_hide_a_cut_line(tmp_path):
 def test_recordings_are_named_by_their_key(key, location, recording, site):
     assert name_recording(key, location) == recording
     assert find_site(recording) == site
+
+
+@pytest.mark.parametrize(
+    ("key", "origin"),
+    [
+        (1118853000042 - 100, "synthetic"),
+        (1118853000042 - 100 + 100 * 77, "synthetic"),  # frames numbered anew
+        (1118853000000 - 100, "recorded"),
+        (1118853000043 - 100, "recorded"),
+        (1118846978900, "recorded"),
+        (1163030342, "recorded"),  # another day: some clock that runs beside the tenth
+    ],
+)
+def test_the_origin_of_a_recording_shows_in_its_times(tmp_path, key, origin):
+    canonical, _ = read_ngsim(tmp_path, write(tmp_path / "a.csv", as_csv([ngsim_row(5, 1, key=key)])))
+    assert [made.subsets[0].facts["origin"][0] for made in canonical.values()] == [origin]
 
 
 def test_recordings_are_told_apart_and_ids_restart_in_each(tmp_path):

@@ -52,6 +52,7 @@ def test_every_row_is_read_and_kept(read, name, rows, recordings):
             TRACKS.validate(subset.tracks, where=subset.name)
             VEHICLES.validate(subset.vehicles, where=subset.name)
             SUBSETS.validate(subset.facts, where=subset.name)
+            assert subset.facts["origin"].to_list() == ["recorded"]
     assert sum(tracks_of(canonical).height for canonical in found.values()) == rows
 
 

@@ -49,8 +49,9 @@ def put_recording(root, number, on_road_s=ON_ROAD_S):
                                     "longitudinal_maneuver": "normal"})  # fmt: skip
                     if vehicle < SECONDS - on_road_s:
                         neighbors.append({**at, "cell": 19, "neighbor_id": vehicle + 1, "dx_m": 25.0})
-        facts = {**where, "recording": number, "site": "1", "direction": side, "freeway": True, "frame_rate_hz": 5.0,
-                 "lanes": 2, "seconds": float(SECONDS), "first_frame": 1, "last_frame": SECONDS * RATE_HZ,
+        facts = {**where, "recording": number, "site": "1", "origin": "recorded", "direction": side,
+                 "freeway": True, "frame_rate_hz": 5.0, "lanes": 2, "seconds": float(SECONDS),
+                 "first_frame": 1, "last_frame": SECONDS * RATE_HZ,
                  "vehicles": len(vehicles), "entries": len(tracks), "flow_vphpl": None,
                  "vehicles_per_lane_s": len(vehicles) / 2 / SECONDS, "ids_split": 0,
                  "on_ramp_lanes": [], "columns_missing": [],

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from raw_texts import read_highd, read_ngsim
 
 from tracklake.pipeline import synthetic as sample
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, write_sample
@@ -67,10 +68,41 @@ def test_portal_export_has_bom_crlf_and_thousands(written):
 
 def test_text_is_aligned_and_has_no_header(written):
     lines = (written[0] / "trajectories-us-101-0930.txt").read_bytes().decode().split("\n")
-    assert lines[0].split()[3] == "1118853000000"
+    assert lines[0].split()[3] == "1118853000042"
     whole = [line for line in lines if len(line.split()) == 18 and "\0" not in line and "fast" not in line]
     assert len({len(line) for line in whole}) == 1
-    assert all(int(line.split()[3]) - 100 * int(line.split()[1]) == 1_118_852_999_900 for line in whole)
+    assert all(int(line.split()[3]) - 100 * int(line.split()[1]) == 1_118_852_999_942 for line in whole)
+
+
+def find_origins(canonical):
+    return {subset.facts["origin"][0] for made in canonical for subset in made.subsets}
+
+
+@pytest.mark.parametrize("name", ["trajectories-us-101-0930.txt", "trajectories-us-101-1015.csv", "us-101-export.csv"])
+def test_a_piece_of_a_generated_ngsim_file_is_recognised_without_its_folder(written, tmp_path, name):
+    lines = (written[0] / name).read_bytes().splitlines(keepends=True)
+    header = lines[:1] if name.endswith(".csv") else []
+    piece = tmp_path / f"mine{Path(name).suffix}"
+    piece.write_bytes(b"".join([*header, *lines[40:80]]))
+    found, _ = read_ngsim(tmp_path / "spilled", piece)
+    assert find_origins(found.values()) == {"synthetic"}
+
+
+def test_a_generated_ngsim_file_that_another_program_rewrote_is_recognised(written, tmp_path):
+    frame = pl.read_csv(written[0] / "trajectories-us-101-1015.csv", ignore_errors=True, truncate_ragged_lines=True)
+    kept = frame.drop_nulls().select("Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel").head(50)
+    kept.write_csv(tmp_path / "derived.csv")
+    found, _ = read_ngsim(tmp_path / "spilled", tmp_path / "derived.csv")
+    assert find_origins(found.values()) == {"synthetic"}
+
+
+def test_a_generated_highd_recording_is_recognised_without_its_folder(written, tmp_path):
+    paths = []
+    for kind in ("recordingMeta", "tracksMeta", "tracks"):
+        paths.append(tmp_path / f"44_{kind}.csv")
+        text = (written[0] / f"04_{kind}.csv").read_text()
+        paths[-1].write_text(text.replace("\n4,", "\n44,", 1) if kind == "recordingMeta" else text)
+    assert find_origins([read_highd(paths, "44")]) == {"synthetic"}
 
 
 def test_rules_find_exactly_the_injected_defects(truth):

@@ -79,9 +79,7 @@ def test_a_follower_names_a_leader_whose_frame_is_lost():
 
 
 def test_recording_meta_adds_up():
-    scenario = HighdScenario(
-        "07", 3, TWO_LANES, 1.0, "09.2017", "Tue", "08:38", Traffic(0.2), Traffic(0.2), exponent=True
-    )
+    scenario = HighdScenario("07", 3, TWO_LANES, 1.0, "09.2017", "08:38", Traffic(0.2), Traffic(0.2), exponent=True)
     upper = tracks((1, 1, 10, 1.9, 1), (1, 2, 11.2, 1.9, 1))
     lower = tracks((2, 1, 50, 1.9, 1), (2, 2, 51.2, 5.6, 2), (2, 4, 53.6, 5.6, 2)).with_columns(v_class=pl.lit(3))
     files = highd.build_recording(scenario, upper, lower, frames=50)
@@ -91,7 +89,9 @@ def test_recording_meta_adds_up():
         "numVehicles,numCars,numTrucks,upperLaneMarkings,lowerLaneMarkings"
     )
     # 1.2 m + 3.6 m; five entries at 25 Hz.
-    assert values == ("7,25,3,-1.00,09.2017,Tue,08:38,2.000000e+00,4.80,0.20,2,1,1,8.50;12.25;16.00,20.20;23.95;27.70")
+    assert values == (
+        "7,25,3,-1.00,09.2017,synthetic,08:38,2.000000e+00,4.80,0.20,2,1,1,8.50;12.25;16.00,20.20;23.95;27.70"
+    )
     meta = files.tracks_meta.splitlines()
     assert meta[0] == (
         "id,width,height,initialFrame,finalFrame,numFrames,class,drivingDirection,traveledDistance,minXVelocity,"
@@ -157,17 +157,18 @@ def test_ngsim_rows_by_hand():
     assert picked[0] == (7, 6.0, 300.0, 0.0, 0, 8, 0.0, 0.0)
     assert picked[1] == (8, 6.0, 200.0, 0.0, 7, 9, 100.0, 9999.99)  # standing behind a leader
     assert picked[2] == (9, 6.0, 100.0, 50.0, 8, 0, 100.0, 2.0)
-    # Frame 1 of the published 07:50 recording is at 07:49:39.0, 1118846979000; 09:30 is 6,021 s later.
-    assert rows["Global_Time"].to_list() == [1_118_853_000_000] * 3
+    # Frame 1 of the published 07:50 recording is at 07:49:39.0, 1118846979000; 09:30 is 6,021 s later,
+    # and generated times lie 42 ms past the tenth of a second.
+    assert rows["Global_Time"].to_list() == [1_118_853_000_042] * 3
     assert ngsim.name_recording("09:30") == "us-101-20050615-093000"
 
 
 def test_ngsim_text_and_csv_lines():
     rows = ngsim.build_rows(feet_pair(), "09:30").with_columns(Global_X=pl.lit(6451137.641), Global_Y=pl.lit(1.5))
-    values = "9 1 1 1118853000000 6.000 100.000 6451137.641 1.500 15.0 6.0 2 50.00 -10.00 1 8 0 100.00 2.00"
+    values = "9 1 1 1118853000042 6.000 100.000 6451137.641 1.500 15.0 6.0 2 50.00 -10.00 1 8 0 100.00 2.00"
     line = ngsim.format_text(rows)[2]
     assert line.split() == values.split()
-    assert line.startswith("    9      1      1  1118853000000    6.000   100.000")
+    assert line.startswith("    9      1      1  1118853000042    6.000   100.000")
     lines = ngsim.format_csv(rows)
     assert lines[0] == (
         "Vehicle_ID,Frame_ID,Total_Frames,Global_Time,Local_X,Local_Y,Global_X,Global_Y,v_Length,v_Width,v_Class,"
@@ -188,7 +189,7 @@ def test_portal_lines_trim_zeros_and_quote_thousands():
         "Time_Headway,Location"
     )
     assert lines[2] == (
-        '1311,1,"1,156",1118853000000,6,200,10.5,1000.25,15,6,2,0,0,1,,,,,,,7,"1,289","1,066.52","9,999.99",us-101'
+        '1311,1,"1,156",1118853000042,6,200,10.5,1000.25,15,6,2,0,0,1,,,,,,,7,"1,289","1,066.52","9,999.99",us-101'
     )
 
 
