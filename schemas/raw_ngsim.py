@@ -24,7 +24,7 @@ RAW_NGSIM = Table(
         "Local_Y": column(pl.Float64, "longitudinal, front centre", unit="ft", ge=-1_000, le=50_000),
         "v_length": column(pl.Float64, "of the vehicle", unit="ft", ge=0, le=300, nullable=True),
         "v_Width": column(pl.Float64, "of the vehicle", unit="ft", ge=0, le=60, nullable=True),
-        "v_Class": column(pl.Int16, "1 motorcycle, 2 car, 3 truck", ge=1, le=3, nullable=True),
+        "v_Class": column(pl.Int16, "1 motorcycle, 2 car, 3 truck; 0 = unknown", ge=0, le=3, nullable=True),
         "v_Vel": column(pl.Float64, "instantaneous speed", unit="ft/s", ge=-130, le=320),
         "v_Acc": column(pl.Float64, "instantaneous acceleration", unit="ft/s2", ge=-650, le=650, nullable=True),
         "Lane_ID": column(pl.Int16, "1 is the leftmost", ge=0, le=200, nullable=True),

@@ -14,6 +14,7 @@ from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.csv import (
     ARCHIVE_SUFFIX,
     ArchiveContents,
+    NoTableError,
     hash_raw,
     is_archive,
     list_members,
@@ -22,11 +23,14 @@ from tracklake.pipeline.sources.csv import (
 from tracklake.pipeline.sources.source import Unit
 from tracklake.schemas.files import write_file
 
-SUFFIXES = (".csv", ".txt", ".dat", ".gz", ARCHIVE_SUFFIX, "")
-"""Endings under which trajectory files circulate; files with others (pictures, Parquet, documents) are skipped."""
+TABLES = (".parquet", ".feather", ".arrow", ".mat")
+"""Endings of binary tables."""
 
-PROSE = (".txt", ".dat", ARCHIVE_SUFFIX, "")
-"""Endings that documents share: an unrecognised file with one is skipped and named, not refused."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, ARCHIVE_SUFFIX, "")
+"""Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""
+
+PROSE = (".txt", ".dat", *TABLES, ARCHIVE_SUFFIX, "")
+"""Endings that other files share: an unrecognised file with one is skipped and named, not refused."""
 
 HASHES = ".hashes.json"
 """Name of the file in the lake that remembers raw files' hashes."""
@@ -135,7 +139,11 @@ class _Search:
         return len(self._found), len(self.refusals)
 
     def _detect_source(self, file: RawFile) -> None:
-        head = read_head(file)
+        try:
+            head = read_head(file)
+        except NoTableError as unknown:
+            self._skip_or_refuse(file, str(unknown))
+            return
         found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.filename)) is not None)
         source, dialect = next(found, (None, ""))
         if source is None:

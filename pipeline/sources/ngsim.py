@@ -199,12 +199,13 @@ def _to_subset(
     )
     has_leader = pl.col("leader_id").is_not_null() if "leader_id" not in missing else pl.col("headway_recorded_m") != 0
     entries = identified.entries.with_columns(headway_recorded_m=pl.when(has_leader).then(pl.col("headway_recorded_m")))
+    vehicle_class = pl.col("v_Class").first(ignore_nulls=True)
     sizes = entries.group_by("vehicle_id").agg(
         source_vehicle_id=pl.col("source_id").first(),
         entries_announced=pl.col("Total_Frames").first(ignore_nulls=True),
         length_m=pl.col("v_length").first(ignore_nulls=True) * FOOT_M,
         width_m=pl.col("v_Width").first(ignore_nulls=True) * FOOT_M,
-        **{"class": pl.col("v_Class").first(ignore_nulls=True).replace_strict(CLASSES, return_dtype=pl.String)},
+        **{"class": vehicle_class.replace_strict(CLASSES, default=None, return_dtype=pl.String)},
     )
     return assemble_subset(
         entries.drop(*CONSTANTS, "source_id", "leader_source_id", "follower_source_id"),

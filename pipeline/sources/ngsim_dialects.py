@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from functools import cache
 from zoneinfo import ZoneInfo
 
-from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Layout
+from tracklake.pipeline.sources.csv import BOM, LINE, NULL_WORDS, UNNAMED, Layout
 from tracklake.pipeline.sources.source import SourceError
 from tracklake.schemas.columns import Origin
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
@@ -173,16 +173,10 @@ def build_layout(head: bytes, dialect: str, *, where: str) -> Layout:
     else:
         names = TEXT_FIELDS
     wanted = [name for name in RAW_NGSIM.columns if name in names and name != LINE]
-    # Every vehicle has a size, a lane and neighbors or 0, so no cell of those columns is empty if a file has them.
-    # The last field shows that a line is whole, so it may not be empty even if the schema allows it.
-    # Direction may be empty: freeways have none.
-    required = (RAW_NGSIM.required | set(TEXT_FIELDS) | {names[-1]}) & set(wanted) - {"Direction"}
-    if dialect != CSV:
-        required = frozenset(wanted)
     return Layout(
         names=names,
         dtypes={name: RAW_NGSIM.dtypes[name] for name in wanted},
-        required=required,
+        required=RAW_NGSIM.required & set(wanted),
         # The portal's export has them in five columns; other columns may have them too.
         thousands=frozenset(name for name in wanted if dialect == CSV and RAW_NGSIM.dtypes[name].is_numeric()),
         bounds={name: limits for name, limits in RAW_NGSIM.bounds.items() if name in wanted},
@@ -212,9 +206,11 @@ def _make_unique(names: list[str], where: str) -> tuple[str, ...]:
 
 
 def _are_numbers(fields: list[str]) -> bool:
+    """Whether a line's fields are the 18 numbers of a file without header; a few may be missing."""
     if len(fields) != len(TEXT_FIELDS):
         return False
     try:
-        return all(float(field) >= float("-inf") for field in fields)
+        numbers = [float(field) for field in fields if field.strip().lower() not in ("", *NULL_WORDS)]
     except ValueError:
         return False
+    return len(numbers) >= len(RAW_NGSIM.required)

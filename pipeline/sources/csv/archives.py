@@ -96,14 +96,15 @@ def open_member(file: RawFile) -> BufferedReader:
             ) from None
 
 
-def measure_member(file: RawFile) -> int:
-    """Return a member's unpacked size in bytes.
+def measure_member(file: RawFile, *, packed: bool = False) -> int:
+    """Return a member's size in bytes, unpacked or as it is in the archive.
 
     Raises:
         SourceError: the archive is damaged.
     """
     with _directory(file) as directory:
-        return directory.getinfo(file.member or "").file_size
+        member = directory.getinfo(file.member or "")
+        return member.compress_size if packed else member.file_size
 
 
 @contextmanager

@@ -5,6 +5,8 @@ import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from io import BufferedReader
+from shutil import copyfileobj
+from tempfile import TemporaryFile
 from typing import BinaryIO, cast
 from zipfile import BadZipFile
 
@@ -12,6 +14,8 @@ import polars as pl
 
 from tracklake.pipeline.sources.csv.archives import measure_member, open_member
 from tracklake.pipeline.sources.csv.line_bytes import BOM, LINE, split_lines
+from tracklake.pipeline.sources.csv.plain_text import convert_text, recognise_form, stream_blocks
+from tracklake.pipeline.sources.csv.table_files import is_table, read_as_csv
 from tracklake.pipeline.sources.source import RawFile, SourceError
 from tracklake.schemas.hashing import hash_chunks
 
@@ -20,6 +24,15 @@ CHUNK_BYTES = 12 << 20
 
 HASH_BYTES = 1 << 20
 """Size of a block that is hashed at once, in bytes."""
+
+MAX_TEXT_RATIO = 40
+"""Highest ratio of text to file size; more than that is the same rows again and again, and would fill the memory."""
+
+FREE_TEXT_BYTES = 256 << 20
+"""Text that every file may hold, however small it is, in bytes."""
+
+HEAD_BYTES = 8192
+"""First bytes by which encoding and separators are recognised."""
 
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip file."""
@@ -38,17 +51,28 @@ def _is_gzip(handle: BufferedReader) -> bool:
 
 @contextmanager
 def open_raw(file: RawFile) -> Iterator[BinaryIO]:
-    """Open a raw file for reading bytes; compressed files are not unpacked to disk.
+    """Open a raw file for reading its text in the plain form; compressed text is not unpacked to disk.
 
     Raises:
-        SourceError: a zip archive is damaged, or its member cannot be read.
+        SourceError: a compressed file or a table is damaged, or an archive's member cannot be read.
     """
     with ExitStack() as stack:
-        handle = stack.enter_context(_open_packed(file))
+        packed = stack.enter_context(_open_packed(file))
         with _explain_damage(file):
-            is_gzip = _is_gzip(handle)
-        # A GzipFile reads like a binary file but is not declared as one.
-        yield stack.enter_context(cast("BinaryIO", gzip.GzipFile(fileobj=handle))) if is_gzip else handle
+            is_gzip = _is_gzip(packed)
+            handle = stack.enter_context(gzip.GzipFile(fileobj=packed)) if is_gzip else packed
+            head = handle.peek(HEAD_BYTES)
+            # A GzipFile reads like a binary file but is not declared as one.
+            plain = cast("BinaryIO", handle)
+            if is_table(head):
+                if is_gzip or file.member is not None:
+                    plain = stack.enter_context(TemporaryFile())  # a table is not read from its start to its end
+                    copyfileobj(handle, plain)
+                    plain.seek(0)
+                plain = stream_blocks(read_as_csv(plain, head, file.name))
+            elif not (form := recognise_form(head)).is_plain:
+                plain = convert_text(plain, form)
+        yield plain
 
 
 def hash_raw(file: RawFile) -> str:
@@ -71,6 +95,12 @@ def measure_unpacked(file: RawFile) -> int:
         is_gzip = _is_gzip(handle)
     size = file.path.stat().st_size if file.member is None else measure_member(file)
     return size * GZIP_RATIO if is_gzip else size
+
+
+def _limit_text(file: RawFile) -> int:
+    """Return the most bytes of text that a file may hold, by its size."""
+    packed = file.path.stat().st_size if file.member is None else measure_member(file, packed=True)
+    return max(FREE_TEXT_BYTES, MAX_TEXT_RATIO * packed)
 
 
 @contextmanager
@@ -100,13 +130,21 @@ def read_whole_lines(handle: BinaryIO, chunk_bytes: int, file: RawFile, *, headi
         heading_lines: number of lines at the file's start that are chunks of their own.
 
     Raises:
-        SourceError: a compressed file is damaged or cut short.
+        SourceError: a compressed file is damaged or cut short, or holds far more text than trajectories of its size.
     """
+    limit, read = _limit_text(file), 0
     with _explain_damage(file):
         for _ in range(heading_lines):
             if line := handle.readline():
                 yield line
         while block := handle.read(chunk_bytes):
+            read += len(block)
+            if read > limit:
+                raise SourceError(
+                    f"{file.name}: unpacks to more than {limit >> 20} MiB, {MAX_TEXT_RATIO} times its size. Expected "
+                    f"about {GZIP_RATIO} times, as trajectories compress. It repeats the same rows, or is damaged; "
+                    "look at its rows, remove the repeated ones, and run again."
+                )
             yield block if block.endswith(b"\n") else block + handle.readline()
 
 

@@ -35,6 +35,15 @@ REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
 THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
 """Pattern of a number that may carry thousands separators: it fits `1,156`, not `1,15`."""
 
+EXPONENT = r"^[+-]?\d(?:\.(\d*))?[eE]([+-]?\d{1,2})$"
+"""Pattern of a number in scientific notation; its groups are the fraction and the exponent."""
+
+NULL_WORDS = ("nan", "na", "n/a", "#n/a", "<na>", "null", "none")
+"""Words in lower case that programs write for a missing value."""
+
+EXACT_WHOLE = 1 << 53
+"""Lowest number above which double precision skips whole numbers."""
+
 UNNAMED = "#"
 """Mark before the number of an unwanted field whose own name is missing or taken."""
 
@@ -210,19 +219,14 @@ def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line:
     reason = _structural_reason(lines, layout)
     sound = lines.filter(reason.is_null())
     fields = _split_fields(sound["text"].str.replace_all(BOM.decode(), "", literal=True), layout)
-    cells = fields.with_columns(sound[LINE])
+    cells = fields.with_columns(sound[LINE]).with_columns(_drop_null_words(layout))
     numeric = [name for name, dtype in layout.dtypes.items() if dtype.is_numeric()]
     # A malformed number stays as it is and fails its cast below.
     well_formed = {name: pl.col(name).str.contains(THOUSANDS) for name in layout.thousands & layout.dtypes.keys()}
     cells = cells.with_columns(
         pl.when(yes).then(pl.col(name).str.replace_all(",", "", literal=True)).otherwise(pl.col(name)).alias(name)
         for name, yes in well_formed.items()
-    ).with_columns(
-        # Programs without a null for whole numbers write 1156 as 1156.0.
-        pl.col(name).str.replace(r"^([+-]?\d+)\.0+$", "${1}")
-        for name in numeric
-        if layout.dtypes[name].is_integer()
-    )
+    ).with_columns(_write_whole(name) for name in numeric if layout.dtypes[name].is_integer())
     typed = cells.select(
         LINE,
         *(
@@ -244,6 +248,37 @@ def _parse_line_by_line(data: bytes, layout: Layout, rows_read: int, first_line:
     return Chunk(kept, rejects.sort(LINE), rows_read)
 
 
+def _drop_null_words(layout: Layout) -> list[pl.Expr]:
+    """Turn the words for a missing value into null in the columns that may be null."""
+    optional = [
+        name
+        for name, dtype in layout.dtypes.items()
+        if name not in layout.required and (dtype.is_numeric() or name in layout.choices)
+    ]
+    return [
+        pl.when(~pl.col(name).str.to_lowercase().is_in(list(NULL_WORDS))).then(pl.col(name)).alias(name)
+        for name in optional
+    ]
+
+
+def _write_whole(name: str) -> pl.Expr:
+    """Write whole numbers without a fraction or an exponent, where that loses no digit.
+
+    Programs without a null for whole numbers write 1156 as 1156.0, others as 1.156000e+03. A number with more digits
+    before its decimal point than were written (1.12E+12) stays as it is: the others are unknown.
+    """
+    cell = pl.col(name).str.replace(r"^([+-]?\d+)\.0+$", "${1}")
+    value = cell.cast(pl.Float64, strict=False)
+    exact = ~_lost_digits(cell) & (value == value.floor()) & (value.abs() < EXACT_WHOLE)
+    return pl.when(exact).then(value.cast(pl.Int64, strict=False).cast(pl.String)).otherwise(cell).alias(name)
+
+
+def _lost_digits(cell: pl.Expr) -> pl.Expr:
+    """Return whether a number in scientific notation lacks digits before its decimal point; null for other numbers."""
+    digits = cell.str.extract(EXPONENT, 1).fill_null("").str.len_bytes().cast(pl.Int32)
+    return cell.str.extract(EXPONENT, 2).cast(pl.Int32, strict=False) > digits
+
+
 def _list_value_reasons(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
     """List why a row's values may be rejected, in the order of precedence; `<name>.cell` is a number's text."""
     reasons = [pl.lit(None, pl.String)]
@@ -254,6 +289,8 @@ def _list_value_reasons(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
         if layout.dtypes[name].is_integer():
             unread = cell.is_not_null() & pl.col(name).is_null()
             whole = cell.str.contains(r"^[+-]?\d+$")
+            lost = f"digits lost in scientific notation (a spreadsheet rounded it): {name}"
+            reasons.append(_reject_if(unread & _lost_digits(cell), lost))
             reasons.append(_reject_if(unread & ~whole, f"not a plain whole number: {name}"))
             reasons.append(_reject_if(unread, f"out of range: {name}"))
     reasons += [_reject_if(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]

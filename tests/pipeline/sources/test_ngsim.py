@@ -343,6 +343,39 @@ def test_rejected_rows_are_part_of_the_accounts(tmp_path):
     check_accounts(canonical, entries_from=["trajectories.csv"])
 
 
+def test_empty_and_nan_cells_are_null_where_a_value_may_be_missing(tmp_path):
+    """pandas writes nothing, or NaN, where there is no leader, headway, acceleration or lane."""
+    optional = ("Total_Frames", "v_length", "v_Width", "v_Class", "v_Acc", "Lane_ID", "Preceding", "Following",
+                "Space_Headway", "Time_Headway", "Location")  # fmt: skip
+    bare = dict.fromkeys(optional, "") | {"Preceding": "NaN", "v_Acc": "nan"}
+    rows = [ngsim_row(7, 1, Preceding=3), ngsim_row(7, 2, **bare), ngsim_row(7, 3, Local_Y="")]
+    canonical = valid(ngsim(tmp_path, as_csv(rows)))
+    assert canonical.rejects.select("line", "reason").rows() == [(4, "empty: Local_Y")]
+    tracks = tracks_of(canonical)
+    assert tracks.select("leader_id", "follower_id", "accel_mps2", "lane", "headway_recorded_m").row(1) == (None,) * 5
+    vehicle = canonical.subsets[0].vehicles.row(0, named=True)
+    assert (vehicle["class"], vehicle["entries_announced"]) == ("car", 100)
+    check_accounts(canonical, entries_from=["trajectories.csv"])
+
+
+def test_class_0_is_an_unknown_class(tmp_path):
+    canonical = valid(ngsim(tmp_path, as_csv([ngsim_row(7, frame, v_Class=0) for frame in (1, 2)])))
+    assert canonical.rejects.is_empty()
+    assert canonical.subsets[0].vehicles["class"].to_list() == [None]
+
+
+def test_times_in_scientific_notation(tmp_path):
+    """With all digits they are exact; rounded by a spreadsheet they are lost."""
+    exact = ngsim(tmp_path / "exact", as_text([ngsim_row(7, 1, Global_Time="1.118846979000e+12")]))
+    assert [subset.name for subset in exact.subsets] == ["us-101-0750"]
+    path = write(tmp_path / "lost.csv", as_csv([ngsim_row(7, frame, Global_Time="1.12E+12") for frame in (1, 2)]))
+    (spilled,) = read_ngsim(tmp_path, path)[1]
+    assert spilled.recordings == {}
+    assert set(spilled.rejects["reason"]) == {
+        "digits lost in scientific notation (a spreadsheet rounded it): Global_Time"
+    }
+
+
 def test_recognition_by_content():
     for data, dialect in [
         (as_text(TWO), None),

@@ -10,7 +10,7 @@ from polars.testing import assert_frame_equal
 from raw_texts import physical_lines
 from raw_texts import write as write_bytes
 
-from tracklake.pipeline.sources.csv import Layout, fetch_lines, read_chunks, read_head
+from tracklake.pipeline.sources.csv import Layout, fetch_lines, raw_files, read_chunks, read_head
 from tracklake.pipeline.sources.csv.line_bytes import split_lines, squeeze_blanks
 from tracklake.pipeline.sources.csv.reader import _parse_line_by_line, _parse_strictly, parse_lines
 from tracklake.pipeline.sources.source import RawFile, SourceError
@@ -99,7 +99,8 @@ def test_strict_and_line_by_line_agree(layout, data):
         (b"1,a,2,-infinity,here", "not a number: x"),
         (b"1,a,2,1e999,here", "not a number: x"),
         (b"1.5,a,2,3,here", "not a plain whole number: id"),
-        (b"1.12E+12,a,2,3,here", "not a plain whole number: id"),
+        (b"1.12E+12,a,2,3,here", "digits lost in scientific notation (a spreadsheet rounded it): id"),
+        (b"1.5e+00,a,2,3,here", "not a plain whole number: id"),
         (b"1,a,2.5,3,here", "not a plain whole number: count"),
         (b"99999999999,a,2,3,here", "out of range: id"),
         (b'1,a,"99,999,999,999",3,here', "out of range: count"),
@@ -156,6 +157,28 @@ def test_whole_numbers_written_with_a_fraction_of_zero(tmp_path):
     frame, rejects, _ = read(tmp_path, HEADER + b'1.0,a,"1,156.00",2.5,here\n-0.0,a,,2.5,here\n')
     assert rejects.is_empty()
     assert rows_of(frame) == [(2, 1, 1156, 2.5, "here"), (3, 0, None, 2.5, "here")]
+
+
+def test_whole_numbers_in_scientific_notation_that_lost_no_digit(tmp_path):
+    lines = b"1.113000e+03,a,,2.5,here\n1e0,a,5.000000000000000000e+00,2.5,here\n"
+    frame, rejects, _ = read(tmp_path, HEADER + lines)
+    assert rejects.is_empty()
+    assert rows_of(frame) == [(2, 1113, None, 2.5, "here"), (3, 1, 5, 2.5, "here")]
+
+
+@pytest.mark.parametrize("word", ["NaN", "nan", "NA", "<NA>", "null", "None", " NaN "])
+def test_words_for_a_missing_value(tmp_path, word):
+    """Null where the column may be null, else no number."""
+    frame, rejects, _ = read(tmp_path, HEADER + f"1,a,{word},2.5,here\n2,a,3,{word},here\n".encode())
+    assert rows_of(frame) == [(2, 1, None, 2.5, "here")]
+    assert rejects.rows() == [(3, "not a number: x", f"2,a,3,{word},here")]
+
+
+def test_an_empty_last_field_may_be_null(tmp_path):
+    layout = Layout(**{**vars(LAYOUT), "required": frozenset({"id"})})
+    frame, rejects, _ = read(tmp_path, HEADER + b"1,a,2,2.5,\n2,a,2,2.5\n3,a,2,2.5,there\n", layout)
+    assert rows_of(frame) == [(2, 1, 2, 2.5, None), (4, 3, 2, 2.5, "there")]
+    assert rejects["reason"].to_list() == ["4 fields instead of 5"]
 
 
 def test_every_field_quoted(tmp_path):
@@ -225,6 +248,13 @@ def test_the_head_of_a_file_that_is_cut_short_can_still_be_recognised(tmp_path):
     assert read_head(write(tmp_path / "a.gz", whole[: len(whole) // 2])).startswith(HEADER)
     with pytest.raises(SourceError, match="damaged"):
         read_head(write(tmp_path / "b.gz", whole[:2]))
+
+
+def test_a_small_file_of_repeated_rows_is_refused_before_it_fills_the_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(raw_files, "FREE_TEXT_BYTES", 1000)
+    path = write(tmp_path / "raw.csv.gz", gzip.compress(HEADER + b"1,a,2,3,here\n" * 20_000))
+    with pytest.raises(SourceError, match=r"raw\.csv\.gz: unpacks to more than 0 MiB, 40 times its size.*repeats"):
+        list(read_chunks(path, LAYOUT, chunk_bytes=1000))
 
 
 def test_a_replacement_character_is_valid_text():
