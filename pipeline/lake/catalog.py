@@ -161,7 +161,9 @@ def rebuild_catalog(root: Path, manifest: Manifest) -> None:
         link.symlink_to(root.resolve(), target_is_directory=True)
         with duckdb.connect(str(made)) as connection:
             connection.execute(f"SET file_search_path = {quote(str(link))}")
+            connection.begin()  # or each statement is written to disk by itself
             create_views(connection, root, manifest, locate=str)
+            connection.commit()
         content = made.read_bytes()
     # What a client that wrote to the old catalog left would be replayed into the new one.
     (root / f"{CATALOG}.wal").unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 import unicodedata
 from collections.abc import Mapping
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
@@ -12,8 +13,9 @@ DASH = "\N{EN DASH}"
 """Text of a number that is unknown or was not computed."""
 
 
+@cache
 def make_environment() -> jinja2.Environment:
-    """Make the templates' environment: text is escaped, a missing name is an error, `style` is the style sheet."""
+    """Make the templates' environment once: text is escaped, a missing name is an error, `style` is the style sheet."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("tracklake.quality_reports", "templates"),
         autoescape=True,

@@ -5,6 +5,7 @@ same rows, that fetches nothing. The page's style sheet (`templates/report.css`)
 reader's, by their values.
 """
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -331,8 +332,8 @@ def _names(rows: Sequence[Row], column: str) -> list[str]:
 
 
 def _data(rows: Iterable[Row]) -> alt.InlineData:
-    """Return rows as a chart's inline data."""
-    return alt.InlineData(values=list(rows))
+    """Return rows as a chart's inline data, as JSON text: Altair copies data with every change of a chart."""
+    return alt.InlineData(values=json.dumps(list(rows)))
 
 
 def _subset_axis(rows: Sequence[Row]) -> alt.Y:

@@ -47,11 +47,12 @@ def open_lake() -> Iterator[Callable[..., duckdb.DuckDBPyConnection]]:
     opened = []
 
     def open_(**tables: list[dict]) -> duckdb.DuckDBPyConnection:
-        connection = duckdb.connect(":memory:")
+        connection = duckdb.connect(":memory:", config={"threads": 1})
         opened.append(connection)
         for table in TABLES:
             rows = [{**dict.fromkeys(table.dtypes), **row} for row in tables.get(table.name, [])]
-            connection.register(f"{table.name}_rows", pl.DataFrame(rows, schema=table.dtypes, orient="row"))
+            connection.register("frame", pl.DataFrame(rows, schema=table.dtypes, orient="row"))
+            connection.execute(f"CREATE TABLE {table.name}_rows AS FROM frame")  # faster to query than frames
         for table in TABLES:
             later, key = JOINED.get(table.name, (None, ()))
             join = f" LEFT JOIN {later}_rows USING ({', '.join(key)})" if later else ""
