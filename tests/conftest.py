@@ -11,13 +11,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import chdir, closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
 import pytest
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
+from plain_flows import replace_prefect
 
 SERVER_START_S = 120.0
 
@@ -38,22 +40,27 @@ class Finished:
     err: str
 
 
+FLOW_COMMANDS = ("run", "ingest", "validate", "repair", "samples", "split", "tensors", "report", "serve")
+"""Commands that may need Prefect's API."""
+
+
 @dataclass(frozen=True)
 class Command:
     """Runs `tracklake` as a user does: a process of its own, in a folder of its own.
 
-    Prefect's API is served by one process for all of them, as where PREFECT_API_URL is set. `alone` is the command of
-    somebody who has set up nothing: each serves itself, which costs it some seconds more.
+    Prefect's API is served by one process for all of them, as where PREFECT_API_URL is set; it starts with the first
+    that may need it. `alone` is the command of somebody who has set up nothing: each serves itself, which costs it some
+    seconds more.
     """
 
     folder: Path
     environment: dict[str, str]
-    own_server: dict[str, str] = field(default_factory=dict)
+    find_server: Callable[[], "Server"] | None = None
 
     def here(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
         """The same in this process, which spares imports: where neither the process nor Prefect is what is tested.
 
-        What runs flows needs the fixture `prefect_here`, too.
+        What runs flows needs the fixture `plain_flows`, too, or `prefect_here` where Prefect is what is tested.
         """
         from typer.testing import CliRunner
 
@@ -65,13 +72,18 @@ class Command:
 
     @property
     def alone(self) -> "Command":
-        return replace(self, environment=self.own_server)
+        return replace(self, find_server=None)
+
+    def _make_environment(self, name: str | Path, extra: dict[str, str]) -> dict[str, str]:
+        served = self.find_server is not None and name in FLOW_COMMANDS
+        address = {"PREFECT_API_URL": self.find_server().address} if served else {}
+        return {**self.environment, **address, **extra}
 
     def __call__(self, *arguments: str | Path, stdin: str = "", **extra: str) -> Finished:
         done = subprocess.run(
             [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)],
             cwd=self.folder,
-            env={**self.environment, **extra},
+            env=self._make_environment(arguments[0], extra),
             input=stdin,
             capture_output=True,
             text=True,
@@ -85,7 +97,7 @@ class Command:
         return subprocess.Popen(
             [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)],
             cwd=self.folder,
-            env={**self.environment, **extra},
+            env=self._make_environment(arguments[0], extra),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -166,12 +178,11 @@ def prefect_home(prefect_server: Server, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def command(
-    clean_environment: dict[str, str], prefect_server: Server, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, clean_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> Command:
-    home = tmp_path_factory.mktemp("prefect")
-    shutil.copy(prefect_server.empty_database, home / "prefect.db")
-    alone = {**clean_environment, "PREFECT_HOME": str(home)}
-    return Command(tmp_path_factory.mktemp("elsewhere"), {**alone, "PREFECT_API_URL": prefect_server.address}, alone)
+    environment = {**clean_environment, "PREFECT_HOME": str(tmp_path_factory.mktemp("prefect"))}
+    find_server = partial(request.getfixturevalue, "prefect_server")
+    return Command(tmp_path_factory.mktemp("elsewhere"), environment, find_server)
 
 
 @contextmanager
@@ -201,6 +212,13 @@ def prefect_here(prefect_address: str, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture(scope="module")
+def plain_flows() -> Iterator[None]:
+    """Flows of this process run without Prefect: for tests of what they do, in less than half the time."""
+    with replace_prefect():
+        yield
+
+
+@pytest.fixture(scope="module")
 def empty_charts() -> Iterator[None]:
     """Charts of this process show nothing: for tests of something else, which would spend half their time on them."""
     with mock.patch("vl_convert.vegalite_to_svg", return_value="<svg ></svg>"):
@@ -225,12 +243,12 @@ class Lake:
 
 
 @pytest.fixture(scope="session")
-def make_lake(command: Command, prefect_address: str, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Lake]:
+def make_lake(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Lake]:
     """Make a lake of raw files by `tracklake run` in this process."""
 
     def make(source: Path) -> Lake:
         root = tmp_path_factory.mktemp("lakes") / "lake"
-        with use_server(prefect_address, tmp_path_factory.mktemp("results")):
+        with replace_prefect():
             done = command.here("run", source, "--lake", root, "--json")
         assert done.code == 0, done.err
         return Lake(root, json.loads(done.out))
@@ -255,5 +273,5 @@ def excerpts_lake(make_lake: Callable[..., Lake]) -> Lake:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep what uses Prefect's server or the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"prefect_server", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
+        if {"prefect_server", "command", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.xdist_group("lake"))

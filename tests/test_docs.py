@@ -31,7 +31,7 @@ def newcomer(command, lake, sample, tmp_path):
 SHORTER = {"--seconds 60": "--seconds 1", "--minutes 0.2": "--minutes 0.1", "--examples 1000": "--examples 200"}
 
 
-@pytest.mark.usefixtures("prefect_here")
+@pytest.mark.usefixtures("plain_flows")
 def test_the_commands_of_the_readme_run_as_printed(newcomer):
     """One after the other, as a reader types them: later ones need what earlier ones made.
 

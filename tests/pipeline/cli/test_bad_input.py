@@ -8,7 +8,7 @@ import pytest
 
 from tracklake.pipeline.lake import connect
 
-pytestmark = pytest.mark.usefixtures("prefect_here")
+pytestmark = pytest.mark.usefixtures("plain_flows")
 
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
 EXPECTED = ("Expected", "highD: NN_recordingMeta.csv", "NGSIM: 18 numbers a line")

@@ -41,7 +41,7 @@ def test_a_copy_is_said_to_be_equal(command, lake, copied):
     assert (done.code, compared["equal"]) == (0, True)
 
 
-@pytest.mark.usefixtures("prefect_here", "empty_charts")
+@pytest.mark.usefixtures("plain_flows", "empty_charts")
 def test_another_threshold_changes_its_findings_only(command, lake, copied):
     assert command.here("validate", "--lake", copied, **THRESHOLD).code == 0
     done = command.here("report", "--lake", copied, "--compare", lake.root, "--json", **THRESHOLD)

@@ -6,7 +6,7 @@ import pytest
 from lake_sources import EXCERPTS
 
 pytestmark = [
-    pytest.mark.usefixtures("prefect_here"),
+    pytest.mark.usefixtures("plain_flows"),
     pytest.mark.skipif(not EXCERPTS.is_dir(), reason=f"the NGSIM excerpts are not at {EXCERPTS}"),
 ]
 

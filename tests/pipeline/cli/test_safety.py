@@ -12,7 +12,7 @@ from tracklake.pipeline.cli import generated_sample
 from tracklake.pipeline.lake import connect
 from tracklake.pipeline.synthetic import SampleSummary
 
-pytestmark = pytest.mark.usefixtures("prefect_here", "empty_charts")
+pytestmark = pytest.mark.usefixtures("plain_flows", "empty_charts")
 
 HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
 BASE = 1_118_846_978_900  # us-101-0750

@@ -15,7 +15,7 @@ ORDERS = (
 )
 
 
-@pytest.mark.usefixtures("prefect_here")
+@pytest.mark.usefixtures("plain_flows")
 def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, sample, lake, tmp_path):
     with zipfile.ZipFile(tmp_path / "download.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("sample/Readme.pdf", b"%PDF")

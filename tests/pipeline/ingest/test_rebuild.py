@@ -16,12 +16,12 @@ from small_recordings import ENTRIES, write_highd
 from tracklake.pipeline.lake import LakeError, connect, load, open_for_writing
 from tracklake.schemas import SCHEMA_VERSION
 
-pytestmark = pytest.mark.usefixtures("prefect_here")
+pytestmark = pytest.mark.usefixtures("plain_flows")
 
 
 @pytest.fixture(scope="module")
-def made(command, prefect_here, tmp_path_factory) -> Path:
-    del prefect_here
+def made(command, plain_flows, tmp_path_factory) -> Path:
+    del plain_flows
     folder = tmp_path_factory.mktemp("made")
     for number in ("01", "02"):
         write_highd(folder / "my raw", number, speed_mps=28.0 + int(number))

@@ -48,9 +48,9 @@ def counted(root: Path) -> dict[str, int]:
 
 
 @pytest.fixture
-def ingest(prefect_here):
+def ingest(plain_flows):
     """The flow behind `tracklake ingest`."""
-    del prefect_here
+    del plain_flows
 
     def call(source: Path, root: Path, **flags) -> dict:
         result = flows.ingest_files(str(root), str(source), **flags)
@@ -61,9 +61,9 @@ def ingest(prefect_here):
 
 
 @pytest.fixture(scope="module")
-def made(command, prefect_here, empty_charts, tmp_path_factory) -> Path:
+def made(command, plain_flows, empty_charts, tmp_path_factory) -> Path:
     """A folder with raw/ of recordings 01 to 04 and lake/, which the whole pipeline made of them."""
-    del prefect_here, empty_charts
+    del plain_flows, empty_charts
     folder = tmp_path_factory.mktemp("made")
     for number in ("01", "02", "03", "04"):
         write_highd(folder / "raw", number, speed_mps=28.0 + int(number))
@@ -339,7 +339,7 @@ def test_remove_takes_recordings_by_name(command, ingest, copy, tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
-@pytest.mark.usefixtures("prefect_here")
+@pytest.mark.usefixtures("plain_flows")
 def test_a_lake_of_no_recordings_works(command, copy):
     raw, root = copy
     done = command.here("remove", "01", "02", "03", "04", "--lake", root)
