@@ -20,6 +20,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
 from plain_flows import replace_prefect
+from simulated import simulate_once
 
 SERVER_START_S = 120.0
 
@@ -229,7 +230,8 @@ def empty_charts() -> Iterator[None]:
 def sample(command: Command, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default sample, shortened, with its truth.parquet."""
     folder = tmp_path_factory.mktemp("generated") / "sample"
-    done = command.here("sample", "--out", folder, *SAMPLE, "--quiet")
+    with simulate_once():
+        done = command.here("sample", "--out", folder, *SAMPLE, "--quiet")
     assert done.code == 0, done.err
     return folder
 
@@ -269,9 +271,18 @@ def excerpts_lake(make_lake: Callable[..., Lake]) -> Lake:
     return make_lake(EXCERPTS)
 
 
+def choose_group(item: pytest.Item) -> str:
+    """What uses the lakes shared by all, or Prefect's server, stays on one worker, and so does each file.
+
+    Each of the lakes, the server and the fixtures of a module is then made once.
+    """
+    used = set(getattr(item, "fixturenames", ()))
+    if used & {"prefect_server", "sample", "lake"}:
+        return "lake"
+    return "excerpts" if "excerpts_lake" in used else item.nodeid.partition("::")[0]
+
+
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what uses Prefect's server or the shared lakes on one worker, so that each is made once."""
     for item in items:
-        if {"prefect_server", "command", "sample", "lake"} & set(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.xdist_group("lake"))
+        item.add_marker(pytest.mark.xdist_group(choose_group(item)))

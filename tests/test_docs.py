@@ -42,7 +42,7 @@ def test_the_commands_of_the_readme_run_as_printed(newcomer):
         shorter = line
         for printed, run in SHORTER.items():
             shorter = shorter.replace(printed, run)
-        done = (newcomer.here if number else newcomer)(*shlex.split(shorter, comments=True)[1:])
+        done = (newcomer.here if number else newcomer.alone)(*shlex.split(shorter, comments=True)[1:])
         assert done.code == 0, f"{line}: {done.err}"
         assert done.out, line
 

@@ -4,8 +4,6 @@ import pytest
 from golden_lake import HOW_TO_UPDATE, digest_lake, find_changes, measure_losses, read_golden
 from lake_sources import EXCERPTS
 
-pytestmark = pytest.mark.xdist_group("lake")
-
 
 @pytest.fixture
 def run(command):

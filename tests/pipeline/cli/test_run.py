@@ -275,7 +275,7 @@ def test_a_model_trains_and_every_run_is_evaluated(command, lake, tmp_path):
     assert set(table["model"]) == {"constant-velocity", "lstm"}
 
 
-@pytest.mark.usefixtures("plain_flows")
+@pytest.mark.usefixtures("plain_flows", "prefect_server")
 def test_dask_workers_make_the_same_lake(command, tmp_path):
     for number in ("01", "02"):
         write_highd(tmp_path / "raw", number)

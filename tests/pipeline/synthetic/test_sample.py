@@ -5,20 +5,25 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from lake_sources import SAMPLE
 from raw_texts import read_highd, read_ngsim
+from simulated import simulate_once
 
-from tracklake.pipeline import synthetic as sample
+from tracklake.pipeline import synthetic
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
 
-MINUTES = 0.2
+MINUTES, SEED = (kind(text) for kind, text in zip((float, int), SAMPLE[1::2], strict=True))
+"""As of the session's sample, with which this one shares its simulations."""
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory) -> tuple[Path, SampleSummary]:
+def written(sample, tmp_path_factory) -> tuple[Path, SampleSummary]:
+    del sample
     out = tmp_path_factory.mktemp("sample") / "raw"
-    return out, write_sample(out, formats=ALL_FORMATS, minutes=MINUTES, seed=3)
+    with simulate_once():
+        return out, write_sample(out, formats=ALL_FORMATS, minutes=MINUTES, seed=SEED)
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +51,14 @@ def test_summary_names_every_file(written):
 
 def test_same_seed_same_bytes_whatever_else_is_written(written, tmp_path):
     out, _ = written
-    again = write_sample(tmp_path / "a", formats=("ngsim-csv", "socrata"), minutes=MINUTES, seed=3)
+    again = write_sample(tmp_path / "a", formats=("ngsim-csv", "socrata"), minutes=MINUTES, seed=SEED)
     for path in again.files:
         if path.name != "truth.parquet":
             assert path.read_bytes() == (out / path.name).read_bytes()
-    twice = write_sample(tmp_path / "b", formats=("socrata", "ngsim-csv"), minutes=MINUTES, seed=3)
+    with simulate_once():
+        twice = write_sample(tmp_path / "b", formats=("socrata", "ngsim-csv"), minutes=MINUTES, seed=SEED)
     assert (tmp_path / "a/truth.parquet").read_bytes() == (tmp_path / "b/truth.parquet").read_bytes()
-    other = write_sample(tmp_path / "c", formats=("ngsim-csv",), minutes=MINUTES, seed=4)
+    other = write_sample(tmp_path / "c", formats=("ngsim-csv",), minutes=MINUTES, seed=SEED + 1)
     assert other.files[1].name == twice.files[1].name
     assert other.files[1].read_bytes() != twice.files[1].read_bytes()
 
@@ -62,7 +68,7 @@ def test_portal_export_has_bom_crlf_and_thousands(written):
     assert data.startswith(b"\xef\xbb\xbfVehicle_ID,Frame_ID,Total_Frames,")
     assert data.count(b"\r\n") == data.count(b"\n")
     assert data.endswith(b"us-101\r\n")
-    assert re.search(rb'"1,0\d\d"', data)
+    assert re.search(rb'"1,0\d\d[".]', data)
     assert b",,,,,,," in data
 
 
@@ -313,4 +319,4 @@ def test_a_failed_run_says_what_sumo_said(tmp_path):
 
 
 def test_the_package_exports_what_it_promises():
-    assert set(sample.__all__) >= {"ALL_FORMATS", "SampleSummary", "write_sample"}
+    assert set(synthetic.__all__) >= {"ALL_FORMATS", "SampleSummary", "write_sample"}
