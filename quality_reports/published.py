@@ -4,11 +4,11 @@ Speeds are averages per vehicle and second. Counts are of all vehicles of the re
 recorded ones less the leader's length.
 """
 
-from collections.abc import Collection, Mapping
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import cast
 
 from tracklake.schemas.completeness import PUBLISHED_TOTALS
-from tracklake.schemas.quality_tracks import PublishedFigures
+from tracklake.schemas.quality_tracks import IncomparableRecording, PublishedFigures, RecordingFacts
 
 SOURCE = (
     "the appendices of the study that validates NGSIM and highD (speeds averaged per vehicle and second, errors by the "
@@ -47,13 +47,45 @@ def list_published() -> list[PublishedFigures]:
     ]
 
 
-def is_comparable(figures: Mapping[str, Any], held: Mapping[str, Collection[str]]) -> bool:
-    """Tell whether a lake holds every recording behind published figures.
+def select_published(
+    recordings: Sequence[RecordingFacts],
+) -> tuple[list[PublishedFigures], list[IncomparableRecording]]:
+    """Select the published figures that a lake's recordings can be compared with.
 
-    Args:
-        figures: an item of `list_published`.
-        held: names of the lake's recordings, by dataset.
+    Figures of a dataset need all its recordings.
+
+    Returns:
+        The figures; and the recordings of which figures exist that are left out, each with the reason.
     """
-    dataset, recording = figures["dataset"], figures["recording"]
-    wanted = (recording,) if recording is not None else WHOLE.get(dataset, ())
-    return set(wanted) <= set(held.get(dataset, ()))
+    gaps = {(row["dataset"], row["recording"]): explain_gap(row) for row in recordings}
+    figures: list[PublishedFigures] = []
+    left_out: list[IncomparableRecording] = []
+    for known in list_published():
+        dataset, recording = known["dataset"], known["recording"]
+        keys = [(dataset, name) for name in (WHOLE[dataset] if recording is None else (recording,))]
+        if not all(key in gaps for key in keys):
+            continue
+        if all(gaps[key] is None for key in keys):
+            figures.append(known)
+        elif recording is not None:
+            left_out.append({"dataset": dataset, "recording": recording, "reason": str(gaps[keys[0]])})
+    return figures, left_out
+
+
+def explain_gap(recording: RecordingFacts) -> str | None:
+    """Explain why a recording cannot be compared with published figures; None where it can: recorded and complete."""
+    if recording["origin"] != "recorded":
+        return "it is synthetic"
+    counts = (
+        ("vehicles", recording["vehicles_announced"], recording["vehicles_found_share"]),
+        ("rows", recording["entries_announced"], recording["entries_found_share"]),
+    )
+    unknown = [what for what, announced, share in counts if announced is None or share is None]
+    if unknown:
+        return f"nothing tells how many {' and '.join(unknown)} it has"
+    wrong = [
+        f"{round(announced * share):,} of {announced:,} {what}"
+        for what, announced, share in counts
+        if announced is not None and share is not None and share != 1
+    ]
+    return f"the lake holds {' and '.join(wrong)}" if wrong else None

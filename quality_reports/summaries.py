@@ -9,7 +9,7 @@ from typing import Any, Protocol, SupportsFloat, TypeAlias, TypeVar, cast
 
 import polars as pl
 
-from tracklake.quality_reports.published import SOURCE, list_published
+from tracklake.quality_reports.published import SOURCE, select_published
 from tracklake.quality_reports.rules.registry import RULES, Rule, describe
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.quality import (
@@ -181,6 +181,8 @@ def collect(
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     source_files = _query_rows(connection, "source_files", SourceFile)
+    recordings = _query_rows(connection, "recordings", RecordingFacts)
+    published, left_out = select_published(recordings)
     return {
         "schema": QUALITY_SCHEMA,
         "headline": _query_rows(connection, "headline", Headline)[0],
@@ -193,9 +195,9 @@ def collect(
             "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
             "histogram": _query_rows(connection, "speed_histogram", SpeedBin),
         },
-        "recordings": _query_rows(connection, "recordings", RecordingFacts),
+        "recordings": recordings,
         "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
-        "published": {"source": SOURCE, "figures": list_published()},
+        "published": {"source": SOURCE, "figures": published, "left_out": left_out},
         "starts": _collect_starts(connection),
         "samples": {
             "subsets": _query_rows(connection, "samples", SubsetSamples),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 INDEX_FILE = "index.json"
 
-TENSORS_VERSION = 4
+TENSORS_VERSION = 5
 """Number of the folder's layout; it grows when older readers cannot read the files."""
 
 POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
@@ -133,6 +133,7 @@ out of val and eval (null where the recipe is not known)."""
 SUBSET_KEYS = {
     "dataset": "text",
     "subset": "text",
+    "origin": "text",
     "frame_rate_hz": "a number",
     "centre_m": "two numbers",
     "lane_markings_m": "numbers or null",
@@ -142,10 +143,10 @@ SUBSET_KEYS = {
 """Each key of a subset and the kind of its value."""
 
 SUBSET_MEANING = """\
-Of each subset: centre_m (2,), the origin of int16 positions, (0, 0) for float32; lane_markings_m, y of each marking,
-null where unknown; last_lane, the rightmost lane (by the markings, else the highest that any entry has: knowledge of
-the map taken from the whole recording, later moments included); width_m of the carriageway (the last marking, else
-12 ft a lane)."""
+Of each subset: origin, recorded or synthetic; centre_m (2,), the origin of int16 positions, (0, 0) for float32;
+lane_markings_m, y of each marking, null where unknown; last_lane, the rightmost lane (by the markings, else the
+highest that any entry has: knowledge of the map taken from the whole recording, later moments included); width_m of
+the carriageway (the last marking, else 12 ft a lane)."""
 
 NOMINAL_LANE_M = 3.6576
 """Width of a lane without known markings, in metres (12 ft), for mirrored positions and the lanes of scenes."""

@@ -9,13 +9,20 @@ from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import cut_text, print_table
-from tracklake.pipeline.lake import Manifest, connect, load
+from tracklake.pipeline.lake import Manifest, connect, load, scan
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 from tracklake.pipeline.stages.score import collect_scores
-from tracklake.quality_reports.pages.comparison import format_difference, format_value, render_comparison
+from tracklake.quality_reports.pages.comparison import (
+    describe_sides,
+    format_difference,
+    format_value,
+    render_comparison,
+)
 from tracklake.quality_reports.pages.lake_differences import COUNTED, Side, compare
+from tracklake.schemas import SUBSETS
 from tracklake.schemas.files import write_file
+from tracklake.schemas.origin import describe_synthetic
 
 COMPARISON = "compare.html"
 MAX_ROWS = 20
@@ -77,6 +84,7 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
     page.parent.mkdir(exist_ok=True)
     write_file(page, render_comparison(compared, report=PAGE).encode())
     terminal.print_line(f"\nnow:  {root.resolve()}\nthen: {other.resolve()}\n")
+    terminal.print_origin(describe_sides(compared))
     show_comparison(terminal, compared)
     terminal.print_line(f"comparison  {page.resolve()}", style="bold green")
     return {"comparison": compared, "comparison_page": page.resolve()}
@@ -86,10 +94,16 @@ def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]
 def _open_side(terminal: Terminal, root: Path, *, reported: bool, **facts: str) -> Iterator[Side]:
     manifest = load(root)
     validated = manifest.of_stage("validate")
+    origins = scan(root, manifest, SUBSETS).select("subset", "origin").collect()
     with connect(root) as connection:
         yield Side(
             connection=connection,
-            facts={"lake": root.resolve().name, "lake_id": manifest.lake_id, **facts},
+            facts={
+                "lake": root.resolve().name,
+                "lake_id": manifest.lake_id,
+                "synthetic": describe_synthetic(dict(origins.iter_rows())),
+                **facts,
+            },
             rules=list(dict.fromkeys(name for entry in validated for name in entry.built_from["rules"])),
             made_with=_list_made_with(manifest) | ({"report": _read_provenance(root)} if reported else {}),
             scores=collect_scores(root, manifest, lambda message: terminal.print_problem(message, label="note")),

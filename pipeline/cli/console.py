@@ -29,11 +29,22 @@ class Terminal:
         self.err = Console(stderr=True, highlight=False, soft_wrap=True)
         self.as_json = as_json
         self.verbose = not (quiet or as_json)
+        self._synthetic: str | None = None
 
     def print_line(self, text: str, *, style: str = "") -> None:
         """Print a line for people."""
         if self.verbose:
             self.out.print(escape(text), style=style or None)
+
+    def print_origin(self, synthetic: str | None) -> None:
+        """Print what of the data is synthetic, if anything, and add it to the record for programs.
+
+        Args:
+            synthetic: text of `schemas.origin.describe_synthetic`.
+        """
+        self._synthetic = synthetic
+        if synthetic is not None:
+            self.print_line(synthetic, style="bold yellow")
 
     def print_problem(self, text: str, *, label: str = "error") -> None:
         """Print an error or refusal, always, on stderr."""
@@ -43,7 +54,8 @@ class Terminal:
     def print_json(self, record: dict[str, Any]) -> None:
         """Print the result for programs, with --json."""
         if self.as_json:
-            json.dump(record, sys.stdout, indent=1, allow_nan=False, default=str)
+            synthetic = {} if self._synthetic is None else {"synthetic": self._synthetic}
+            json.dump({**record, **synthetic}, sys.stdout, indent=1, allow_nan=False, default=str)
             sys.stdout.write("\n")
 
     @contextmanager

@@ -10,6 +10,7 @@ import polars as pl
 import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
 from tracklake.pipeline.cli.score_tables import show_evaluations
@@ -21,6 +22,7 @@ from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_file
+from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
 from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
 from tracklake.training.evaluation.published import published_rows
@@ -93,9 +95,9 @@ def evaluate(
         )
         measured = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
         table = measured
-        if published:
-            datasets = tuple(measured["dataset"].unique())
-            table = pl.concat([measured, published_rows(settings.get_protocol().name, datasets)])
+        comparable = print_comparability(terminal, root, TensorFolder.open(tensors), published=published)
+        if comparable:
+            table = pl.concat([measured, published_rows(settings.get_protocol().name, comparable)])
         table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])

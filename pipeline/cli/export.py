@@ -98,6 +98,7 @@ def _write_windows(
     """Write the windows and print how many there are."""
     with terminal.show_stages():
         written = export_windows(settings, out, file_format, absolute=absolute, force=force)
+    terminal.print_origin(written.synthetic)
     for part, samples in written.samples.items():
         terminal.print_line(f"{part}.{file_format}: {samples:,} samples, {written.neighbors[part]:,} neighbors")
     for note in written.notes:
@@ -108,6 +109,7 @@ def _write_windows(
 
 def _show_csp_export(terminal: Terminal, written: CspExport) -> None:
     """Print a line per file, and what was dropped by reason."""
+    terminal.print_origin(written.synthetic)
     rows = [
         [file.name, *(f"{count:,}" for count in (file.samples, file.sampled_tracks, file.tracks, file.entries))]
         for file in written.files

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from tracklake.pipeline.cli.command import REFUSED, command, read_settings
+from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
 from tracklake.pipeline.cli.tables import format_number, print_table
@@ -88,6 +89,7 @@ def lane_forest(
         forest_settings = _read_forest_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
+        comparable = print_comparability(terminal, settings.lake, folder, published=True)
         out = settings.lake / RUNS / FOLDER
         if use:
             forest = _open_forest(out / FOREST, folder)
@@ -114,7 +116,7 @@ def lane_forest(
             "passed_by": skipped,
         }
         _write_scores(out / SCORES, record)
-        _show_scores(terminal, folder, scores, forest)
+        _show_scores(terminal, folder, scores, forest, published=bool(comparable))
         no_curve = ""
         if learning_curve:
             try:
@@ -188,11 +190,13 @@ def _find_predictors(
     return predictors, reads
 
 
-def _show_scores(terminal: Terminal, folder: TensorFolder, scores: GridScores, forest: LaneForest) -> None:
+def _show_scores(
+    terminal: Terminal, folder: TensorFolder, scores: GridScores, forest: LaneForest, *, published: bool
+) -> None:
     """Print cell accuracies by horizon, those of the last horizon by stratum, and the maneuvers' accuracies."""
     protocol = folder.protocol
     terminal.print_line(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
-    _show_cells(terminal, scores.cells, protocol.name)
+    _show_cells(terminal, scores.cells, published=published and protocol.name == "grid-2021")
     rows = [
         [own.stratum, f"{own.n:,}", *map(_format_percent, (own.accuracy, *own.recall.values(), own.majority))]
         for own in scores.maneuvers
@@ -230,8 +234,7 @@ def _show_curve(terminal: Terminal, curve: list[LearningPoint]) -> None:
         terminal.print_line(f"it ends at {last:,} examples, with which the smallest stratum is used up", style="dim")
 
 
-def _show_cells(terminal: Terminal, cells: list[CellScore], protocol: str) -> None:
-
+def _show_cells(terminal: Terminal, cells: list[CellScore], *, published: bool) -> None:
     horizons = sorted({own.seconds for own in cells})
     strata = list(dict.fromkeys(own.stratum for own in cells))
     by_key = {(own.model, own.column, own.seconds, own.stratum): own for own in cells}
@@ -246,7 +249,7 @@ def _show_cells(terminal: Terminal, cells: list[CellScore], protocol: str) -> No
     for title, figure in (("always the commonest cell", "majority"), ("true place outside of the nine", "outside")):
         rows.append([title, *(_format_percent(getattr(by_key[*first, ahead, ALL], figure)) for ahead in horizons)])
     rows.append(["n", *(f"{by_key[*first, ahead, ALL].n:,}" for ahead in horizons)])
-    if protocol == "grid-2021":
+    if published:
         for model, shares in CELL_ACCURACY.items():
             known = dict(zip(CELL_ACCURACY_S, shares, strict=True))
             rows.append([f"{model}, published", *(_format_percent(known.get(ahead)) for ahead in horizons)])

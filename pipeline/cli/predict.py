@@ -15,6 +15,7 @@ from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.files import write_file
+from tracklake.schemas.origin import describe_synthetic
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.attention import export_attention
 from tracklake.training.plots.picture import Picture, forecast_samples, forecast_scene, take_picture
@@ -91,6 +92,7 @@ def predict(
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         folder = TensorFolder.open(tensor_folder(root, load(root), settings))
+        terminal.print_origin(describe_synthetic(folder.origins))
         samples = _find_samples(folder, sample, vehicle, time)
         parts = _list_parts(folder, samples) if samples else frozenset({part})
         forecasters = _open_forecasters(terminal, models or [], folder, root / MODELS, parts, alone=all_vehicles)

@@ -26,6 +26,7 @@ from tracklake.pipeline.sources.highd_plan import announce_subsets
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
 from tracklake.pipeline.transforms.splits.tables import Allocation
 from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.origin import describe_synthetic
 
 FORMATS = ("table", "csv", "json")
 
@@ -98,6 +99,7 @@ def _plan_split(
         seed=settings.split_seed,
     )
     parts = subsets.join(allocation.splits.select("dataset", "subset", "part"), on=["dataset", "subset"])
+    terminal.print_origin(describe_synthetic(dict(subsets.select("subset", "origin").iter_rows())))
     parts = parts.select(SHOWN).sort("dataset", "subset")
     _show_plan(terminal, parts, allocation, form, out)
     record: dict[str, Any] = {

@@ -7,6 +7,7 @@ from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.lake import connect
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.quality_reports.summaries import query
+from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
 
 
@@ -25,6 +26,7 @@ def show_result(terminal: Terminal, result: RunResult) -> None:
 
 def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
     """Print the report's figures, its path, and two commands to try next."""
+    terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]}))
     head = quality["headline"]
     excluded, judged = _format_count(head["excluded_subsets"]), head["eligible_starts"]
     late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"

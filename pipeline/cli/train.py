@@ -22,6 +22,8 @@ from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS as RUNS
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.origin import describe_synthetic
+from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Model
 from tracklake.training.runs.config import RECIPE_SETTINGS, TrainConfig
 from tracklake.training.train import TrainingInterruptedError
@@ -91,6 +93,7 @@ def train(
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
+        terminal.print_origin(describe_synthetic(TensorFolder.open(tensors).origins))
         out = found.lake / RUNS / run_name
 
         try:

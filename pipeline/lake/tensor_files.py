@@ -29,7 +29,8 @@ def write_tensors(
 
     Args:
         folder: exists and is empty; the lake makes it visible, whole, afterwards.
-        subsets: facts (dataset, subset, frame_rate_hz, lane_markings_m) and tensors of each, in the split's order.
+        subsets: facts (dataset, subset, origin, frame_rate_hz, lane_markings_m) and tensors of each, in the split's
+            order.
         splits: the split's rows of `schemas.splits.SPLITS`.
         protocol: of the samples.
         storage: of positions, one of `schemas.tensors.POSITION_STORAGES`, as `subsets` were built.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, HIGHD_FORMAT, read_metadata
+from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, HIGHD_FORMAT, find_origin, read_metadata
 from tracklake.pipeline.sources.levelx import RECORDING, VEHICLES
 from tracklake.pipeline.sources.source import RawFile, SourceError
 from tracklake.pipeline.transforms.splits.tables import COLUMNS
@@ -16,8 +16,8 @@ class Announcement:
     """The subsets that metadata files announce.
 
     Args:
-        subsets: one row per carriageway with vehicles: the columns of `splits.tables.COLUMNS`, `recording`, `lanes`
-            and `seconds`. `weight` is the sum of numFrames.
+        subsets: one row per carriageway with vehicles: the columns of `splits.tables.COLUMNS`, `recording`, `origin`,
+            `lanes` and `seconds`. `weight` is the sum of numFrames.
         refusals: messages about recordings that cannot be used.
     """
 
@@ -57,7 +57,7 @@ def announce_subsets(files: Sequence[RawFile]) -> Announcement:
                 seen.add(recording)
             except SourceError as damage:
                 refusals.append(str(damage))
-    schema = {**COLUMNS, "recording": pl.String, "lanes": pl.Int64, "seconds": pl.Float64}
+    schema = {**COLUMNS, "recording": pl.String, "origin": pl.String, "lanes": pl.Int64, "seconds": pl.Float64}
     return Announcement(pl.DataFrame(rows, schema=schema), tuple(refusals))
 
 
@@ -81,6 +81,7 @@ def _describe_carriageways(files: dict[str, RawFile], recording: str) -> list[di
                 "first_frame": FIRST_FRAME,
                 "last_frame": own["finalFrame"].max() or FIRST_FRAME,
                 "recording": recording,
+                "origin": find_origin(meta),
                 "lanes": lanes[direction],
                 "seconds": meta["duration"],
             }

@@ -5,17 +5,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Manifest, connect
+import polars as pl
+
+from tracklake.pipeline.lake import Manifest, connect, scan
 from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
 from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_report_file
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
-from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
+from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE
 from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.schemas import SUBSETS
 from tracklake.schemas.files import remove_unfinished
 from tracklake.schemas.hashing import hash_chunks
 
@@ -72,7 +75,8 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     from tracklake.quality_reports.pages.report import build_report
 
     root, manifest, built_from = reader.root, reader.manifest, reader.job.built_from
-    datasets = {commit.info["dataset"] for commit in manifest.of_stage(INGEST) if commit.info["subsets"]}
+    recorded = scan(root, manifest, SUBSETS).filter(pl.col("origin") == "recorded").select("dataset").collect()
+    datasets = set(recorded["dataset"])
     provenance = {
         **{"lake": None, "lake_id": manifest.lake_id, **describe_origin(root)},
         "python": platform.python_version(),
@@ -109,7 +113,7 @@ STAGE = Stage(
     scope="lake",
     after=(),  # the report shows what there is
     settings=(_describe_settings,),
-    version=4,
+    version=5,
     build=build,
     extra_inputs=_find_inputs,
 )

@@ -112,7 +112,7 @@ STAGE = Stage(
     scope="lake",
     after=(INGEST, "validate", "samples", "split"),
     settings=(_describe_settings,),
-    version=5,
+    version=6,
     build=build,
 )
 

@@ -13,7 +13,7 @@ Key = tuple[int, int]
 """Key of an entry: vehicle and frame."""
 
 HIGH_ACCELERATION_MPS2 = 3.05
-LOW_SPEED_MPS = 1.52
+LOW_SPEED_MPS = 1.524
 JUMP_M = 2.0
 SPEED_DIFFERENCE_MPS = 1.0
 HIGH_JERK_MPS3 = 15.0

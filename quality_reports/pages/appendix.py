@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from tracklake.quality_reports.pages.rendering import label_sums
-from tracklake.quality_reports.published import is_comparable
 from tracklake.quality_reports.summaries import Row
 from tracklake.schemas.quality import Quality
 from tracklake.schemas.quality_tracks import PublishedFigures
@@ -65,15 +64,8 @@ def count_errors(quality: Quality) -> list[Row]:
 
 
 def _index_published(quality: Quality) -> dict[tuple[str, str | None], PublishedFigures]:
-    """Return the published figures of what the lake holds, by (dataset, subset).
-
-    NGSIM's freeway recordings are one subset each, of the same name.
-    """
-    held: dict[str, set[str]] = {}
-    for row in quality["subsets"]:
-        held.setdefault(row["dataset"], set()).add(row["recording"])
-    figures = quality["published"]["figures"]
-    return {(row["dataset"], row["recording"]): row for row in figures if is_comparable(row, held)}
+    """Return the published figures by (dataset, subset); NGSIM's recordings are one subset each, of the same name."""
+    return {(row["dataset"], row["recording"]): row for row in quality["published"]["figures"]}
 
 
 def _count_published(figures: Mapping[str, Any]) -> Row:

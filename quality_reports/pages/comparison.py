@@ -18,7 +18,15 @@ def render_comparison(compared: Row, report: str | None = None) -> str:
     environment = make_environment()
     environment.filters.update(value=format_value, difference=format_difference)
     sides = {side: {"lake": "", "lake_id": "", "compared": "", **compared[side]} for side in ("then", "now")}
-    return environment.get_template("compare.html.j2").render(**{**compared, **sides}, counted=COUNTED, report=report)
+    return environment.get_template("compare.html.j2").render(
+        **{**compared, **sides}, counted=COUNTED, report=report, banner=describe_sides(compared)
+    )
+
+
+def describe_sides(compared: Row) -> str | None:
+    """Describe what is synthetic in each of two compared lakes; None where nothing is."""
+    texts = [f"{side}: {compared[side]['synthetic']}" for side in ("now", "then") if compared[side].get("synthetic")]
+    return " ".join(texts).capitalize() if texts else None
 
 
 def format_value(value: object) -> str:

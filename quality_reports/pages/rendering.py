@@ -9,6 +9,9 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.quality import Quality
+
 DASH = "\N{EN DASH}"
 """Text of a number that is unknown or was not computed."""
 
@@ -36,6 +39,11 @@ def make_environment() -> jinja2.Environment:
     style = (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
     environment.globals["style"] = Markup(style)
     return environment
+
+
+def describe_origins(quality: Quality) -> str | None:
+    """Describe what of the lake is synthetic; None where nothing is."""
+    return describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]})
 
 
 def label_sums(row: Mapping[str, Any]) -> dict[str, Any]:

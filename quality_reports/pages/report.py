@@ -11,7 +11,7 @@ from markupsafe import Markup
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
 from tracklake.quality_reports.pages.assessments import tabulate_assessments
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
-from tracklake.quality_reports.pages.rendering import flatten, make_environment
+from tracklake.quality_reports.pages.rendering import describe_origins, flatten, make_environment
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.rules.registry import RULES, Rule
@@ -71,6 +71,7 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
         .get_template("report.html.j2")
         .render(
             **quality,
+            banner=describe_origins(quality),
             drawings=_draw_plots(quality),
             stage={row["stage"]: row for row in quality["stages"]},
             found_in={

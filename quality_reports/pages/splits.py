@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
-from tracklake.quality_reports.pages.rendering import make_environment
+from tracklake.quality_reports.pages.rendering import describe_origins, make_environment
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.summaries import Row
 from tracklake.schemas.quality import Quality, SplitBalance, Splits
@@ -35,6 +35,7 @@ def render_splits(quality: Quality) -> str | None:
         .get_template("splits.html.j2")
         .render(
             provenance=quality["provenance"],
+            banner=describe_origins(quality),
             compared=compared,
             shared_plot=Markup(plots.draw_shared(_list_shares(compared), names)) if compared else None,
             shift_plot=Markup(plots.draw_shifts(shifts, names)) if shifts else None,

@@ -13,6 +13,7 @@ from tracklake.quality_reports.plots.flow import draw_flow
 from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, make_grid
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.quality import Quality
 from tracklake.schemas.quality_tracks import SubsetFacts
 
@@ -54,6 +55,7 @@ def render_pages(
             template.render(
                 subset=subset,
                 provenance=quality["provenance"],
+                banner=describe_synthetic({subset["subset"]: subset["origin"]}),
                 **content,
             ),
         )

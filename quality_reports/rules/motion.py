@@ -9,7 +9,7 @@ HIGH_ACCELERATION = Rule(
     severity="warning",
     unit="m/s2",
     thresholds=(Threshold("high_acceleration_mps2", 3.05, "m/s2"),),
-    meaning="the recorded acceleration exceeds the threshold (10 ft/s²)",
+    meaning="the recorded acceleration exceeds the threshold (10 ft/s², rounded up)",
     source=f"{DESIGN}; implausible accelerations in NGSIM: {PUNZO}",
     breaks=lambda limits: pl.col("accel_mps2") > recorded(limits["high_acceleration_mps2"]),
     value=pl.col("accel_mps2"),
@@ -22,9 +22,9 @@ LOW_CONSTANT_SPEED = Rule(
     name="low_constant_speed",
     severity="warning",
     unit="m/s",
-    thresholds=(Threshold("low_constant_speed_mps", 1.52, "m/s"),),
-    meaning="the recorded speed is above zero and at most the threshold (5 ft/s) while the recorded acceleration "
-    "is exactly zero: a frozen measurement rather than a crawling vehicle",
+    thresholds=(Threshold("low_constant_speed_mps", 1.524, "m/s"),),
+    meaning="the recorded speed is above zero and at most the threshold (5 ft/s exactly) while the recorded "
+    "acceleration is exactly zero: a frozen measurement rather than a crawling vehicle",
     source=DESIGN,
     breaks=lambda limits: (
         (pl.col("speed_mps") > 0)
@@ -34,7 +34,7 @@ LOW_CONSTANT_SPEED = Rule(
     value=pl.col("speed_mps"),
     extreme="min",
     compared="as recorded, in single precision",
-    case=Case({"speed_mps": (0.0, 1.52, 1.53, 1.0), "accel_mps2": (0.0, 0.0, 0.0, 0.01)}, breaks=(1,)),
+    case=Case({"speed_mps": (0.0, 1.524, 1.525, 1.0), "accel_mps2": (0.0, 0.0, 0.0, 0.01)}, breaks=(1,)),
 )
 
 BACKWARD = Rule(

@@ -8,7 +8,7 @@ windows AS (
     FROM missing_starts GROUP BY dataset, subset
 )
 SELECT
-    subsets.dataset, subsets.subset, recording, site, direction, freeway, frame_rate_hz, lanes, seconds,
+    subsets.dataset, subsets.subset, recording, site, origin, direction, freeway, frame_rate_hz, lanes, seconds,
     vehicles, subsets.entries, flow_vphpl, vehicles_per_lane_s, ids_split, columns_missing, mean_speed_mps, mean_x_m,
     backward_vehicles, excluded, excluded_reason,
     cutoff_m, eligible AS eligible_starts, late AS late_starts, fully_tracked, frames_missing,

@@ -11,7 +11,8 @@ vehicles_announced AS (FROM announced WHERE measure = 'vehicles'),
 entries_announced AS (FROM announced WHERE measure = 'entries'),
 held AS (
     SELECT
-        dataset, recording, any_value(site ORDER BY subset) AS site, count(*) AS subsets, max(seconds) AS seconds,
+        dataset, recording, any_value(site ORDER BY subset) AS site, any_value(origin) AS origin,
+        count(*) AS subsets, max(seconds) AS seconds,
         sum(vehicles)::BIGINT AS vehicles, sum(entries)::BIGINT AS entries
     FROM subsets GROUP BY dataset, recording
 )

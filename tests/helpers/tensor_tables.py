@@ -102,7 +102,8 @@ def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=
     found = FINDINGS.empty() if findings is None else findings
     rate = 5.0 * protocol.rate_hz
     for subset, clock, samples, neighbors in tables:
-        facts = {"dataset": "highd", "subset": subset, "frame_rate_hz": rate, "lane_markings_m": markings}
+        facts = {"dataset": "highd", "subset": subset, "origin": "recorded", "frame_rate_hz": rate}
+        facts["lane_markings_m"] = markings
         yield (
             facts,
             build_subset_tensors(

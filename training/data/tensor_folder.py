@@ -122,6 +122,11 @@ class TensorFolder:
         return scene
 
     @property
+    def origins(self) -> dict[str, str]:
+        """Origin, recorded or synthetic, of each subset by name (`dataset/subset`)."""
+        return {f"{named['dataset']}/{named['subset']}": named["origin"] for named in self.index["subsets"]}
+
+    @property
     def split(self) -> str:
         """Name of the split."""
         return str(self.index["split"])

@@ -12,6 +12,7 @@ import polars as pl
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
+from tracklake.schemas.origin import DataOrigin, summarise_origins
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
@@ -35,13 +36,14 @@ class Evaluation:
     """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
     `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
-    `latency` is empty where it was not measured.
+    `latency` is empty where it was not measured. `data_origin` is of all subsets of the tensors.
     """
 
     model: str
     part: str
     split: str
     protocol: Protocol
+    data_origin: DataOrigin
     samples: int
     vehicles: int
     scores: tuple[Score, ...]
@@ -56,14 +58,15 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to plain values for JSON; of the scores `horizons` alone, without the keys they share."""
-        values = {name: getattr(self, name) for name in ("model", "part", "split", "protocol", "samples", "vehicles")}
+        names = ("model", "part", "split", "protocol", "data_origin", "samples", "vehicles")
+        values = {name: getattr(self, name) for name in names}
         shared = {"dataset", "group", "average"}
         rows = [{name: value for name, value in asdict(own).items() if name not in shared} for own in self.horizons]
         return values | {"protocol": self.protocol.name, "horizons": rows}
 
     def to_table(self) -> pl.DataFrame:
         """Convert to rows of `schemas.evaluations.EVALUATIONS`."""
-        shared = {name: getattr(self, name) for name in ("split", "part", "model", "nearest")} | {
+        shared = {name: getattr(self, name) for name in ("split", "part", "model", "nearest", "data_origin")} | {
             "protocol": self.protocol.name,
             "protocol_digest": self.protocol.digest,
             "origin": "measured",
@@ -157,6 +160,7 @@ def measure_errors(
         part=part,
         split=folder.split,
         protocol=protocol,
+        data_origin=summarise_origins(folder.origins.values()),
         samples=len(samples),
         vehicles=int(strata.vehicle[-1]) + 1,
         scores=tally.score(at, protocol.rate_hz),

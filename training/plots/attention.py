@@ -157,7 +157,7 @@ def draw_attention(shown: AttentionMap) -> Drawing:
         "boxes": [row for head in heads for row in list_boxes(shown, head)],
         "weights": [row for head in heads for row in list_weights(shown, head)],
     }
-    title = f"Attention of vehicle {picture.own.vehicle_id} of {picture.dataset} {picture.subset}"
+    title = f"Attention of vehicle {picture.own.vehicle_id} of {picture.place}"
     title = f"{title} at {picture.time_s:.1f} s (sample {picture.sample}, {picture.part})"
     subtitle = [
         f"true maneuver: {picture.lateral}, {picture.longitudinal}. The road: the ego's attention in the encoder to "

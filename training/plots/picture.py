@@ -122,6 +122,7 @@ class Picture:
     Args:
         sample: number of the sample.
         part: part of the split that holds the sample.
+        origin: recorded or synthetic.
         time_s: seconds since the recording began.
         lateral: true lateral maneuver; `longitudinal` likewise.
         markings_m: y of the lanes' borders, from the left edge to the right one.
@@ -134,6 +135,7 @@ class Picture:
     split: str
     dataset: str
     subset: str
+    origin: str
     time_s: float
     rate_hz: int
     lateral: str
@@ -141,6 +143,11 @@ class Picture:
     markings_m: tuple[float, ...]
     marked: bool
     vehicles: tuple[Vehicle, ...]
+
+    @property
+    def place(self) -> str:
+        """Dataset and subset, as drawings name them: `synthetic` where traffic was generated."""
+        return f"{'synthetic ' if self.origin == 'synthetic' else ''}{self.dataset} {self.subset}"
 
     @property
     def own(self) -> Vehicle:
@@ -196,6 +203,7 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
         split=folder.split,
         dataset=facts["dataset"],
         subset=facts["subset"],
+        origin=facts["origin"],
         time_s=tick / folder.protocol.rate_hz,
         rate_hz=folder.protocol.rate_hz,
         lateral=LATERAL_MANEUVERS[folder.sample_lateral[sample]],

@@ -70,7 +70,7 @@ def draw_picture(picture: Picture) -> Drawing:
     vehicles = _draw_vehicles(to, present, f"vehicle {picture.own.vehicle_id}")
     road = alt.layer(*_draw_road(to), *vehicles, *_draw_paths(to), width=WIDTH, height=height)
     maneuvers, marks = describe_maneuvers(picture), describe_marks(picture, view)
-    name = f"{picture.dataset} {picture.subset}, vehicle {picture.own.vehicle_id} at {picture.time_s:.1f} s"
+    name = f"{picture.place}, vehicle {picture.own.vehicle_id} at {picture.time_s:.1f} s"
     title = alt.Title(f"{name} (sample {picture.sample}, {picture.part})", subtitle=[*maneuvers, *marks], offset=14)
     errors = alt.hconcat(*(_draw_error(to, error, picture.own.has_density) for error in ERRORS), spacing=ERROR_GAP)
     return Drawing(alt.vconcat(road, errors, title=title, spacing=18), rows)

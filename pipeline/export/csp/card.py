@@ -38,6 +38,7 @@ def write_card(path: Path, export: CspExport) -> None:
         f"Written by tracklake {version('tracklake')}: `tracklake {' '.join(('export csp', *options))}`, in the format",
         "of conv-social-pooling (Deo and Trivedi 2018, github.com/nachiket92/conv-social-pooling).",
         "",
+        *([f"**{export.synthetic}**", ""] if export.synthetic else []),
         CLEAN if export.options.clean else ORIGINAL,
         "| file | samples | tracks with samples | tracks | entries of tracks |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -56,8 +57,9 @@ def write_card(path: Path, export: CspExport) -> None:
         if any(counts):
             lines.append(f"| {reason} | " + " | ".join(f"{count:,}" for count in counts) + f" | {meaning} |")
     lines += ["", *_describe_left_out(export), "Data sets, by the first column of `traj` and the row of `tracks`:", ""]
-    lines += ["| id | data set | subset | recording |", "| ---: | --- | --- | --- |"]
-    lines += [f"| {row['id']} | {row['dataset']} | {row['subset']} | {row['recording']} |" for row in export.datasets]
+    lines += ["| id | data set | subset | recording | origin |", "| ---: | --- | --- | --- | --- |"]
+    names = ("id", "dataset", "subset", "recording", "origin")
+    lines += [f"| {' | '.join(str(row[name]) for name in names)} |" for row in export.datasets]
     lines += ["", COLUMNS, *(f"- note: {note}" for note in export.notes)]
     path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 

@@ -45,6 +45,9 @@ LAST_LANES = {"us-101": 6}
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 """Columns of tracks that the export reads."""
 
+DESCRIBED = ("dataset", "subset", "recording", "origin")
+"""Facts of each data set that the card lists."""
+
 _NEEDS = "A sample needs lanes, 3.0 s of track before it and 0.2 s after; DESIGN describes what --clean drops."
 
 
@@ -125,7 +128,7 @@ def _prepare_all(
             why = "entries without a lane" if reason == NO_LANE else "excluded by validation"
             export.notes.append(f"{facts['subset']}: left out ({why}: {clock.height:,} entries)")
         else:
-            export.datasets.append({"id": facts["dataset_id"], **values, "recording": facts["recording"]})
+            export.datasets.append({"id": facts["dataset_id"], **{name: facts[name] for name in DESCRIBED}})
             if context is not None:
                 subset = prepare_clean_subset(clock, context, recorded, full_future=options.full_future)
             else:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.transforms.csp.parts import REASONS
+from tracklake.schemas.origin import describe_synthetic
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class CspExport:
         options: options of the export.
         files: counts of each file, one per part.
         rows: number of rows of `tracks`.
-        datasets: id, dataset, subset and recording of each row of `tracks` that is not empty.
+        datasets: id, dataset, subset, recording and origin of each row of `tracks` that is not empty.
         left_out: entries that are in no file, by reason.
         overwritten: neighbors lost because a later row had the same cell (without --clean).
         collisions: neighbors whose cell was taken (with --clean); all but `crowded_out` moved to another cell.
@@ -62,6 +63,11 @@ class CspExport:
     collisions: int = 0
     crowded_out: int = 0
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def synthetic(self) -> str | None:
+        """Description of what is synthetic; None where all was recorded."""
+        return describe_synthetic({f"{row['dataset']}/{row['subset']}": row["origin"] for row in self.datasets})
 
     def count_drops(self) -> dict[str, int]:
         """Count entries that are no samples by reason, in all files and in none."""

@@ -77,6 +77,7 @@ def write_card(path: Path, export: WindowsExport, folder: TensorFolder, facts: p
         "",
         f"Written by tracklake {version('tracklake')}: `{command}{' --absolute' if export.absolute else ''}`.",
         "",
+        *([f"**{export.synthetic}**", ""] if export.synthetic else []),
         *_describe_counts(export, folder),
         *_describe_provenance(facts),
         *_describe_protocol(folder),
@@ -100,6 +101,8 @@ def _describe_counts(export: WindowsExport, folder: TensorFolder) -> list[str]:
         counts = f"{export.samples[part]:,} | {export.neighbors[part]:,}"
         lines.append(f"| {part}.{export.format} | {counts} | {subsets} |")
     lines += ["", "## Licence", "", *(f"- {note}" for note in export.notes), ""]
+    if all(origin == "synthetic" for origin in folder.origins.values()):
+        return lines
     return [
         *lines,
         "Windows are the recordings' data in another form: each data set's licence applies to them too.",
@@ -118,7 +121,7 @@ def _describe_provenance(facts: pl.DataFrame) -> list[str]:
         for file in row["source_files"] or [{"file": "-", "sha256": "-"}]:
             subset = f"{row['dataset']}/{row['subset']} | {row['recording']} | {row['vehicles']:,}"
             lines.append(f"| {subset} | {file['file']} | {file['sha256']} |")
-    used = set(facts["dataset"])
+    used = set(facts.filter(pl.col("origin") == "recorded")["dataset"])
     cited = [line for source in SOURCES if source.name in used for line in (f"Cite: {source.citation}", "")]
     return [*lines, "", *cited]
 

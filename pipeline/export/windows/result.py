@@ -23,7 +23,8 @@ class WindowsExport:
         samples: number of samples by part.
         neighbors: number of neighbors by part.
         files: names of the files.
-        notes: messages for the user.
+        notes: licences of the datasets.
+        synthetic: description of what is synthetic; None where all was recorded.
     """
 
     out: Path
@@ -33,6 +34,7 @@ class WindowsExport:
     neighbors: dict[str, int]
     files: tuple[str, ...]
     notes: tuple[str, ...]
+    synthetic: str | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain values."""

@@ -17,7 +17,7 @@ def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[st
     """Describe a subset by `schemas.tensors.SUBSET_KEYS`.
 
     Args:
-        facts: dataset, subset, frame_rate_hz, lane_markings_m (null = unknown).
+        facts: dataset, subset, origin, frame_rate_hz, lane_markings_m (null = unknown).
         tensors: tensors of the subset.
     """
     markings = facts["lane_markings_m"]
@@ -25,6 +25,7 @@ def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[st
     return {
         "dataset": facts["dataset"],
         "subset": facts["subset"],
+        "origin": facts["origin"],
         "frame_rate_hz": facts["frame_rate_hz"],
         "centre_m": list(tensors.centre_m),
         "lane_markings_m": list(markings) if markings else None,

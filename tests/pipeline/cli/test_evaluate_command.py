@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 from io import StringIO
+from unittest import mock
 
 import polars as pl
 import pytest
@@ -17,6 +18,13 @@ from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 
 
+@pytest.fixture
+def comparable():
+    """Makes the commands take the sample's recordings for recorded and complete ones."""
+    with mock.patch("tracklake.pipeline.cli.comparability.explain_gap", return_value=None):
+        yield
+
+
 @pytest.fixture(scope="module")
 def said(command, lake, tmp_path_factory):
     """The baseline, by name: nothing is written into the lake."""
@@ -26,8 +34,23 @@ def said(command, lake, tmp_path_factory):
     return json.loads(done.out), pl.read_parquet(out)
 
 
-def test_the_table_holds_measured_rows_and_published_ones_marked_as_such(said):
+def test_scores_of_synthetic_data_say_so_and_have_no_published_rows(command, lake, said):
     answer, table = said
+    assert answer["synthetic"].startswith("Synthetic data: all")
+    assert answer["evaluations"][0]["data_origin"] == "synthetic"
+    assert table["origin"].unique().to_list() == ["measured"]
+    assert table["data_origin"].unique().to_list() == ["synthetic"]
+    out = command.here("evaluate", "constant-velocity", "--lake", lake.root).out
+    assert out.startswith("Synthetic data: all")
+    assert "note: no published figures beside ngsim (us-101-20050615-093000: it is synthetic" in out
+    assert "published [" not in out
+
+
+@pytest.mark.usefixtures("comparable")
+def test_the_table_holds_measured_rows_and_published_ones_marked_as_such(command, lake, tmp_path):
+    out = tmp_path / "table.parquet"
+    done = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--out", out, "--json")
+    answer, table = json.loads(done.out), pl.read_parquet(out)
     assert answer["rows"] == EVALUATIONS.validate(table, where="here").to_dicts()
     measured, published = (table.filter(origin=origin) for origin in ("measured", "published"))
     assert measured["model"].unique().to_list() == ["constant-velocity"]
@@ -65,13 +88,14 @@ def list_files(lake):
     return {path: path.stat().st_mtime_ns for path in (lake.root / "evaluations").glob("*")}
 
 
+@pytest.mark.usefixtures("comparable")
 def test_what_a_person_reads(command, lake):
     before = list_files(lake)
     call = ("evaluate", "constant-velocity", "--lake", lake.root)
     done = command.here(*call)
     assert done.code == 0, done.err
     lines = done.out.splitlines()
-    assert re.match(r"eval of flow-balanced, protocol csp \(\w{12}\): [\d,]+ samples of [\d,]+ vehicles$", lines[0])
+    assert re.match(r"eval of flow-balanced, protocol csp \(\w{12}\): [\d,]+ samples of [\d,]+ vehicles$", lines[1])
     headings = [line.split() for line in lines if "1 s" in line]
     assert headings == [["1", "s", "2", "s", "3", "s", "4", "s", "5", "s"]] * 3, "of all, and of each data set"
     counts = [line.split() for line in lines if line.startswith("n ")]

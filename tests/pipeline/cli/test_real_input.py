@@ -50,3 +50,11 @@ def test_all_excerpts_at_once(command, excerpts_lake):
     assert about == [
         "us-101-0750: 155,611 of 1,180,598 published rows (13.1 %) and 292 of 2,169 vehicles: an excerpt, or incomplete"
     ]
+    quality = json.loads((excerpts_lake.root / "reports/quality.json").read_text())
+    assert quality["published"]["figures"] == [], "these are excerpts"
+    reasons = {row["recording"]: row["reason"] for row in quality["published"]["left_out"]}
+    assert reasons["us-101-0750"] == "the lake holds 292 of 2,169 vehicles and 155,611 of 1,180,598 rows"
+    assert list(quality["provenance"]["data"]) == ["ngsim"]
+    assert {row["origin"] for row in quality["subsets"]} == {"recorded"}
+    assert "synthetic" not in said
+    assert 'class="banner"' not in (excerpts_lake.root / "reports/index.html").read_text()

@@ -288,3 +288,22 @@ def test_dask_workers_make_the_same_lake(command, tmp_path):
         for table in ("tracks", "vehicles", "subsets"):
             query = f"SELECT * FROM {table} ORDER BY ALL"
             assert one.sql(query).pl().equals(other.sql(query).pl()), table
+
+
+def test_everything_made_of_the_sample_says_that_it_is_synthetic(command, lake, tmp_path):
+    assert lake.said["synthetic"].startswith("Synthetic data: all")
+    pages = list((lake.root / "reports").rglob("*.html"))
+    assert len(pages) > 11
+    for page in pages:
+        assert '<p class="banner" role="note">Synthetic data: ' in page.read_text(), page
+    quality = json.loads((lake.root / "reports/quality.json").read_text())
+    assert quality["provenance"]["data"] == {}, "no licence and no citation of the data sets"
+    assert quality["published"]["figures"] == []
+    assert {row["origin"] for row in quality["subsets"] + quality["recordings"]} == {"synthetic"}
+    for form, card in (("npz", "README.md"), ("csp", "DATA_CARD.md")):
+        done = command.here("export", form, "--lake", lake.root, "--out", tmp_path / form)
+        assert done.code == 0, done.err
+        assert done.out.startswith("Synthetic data: ")
+        text = (tmp_path / form / card).read_text()
+        assert "**Synthetic data: all" in text
+        assert not [word for word in ("Cite: ", "public domain", "levelXdata", "licence applies") if word in text]

@@ -36,8 +36,8 @@ def test_subsets_by_hand(tmp_path):
     assert announced.refusals == ()
     rate = pytest.approx(2 / 2 / 901.56)
     assert announced.subsets.rows() == [
-        ("highd", "01-upper", "location-3", "upper", 2, 4, rate, 1, 2, "01", 2, 901.56),
-        ("highd", "01-lower", "location-3", "lower", 2, 3, rate, 1, 2, "01", 2, 901.56),
+        ("highd", "01-upper", "location-3", "upper", 2, 4, rate, 1, 2, "01", "recorded", 2, 901.56),
+        ("highd", "01-lower", "location-3", "lower", 2, 3, rate, 1, 2, "01", "recorded", 2, 901.56),
     ]
 
 

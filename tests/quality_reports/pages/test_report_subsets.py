@@ -304,17 +304,27 @@ def test_the_published_figures_add_up():
     assert f"{whole['ngsim']['slow_vehicles'] / whole['ngsim']['vehicles']:.2%}" == "3.30%"
 
 
-def test_published_figures_stand_beneath_known_recordings_only(open_lake, small_lake, report):
-    assert not [row for row in compare_speeds(report.quality) if row["is_published"]], "no known recording"
+def open_us_101(open_lake, small_lake, *, vehicles=2169, entries=1180598, origin="recorded"):
+    """A lake with one entry of the recording, which is said to hold so many vehicles and entries."""
     known = {"dataset": "ngsim", "subset": "us-101-0750"}
+    announced = {"dataset": "ngsim", "recording": "us-101-0750", "authority": "published"}
     arterial = next(row for row in small_lake["subsets"] if row["dataset"] == "ngsim")
-    lake = open_lake(
+    facts = {"recording": "us-101-0750", "freeway": True, "columns_missing": [], "origin": origin}
+    return open_lake(
         tracks=[{**known, "vehicle_id": 1, "frame": 1, "time_s": 0.0, "x_m": 0.0, "y_m": 0.0, "speed_mps": 5.0}],
-        subsets=[{**arterial, **known, "recording": "us-101-0750", "freeway": True, "columns_missing": []}],
+        subsets=[{**arterial, **known, **facts}],
         subset_status=[{**known, "backward_vehicles": 0, "excluded": False}],
         findings=[{**a_finding("low_constant_speed", 1, 1, 1, 1.0, "warning"), **known}],
+        completeness=[
+            {**announced, "measure": "vehicles", "expected": 2169, "found": vehicles},
+            {**announced, "measure": "entries", "expected": 1180598, "found": entries},
+        ],
     )
-    page = build_report(lake, {})
+
+
+def test_published_figures_stand_beneath_complete_recordings(open_lake, small_lake, report):
+    assert not [row for row in compare_speeds(report.quality) if row["is_published"]], "no known recording"
+    page = build_report(open_us_101(open_lake, small_lake), {})
     speeds = [(row["label"], row["median_mps"]) for row in compare_speeds(page.quality)]
     assert speeds == [("all of ngsim", 5.0), ("us-101-0750", 5.0), ("published", 11.96)], "of one of six recordings"
     *_, found, published = count_errors(page.quality)
@@ -323,6 +333,25 @@ def test_published_figures_stand_beneath_known_recordings_only(open_lake, small_
     assert (published["headway_entries"], published["headway_entry_share"]) == (1912, 1912 / 1180598)
     assert published["acceleration_vehicles"] is None
     assert '<th scope="row">published</th>' in page.html
+    assert "left out" not in page.html.partition('id="speeds"')[2].partition("</section>")[0]
+    assert 'class="banner"' not in page.html
+
+
+@pytest.mark.parametrize(
+    ("held", "reason"),
+    [
+        ({"vehicles": 290, "entries": 155_604}, "the lake holds 290 of 2,169 vehicles and 155,604 of 1,180,598 rows"),
+        ({"entries": 1_180_597}, "the lake holds 1,180,597 of 1,180,598 rows"),
+        ({"entries": 1_180_600}, "the lake holds 1,180,600 of 1,180,598 rows"),
+        ({"origin": "synthetic"}, "it is synthetic"),
+    ],
+)
+def test_an_excerpt_or_a_synthetic_recording_has_no_published_figures_beneath_it(open_lake, small_lake, held, reason):
+    page = build_report(open_us_101(open_lake, small_lake, **held), {})
+    assert page.quality["published"]["figures"] == []
+    assert [row["label"] for row in compare_speeds(page.quality)] == ["all of ngsim", "us-101-0750"]
+    assert f"The published figures of us-101-0750 are left out: {reason}." in page.html
+    assert ('class="banner"' in page.html) == ("origin" in held)
 
 
 def test_every_colour_of_our_own_drawings_follows_the_theme(open_lake, road):

@@ -42,7 +42,7 @@ def judge(rule: str, speed: float, accel: float | None, gap: float | None) -> fl
     if rule == "high_acceleration":
         return accel if accel is not None and accel > float32(3.05) else None
     if rule == "low_constant_speed":
-        return speed if 0 < speed <= float32(1.52) and accel == 0 else None
+        return speed if 0 < speed <= float32(1.524) and accel == 0 else None
     return speed if speed < 0 else None
 
 
@@ -71,7 +71,7 @@ def as_tuples(findings: pl.DataFrame) -> list[tuple]:
     return findings.select(columns).rows()
 
 
-speeds = st.sampled_from([-1.5, -0.01, 0.0, 0.5, 1.52, 1.53, 30.0]).map(float32)
+speeds = st.sampled_from([-1.5, -0.01, 0.0, 0.5, 1.524, 1.53, 30.0]).map(float32)
 accelerations = st.none() | st.sampled_from([-9.0, 0.0, 3.04, 3.05, 3.06, 9.0]).map(float32)
 gaps = st.none() | st.sampled_from([-4.0, -0.001, 0.0, 12.0])
 

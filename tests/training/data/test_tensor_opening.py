@@ -81,8 +81,8 @@ def test_the_protocol_is_read_as_it_was_written(tmp_path):
     [
         (lambda folder: (folder / INDEX_FILE).unlink(), r"no tensors here \(no index.json\); run `tracklake tensors`"),
         (lambda folder: (folder / INDEX_FILE).write_text("{"), "index.json: not readable as JSON"),
-        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 4 of tensors, got list"),
-        (change_index(version=1), "expected version 4 of tensors, got 1; run `tracklake tensors` again"),
+        (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 5 of tensors, got list"),
+        (change_index(version=1), "expected version 5 of tensors, got 1; run `tracklake tensors` again"),
         (drop_key, "index.json: lacks blocks, subsets: width_m; run"),
         (change_index(protocol={"name": "x"}), "expected a protocol of drop_error_findings, .*, got name"),
         (change_index(storage="float16"), "expected storage float32 or .*, got 'float16'"),

@@ -207,7 +207,14 @@ def test_more_rows_than_their_numbers_hold_are_refused():
         join_after(build(), dict.fromkeys("NRSKCM", 2**31 - 5), 1)
 
 
-FACTS = {"dataset": "highd", "subset": "a", "frame_rate_hz": 25.0, "lane_markings_m": None, "more": 1}
+FACTS = {
+    "dataset": "highd",
+    "subset": "a",
+    "origin": "recorded",
+    "frame_rate_hz": 25.0,
+    "lane_markings_m": None,
+    "more": 1,
+}
 
 
 def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
@@ -219,8 +226,8 @@ def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
     assert index["protocol"]["name"] == "p"
     assert index["protocol"]["digest"] == P.digest
     unmarked = {
-        "dataset": "highd", "subset": "a", "frame_rate_hz": 25.0, "centre_m": [0, 0], "lane_markings_m": None,
-        "last_lane": 2, "width_m": 7.3152,
+        "dataset": "highd", "subset": "a", "origin": "recorded", "frame_rate_hz": 25.0, "centre_m": [0, 0],
+        "lane_markings_m": None, "last_lane": 2, "width_m": 7.3152,
     }  # fmt: skip
     assert index["subsets"][0] == unmarked
     assert index["subsets"][1] == unmarked | {

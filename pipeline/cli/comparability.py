@@ -1,0 +1,48 @@
+"""Whether published figures may stand beside scores: only where data were recorded and recordings are complete."""
+
+from pathlib import Path
+from typing import cast
+
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.lake import connect, load, scan
+from tracklake.quality_reports.published import explain_gap
+from tracklake.quality_reports.summaries import query
+from tracklake.schemas import SUBSETS
+from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.quality_tracks import RecordingFacts
+from tracklake.training.data.tensor_folder import TensorFolder
+
+
+def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *, published: bool) -> tuple[str, ...]:
+    """Print what is synthetic, and which datasets have no published figures beside them and why.
+
+    Args:
+        terminal: terminal of the command.
+        root: folder of the lake.
+        folder: tensors of the lake.
+        published: whether published figures are wanted.
+
+    Returns:
+        Datasets that published figures may stand beside; none unless wanted.
+    """
+    terminal.print_origin(describe_synthetic(folder.origins))
+    if not published:
+        return ()
+    facts = scan(root, load(root), SUBSETS).select("dataset", "subset", "recording").collect()
+    used = {
+        (dataset, recording)
+        for dataset, subset, recording in facts.iter_rows()
+        if f"{dataset}/{subset}" in folder.origins
+    }
+    gaps: dict[str, list[str]] = {dataset: [] for dataset, _ in sorted(used)}
+    with connect(root) as connection:
+        rows = cast("list[RecordingFacts]", query(connection, "recordings"))
+    for row in rows:
+        gap = explain_gap(row) if (row["dataset"], row["recording"]) in used else None
+        if gap is not None:
+            gaps[row["dataset"]].append(f"{row['recording']}: {gap}")
+    for dataset, reasons in gaps.items():
+        if reasons:
+            more = f"; and {len(reasons) - 1} more recordings" if len(reasons) > 1 else ""
+            terminal.print_line(f"note: no published figures beside {dataset} ({reasons[0]}{more})", style="dim")
+    return tuple(dataset for dataset, reasons in gaps.items() if not reasons)
