@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.errors import FileAccessError, explain_file_errors
 
 _UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 """Names of files that are not whole yet; DuckDB writes its log beside a database."""
@@ -45,11 +45,39 @@ def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> N
         sync(target.parent)
 
 
+def write_output(target: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
+    """Write a file that a user named: whole or not at all, into what a link leads to, or into a pipe or device.
+
+    Raises:
+        FileAccessError: it is a folder, or cannot be written.
+    """
+    if target.is_dir():
+        raise FileAccessError(f"{target}: is a folder; name a file")
+    if not _is_stream(target):
+        write_file(target.resolve(), content)
+        return
+    with explain_file_errors(target), target.open("wb") as stream:
+        if isinstance(content, bytes):
+            stream.write(content)
+        else:
+            content(stream)
+
+
+def _is_stream(target: Path) -> bool:
+    """Return whether a path is a pipe, a device or an open descriptor (/dev/stdout), which nothing may replace."""
+    leads_to = target.readlink() if target.is_symlink() else target
+    return Path("/proc") in (target.parent / leads_to).parents or (target.exists() and not target.is_file())
+
+
 def remove_unfinished(folder: Path) -> None:
     """Delete the unfinished files that killed processes left in a folder."""
-    for file in folder.glob(".*.tmp*"):
-        if _UNFINISHED.fullmatch(file.name) and file.is_file():
-            file.unlink()
+    for file in list_unfinished(folder):
+        file.unlink()
+
+
+def list_unfinished(folder: Path) -> list[Path]:
+    """Return the unfinished files that killed processes left in a folder."""
+    return [file for file in folder.glob(".*.tmp*") if _UNFINISHED.fullmatch(file.name) and file.is_file()]
 
 
 def sync(path: Path) -> None:

@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from tracklake.pipeline.cli.streams import guard_streams
 from tracklake.training.runs.memory import keep_freed_memory
 
 COMMANDS = {
@@ -21,6 +22,7 @@ COMMANDS = {
     "split": "Divide the subsets into train and eval.",
     "tensors": "Write the split as flat arrays.",
     "report": "Write the quality report.",
+    "check": "Compare every live file with its checksum; what is damaged is made again by the next run.",
     "sql": "Query the tables with SQL, read-only, from anywhere.",
     "train": "Train a model on the split's training part and evaluate it once on the evaluation part.",
     "evaluate": "Score runs and models at each horizon, beside published figures.",
@@ -90,6 +92,7 @@ def _read_global_options(
 def main() -> None:
     """Entry point of the `tracklake` command."""
     keep_freed_memory()
+    guard_streams()
     app()
 
 

@@ -33,6 +33,7 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
     terminal = Terminal(quiet=quiet, as_json=json)
     try:
         yield terminal
+        sys.stdout.flush()  # what fails here would otherwise fail at exit
     except (typer.Exit, typer.Abort, typer.TyperException):
         raise
     except TracklakeError as error:

@@ -14,14 +14,14 @@ from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
 from tracklake.pipeline.cli.score_tables import show_evaluations
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
 from tracklake.pipeline.stages.score import BASELINE, finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
-from tracklake.schemas.files import write_file
+from tracklake.schemas.files import write_output
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
 from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
@@ -80,6 +80,7 @@ def evaluate(
         require_choice("--part", part, PARTS)
         if out is not None and out.suffix not in FORMATS:
             raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
+        refuse_lake(out)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         tensors = tensor_folder(root, load(root), settings)
@@ -146,4 +147,4 @@ def _write_table(target: Path, table: pl.DataFrame) -> None:
         table.write_json(content)
     else:
         table.write_parquet(content)
-    write_file(target, content.getvalue())
+    write_output(target, content.getvalue())

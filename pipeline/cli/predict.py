@@ -9,12 +9,12 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
-from tracklake.schemas.files import write_file
+from tracklake.schemas.files import write_output
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.attention import export_attention
@@ -89,6 +89,7 @@ def predict(
     """Draw samples on the road: history, neighbors, truth, predictions and their uncertainty."""
     with command(quiet=quiet, json=json) as terminal:
         _check_options(models or [], sample, vehicle, time, pick, part, count, out)
+        refuse_lake(out)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         folder = TensorFolder.open(tensor_folder(root, load(root), settings))
@@ -111,7 +112,7 @@ def predict(
             file = _name_file(out, root / FOLDER, picture, all_vehicles=all_vehicles)
             with explain_file_errors(file.parent):
                 file.parent.mkdir(parents=True, exist_ok=True)
-            write_file(file, draw_picture(picture).render(file.suffix))
+            write_output(file, draw_picture(picture).render(file.suffix))
             _show_errors(terminal, picture, file)
             drawn.append({"file": file, **picture.to_dict()})
         maps = _draw_attention(folder, forecasters, samples, file.parent) if attention else []

@@ -9,6 +9,7 @@ from tracklake.pipeline.cli.command import command
 from tracklake.pipeline.cli.console import find_command
 from tracklake.pipeline.cli.generated_sample import write_generated
 from tracklake.pipeline.cli.options import JsonOption, MinutesOption, QuietOption, SeedOption
+from tracklake.pipeline.lake import refuse_lake
 
 
 def sample(
@@ -23,6 +24,7 @@ def sample(
 ) -> None:
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
     with command(quiet=quiet, json=json) as terminal:
+        refuse_lake(out)
         summary = write_generated(out, minutes, seed, terminal, formats=format)
         terminal.print_line(
             f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)"

@@ -80,6 +80,8 @@ def run_steps(
         terminal.print_line("nothing to do: the lake is up to date", style="dim")
         return conclude_idle(request, plan)
     refuse_if_busy(request.root, rebuild=rebuild)
+    if plan.is_broken_off:
+        terminal.print_line("the last session was broken off before its end, which is done now", style="dim")
     with terminal.show_stages(), explain_file_errors(request.root):
         result: RunResult = import_module(FLOWS).execute(request, plan)
         return result

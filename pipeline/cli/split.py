@@ -20,12 +20,13 @@ from tracklake.pipeline.cli.options import (
 from tracklake.pipeline.cli.session import report_result, run_steps
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.pipeline.ingest.discovery import recognise
+from tracklake.pipeline.lake import refuse_lake
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.sources.highd_plan import announce_subsets
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
 from tracklake.pipeline.transforms.splits.tables import Allocation
-from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.files import write_output
 from tracklake.schemas.origin import describe_synthetic
 
 FORMATS = ("table", "csv", "json")
@@ -71,6 +72,7 @@ def split(
         require_choice("--format", format, FORMATS)
         if out is not None and format == "table":
             raise typer.BadParameter("--format table goes to the terminal only: with --out, choose csv or json")
+        refuse_lake(out)
         _plan_split(terminal, settings, plan, exclude or [], format, out)
 
 
@@ -120,9 +122,7 @@ def _show_plan(terminal: Terminal, parts: pl.DataFrame, allocation: Allocation, 
         if out is None:
             sys.stdout.write(text)
             return
-
-        with explain_file_errors(out):
-            out.write_text(text, encoding="utf-8")
+        write_output(out, text.encode())
         terminal.print_line(f"{parts.height:,} subsets in {out}")
     else:
         rows = [

@@ -3,7 +3,7 @@
 import errno
 import sys
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, BinaryIO, cast
 
 import polars as pl
 import typer
@@ -12,11 +12,12 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import LakeOption, require_choice
 from tracklake.pipeline.cli.tables import cut_text, print_table
-from tracklake.pipeline.lake import LakeResult, connect, query_errors
+from tracklake.pipeline.lake import LakeResult, connect, query_errors, refuse_lake
 from tracklake.pipeline.lake import query as run_query
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import FileAccessError, TracklakeError
+from tracklake.schemas.files import write_output
 
 if TYPE_CHECKING:
     from io import IOBase
@@ -46,6 +47,7 @@ def sql(
         if names:
             show_names(terminal)
             return
+        refuse_lake(out)
         if query is None:
             raise typer.BadParameter("give one SELECT, `-` to read it from standard input, or --list")
         with connect(read_settings(lake=lake).lake) as connection:
@@ -70,25 +72,28 @@ def write_result(relation: LakeResult, form: str, out: Path | None, terminal: Te
     if form == "table" and out is None:
         _show_rows(relation, terminal)
         return
+    if form == "table":
+        raise TracklakeError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise TracklakeError("Parquet is no text: give --out FILE, or redirect standard output to a file")
+    frame = (relation if form == "parquet" else relation.to_text(flat=form == "csv")).pl()
+    if out is not None:
+        write_output(out, lambda stream: _write(frame, form, stream))
+        terminal.print_line(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+        return
     try:
-        frame = _flatten(relation).pl() if form == "csv" else relation.pl()
-        _write(frame, form, out or sys.stdout.buffer)
+        _write(frame, form, sys.stdout.buffer)
     except OSError as error:
         # Polars raises the system's error without its number.
         if f"(os error {errno.EPIPE})" in str(error):
             raise BrokenPipeError from error
-        raise FileAccessError(f"{out or 'standard output'}: {error}") from error
-    if out is None:
-        sys.stdout.buffer.flush()
-    else:
-        terminal.print_line(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+        raise FileAccessError(f"standard output: {error}") from error
+    sys.stdout.buffer.flush()
 
 
 def _show_rows(relation: LakeResult, terminal: Terminal) -> None:
     """Print a query's first rows as a table with every column, and on stderr how many rows there are."""
-    rows = relation.limit(MAX_ROWS + 1).fetchall()
+    rows = relation.limit(MAX_ROWS + 1).to_text().fetchall()
     numeric = [str(kind).startswith(NUMERIC) and not str(kind).endswith("]") for kind in relation.types]
     cells = [[_format_cell(value) for value in row] for row in rows[:MAX_ROWS]]
     print_table(terminal, list(relation.columns), cells, right=numeric)
@@ -122,23 +127,11 @@ def _take_first_sentence(text: str) -> str:
     return text.split(". ")[0].removesuffix(".") + "."
 
 
-def _write(frame: pl.DataFrame, form: str, target: Path | IO[bytes]) -> None:
+def _write(frame: pl.DataFrame, form: str, target: BinaryIO) -> None:
     if form == "csv":
         frame.write_csv(target)
     elif form == "json":
         # Any binary file will do, though Polars declares it otherwise than for the other forms.
-        frame.write_json(cast("Path | IOBase", target))
-    elif form == "parquet":
-        frame.write_parquet(target)
+        frame.write_json(cast("IOBase", target))
     else:
-        raise TracklakeError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
-
-
-def _flatten(relation: LakeResult) -> LakeResult:
-    """Cast lists and structs to text, as CSV holds nothing else."""
-    columns = []
-    for name, kind in zip(relation.columns, relation.types, strict=True):
-        quoted = '"' + name.replace('"', '""') + '"'
-        nested = str(kind).endswith("]") or str(kind).startswith(("STRUCT", "MAP"))
-        columns.append(f"CAST({quoted} AS VARCHAR) AS {quoted}" if nested else quoted)
-    return relation.project(", ".join(columns))
+        frame.write_parquet(target)

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tracklake.pipeline.lake import refuse_lake
 from tracklake.schemas.errors import TracklakeError, explain_file_errors
 from tracklake.schemas.files import name_unfinished, sync
 
@@ -13,26 +14,25 @@ class ExportError(TracklakeError):
     """An export cannot be made as asked; the message says why and what to do."""
 
 
-def refuse_taken(out: Path, names: Sequence[str], *, force: bool, lake: Path) -> None:
+def refuse_taken(out: Path, names: Sequence[str], *, force: bool) -> None:
     """Refuse a folder where the export would overwrite something, before any work is done.
 
     Args:
         out: folder of the export; it may hold other files.
         names: names of the files.
         force: whether existing files of these names may be replaced.
-        lake: folder of the lake, which holds only the lake's own files.
 
     Raises:
-        ExportError: the folder is a file, lies in the lake, cannot be written to, or holds one of the names.
+        ExportError: the folder is a file, cannot be written to, or holds one of the names.
+        LakeError: the folder lies in a lake.
     """
+    refuse_lake(out)
     if out.exists() and not out.is_dir():
         raise ExportError(f"{out}: is a file; the export needs a folder. Name another with --out.")
     target = out.resolve()
     nearest = next(folder for folder in (target, *target.parents) if folder.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         raise ExportError(f"{out}: {nearest} is not a folder that can be written to. Name another with --out.")
-    if target.is_relative_to(lake.resolve()):
-        raise ExportError(f"{out}: lies in the lake, which deletes other files. Name another folder with --out.")
     folders = [name for name in names if (out / name).is_dir()]
     if folders:
         raise ExportError(f"{out}: holds folders named {', '.join(folders)}. Name another folder with --out.")

@@ -10,7 +10,7 @@ import polars as pl
 from polars.datatypes import DataTypeClass
 
 from tracklake.pipeline.lake.errors import LakeError
-from tracklake.pipeline.lake.files import read_partition
+from tracklake.pipeline.lake.files import STAGING, read_partition
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
@@ -145,14 +145,26 @@ def create_views(
 
 
 def rebuild_catalog(root: Path, manifest: Manifest) -> None:
-    """Replace catalog.duckdb, as the last step of a session; its views hold paths relative to the lake's folder.
+    """Replace catalog.duckdb, towards a session's end.
+
+    Raises:
+        LakeError: a live file is missing or unreadable; the earlier catalog stays.
+    """
+    content = build_catalog(root, manifest)
+    # What a client that wrote to the old catalog left would be replayed into the new one.
+    (root / f"{CATALOG}.wal").unlink(missing_ok=True)
+    if (root / CATALOG).is_dir():  # not by us; a file cannot take a folder's name
+        (root / STAGING).mkdir(exist_ok=True)
+        (root / CATALOG).rename(root / STAGING / CATALOG)
+    write_file(root / CATALOG, content)
+
+
+def build_catalog(root: Path, manifest: Manifest) -> bytes:
+    """Return the content of catalog.duckdb, whose views hold paths relative to the lake's folder.
 
     It is made in a temporary folder, where the lake goes by a link. Views are checked on creation against files
     relative to DuckDB's search path, which is a list of patterns without a way to quote, and "?" in a database's path
     starts its options; a lake may be called "a,b" or "c[1]?".
-
-    Raises:
-        LakeError: a live file is missing or unreadable; the earlier catalog stays.
     """
     import duckdb
 
@@ -164,7 +176,4 @@ def rebuild_catalog(root: Path, manifest: Manifest) -> None:
             connection.begin()  # or each statement is written to disk by itself
             create_views(connection, root, manifest, locate=str)
             connection.commit()
-        content = made.read_bytes()
-    # What a client that wrote to the old catalog left would be replayed into the new one.
-    (root / f"{CATALOG}.wal").unlink(missing_ok=True)
-    write_file(root / CATALOG, content)
+        return made.read_bytes()

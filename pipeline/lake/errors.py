@@ -15,6 +15,10 @@ class LakeLockedError(LakeError):
     """Another process is writing to the lake."""
 
 
+class DamagedFileError(LakeError):
+    """A live file's content is not what was written."""
+
+
 class LakeVersionError(LakeError):
     """The lake was built by another version of the tables."""
 

@@ -11,11 +11,14 @@ from urllib.parse import quote, unquote
 
 import polars as pl
 
+from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.errors import LakeMissingError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.files import sync
 
+STORE = ".files"
+"""Folder of the lake for the content of tables, under names with fingerprints; other folders have links to it."""
 STAGING = ".staging"
 """Folder of the lake for files that are not whole yet."""
 TENSORS = "tensors"
@@ -33,14 +36,14 @@ TABLE_BY_NAME = {table.name: table for table in TABLES}
 
 
 def name_table_file(table: Table, values: Mapping[str, str], fingerprint: str) -> str:
-    """Return the path of a table's file: `tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
-    folders = [_name_folder(name, values[name]) for name in table.partition]
-    return "/".join([table.name, *folders, f"part-{fingerprint}.parquet"])
+    """Return the path of a table's file: `.files/tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
+    folders = [f"{name}={escape_name(values[name])}" for name in table.partition]
+    return "/".join([STORE, table.name, *folders, f"part-{fingerprint}.parquet"])
 
 
-def _name_folder(name: str, value: str) -> str:
-    """Return a hive partition's folder; what would end the name or be a pattern is percent-encoded."""
-    return f"{name}=" + re.sub(r"[^\w.\- ]", lambda found: quote(found[0], safe=""), value)
+def escape_name(value: str) -> str:
+    """Return a text as a part of a file's name; what would end the name or be a pattern is percent-encoded."""
+    return re.sub(r"[^\w.\- ]", lambda found: quote(found[0], safe=""), value)
 
 
 def read_partition(table: Table, path: str) -> dict[str, str]:
@@ -74,20 +77,39 @@ def write_table(
     table.validate(frame, where=where)
     path = find_free_path(root, name_table_file(table, values, fingerprint))
     target = root / path
-    if not _has_rows(target, frame.height):
+    if not _is_as_written(root, path, frame.height):
         stored = frame.drop(*table.partition)
 
         def write(aside: Path) -> None:
             stored.write_parquet(aside, compression="zstd", compression_level=ZSTD_LEVEL, row_group_size=250_000)
 
         _write_aside(root, target, write)
-    return [LakeFile(path=path, rows=frame.height, bytes=target.stat().st_size)]
+    return [_describe_file(root, target, frame.height)]
+
+
+def _describe_file(root: Path, file: Path, rows: int | None) -> LakeFile:
+    return LakeFile(file.relative_to(root).as_posix(), rows, file.stat().st_size, hash_file(file))
+
+
+def _is_as_written(root: Path, path: str, rows: int) -> bool:
+    """Return whether a file is there with the committed bytes, or whole, where it was never committed."""
+    if not (root / path).is_file():
+        return False
+    checksum = _load_checksums(root).get(path)
+    if checksum is None:
+        return _has_rows(root / path, rows)
+    return hash_file(root / path, again=True) == checksum
+
+
+def _load_checksums(root: Path) -> dict[str, str]:
+    try:
+        return load(root).list_checksums()
+    except LakeMissingError:
+        return {}
 
 
 def _has_rows(target: Path, rows: int) -> bool:
-    """Return whether a Parquet file is there, to its end (the footer), with so many rows."""
-    if not target.is_file():
-        return False
+    """Return whether a Parquet file is there to its end (the footer), with so many rows."""
     try:
         found = pl.scan_parquet(target, glob=False, hive_partitioning=False).select(pl.len()).collect().item()
     except (pl.exceptions.PolarsError, OSError):
@@ -127,7 +149,7 @@ def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[L
         Its files, and the listing of them that is added.
     """
     target = root / find_free_path(root, path)
-    if not _is_whole(target):
+    if not _is_whole(root, target):
 
         def write_listed(aside: Path) -> None:
             aside.mkdir()
@@ -136,25 +158,28 @@ def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[L
             (aside / LISTING).write_text(json.dumps(sizes, indent=1), encoding="utf-8")
 
         _write_aside(root, target, write_listed)
-    return [
-        LakeFile(path=file.relative_to(root).as_posix(), rows=None, bytes=file.stat().st_size)
-        for file in _list_files(target)
-    ]
+    return [_describe_file(root, file, None) for file in _list_files(target)]
 
 
 def _list_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.rglob("*") if file.is_file())
 
 
-def _is_whole(folder: Path) -> bool:
-    """Return whether a folder holds what its listing says; its deletion may have been killed half way."""
+def _is_whole(root: Path, folder: Path) -> bool:
+    """Return whether a folder holds what its listing says, with the bytes that were committed, if they were.
+
+    Its deletion may have been killed half way.
+    """
     try:
         sizes = json.loads((folder / LISTING).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     found = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _list_files(folder)}
     found.pop(LISTING)
-    return bool(found == sizes)
+    if found != sizes:
+        return False
+    committed, files = _load_checksums(root), {file.relative_to(root).as_posix(): file for file in _list_files(folder)}
+    return all(hash_file(files[path], again=True) == committed[path] for path in files.keys() & committed.keys())
 
 
 def _write_aside(root: Path, target: Path, write: Callable[[Path], None]) -> None:
@@ -227,20 +252,21 @@ def is_intact(root: Path, files: Iterable[LakeFile]) -> bool:
 
 def remove_orphans(root: Path, manifest: Manifest) -> int:
     """Delete what killed runs left: finished files never committed, and empty folders. Returns how many files."""
-    known = manifest.live_paths() | {item.path for item in manifest.retired}
-    folders = [root / name for name in (*TABLE_BY_NAME, TENSORS) if (root / name).is_dir()]
-    orphans = [
-        file
-        for folder in folders
-        for file in folder.rglob("*")
-        if file.is_file() and file.relative_to(root).as_posix() not in known
-    ]
+    folders = [root / name for name in (STORE, TENSORS) if (root / name).is_dir()]
+    orphans = find_orphans(root, manifest)
     remove_files(root, orphans)
     for folder in folders:
         for item in sorted(folder.rglob("*"), reverse=True):
             if item.is_dir() and not any(item.iterdir()):
                 item.rmdir()
     return len(orphans)
+
+
+def find_orphans(root: Path, manifest: Manifest) -> list[Path]:
+    """Return the files in the folders of contents that are neither live nor kept for readers."""
+    known = manifest.live_paths() | {item.path for item in manifest.retired}
+    found = (file for name in (STORE, TENSORS) for file in (root / name).rglob("*") if file.is_file())
+    return [file for file in found if file.relative_to(root).as_posix() not in known]
 
 
 def remove_files(root: Path, files: Iterable[Path]) -> None:

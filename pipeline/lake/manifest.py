@@ -24,11 +24,13 @@ class LakeFile:
         path: path relative to the lake's root, with forward slashes.
         rows: number of rows of a table; None for anything else (reports, tensors).
         bytes: size in bytes, so that a truncated file is noticed.
+        sha256: checksum of the bytes, so that other damage is noticed; None for what may change (reports, models).
     """
 
     path: str
     rows: int | None
     bytes: int
+    sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Commit:
 
     Args:
         key: name of the work: `stage/dataset/recording`, or `stage` for a stage over the whole lake.
-        fingerprint: digest of the inputs, settings and code version; part of every file's name.
+        fingerprint: digest of the inputs, settings and code version; part of every file's name. Empty: its files are
+            damaged and to be made again.
         files: live files by table.
         built_from: sources with sha256, upstream fingerprints, settings, versions.
         info: small facts that later stages plan with (subsets, counts, notes), and the seconds it took.
@@ -73,11 +76,13 @@ class Retired:
         path: path relative to the lake's root.
         generation: number of the session in which it was replaced.
         void: whether it must not be used again, even for the same inputs: a rebuild makes everything again.
+        sha256: checksum of its bytes, if it is known.
     """
 
     path: str
     generation: int
     void: bool = False
+    sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,12 @@ class Manifest:
         """Return the paths of all live files."""
         return {file.path for commit in self.commits.values() for file in commit.all_files}
 
+    def list_checksums(self) -> dict[str, str]:
+        """Return the checksums that live and retired files were committed with, by path, as far as they are known."""
+        known = {item.path: item.sha256 for item in self.retired}
+        known |= {file.path: file.sha256 for commit in self.commits.values() for file in commit.all_files}
+        return {path: sha256 for path, sha256 in known.items() if sha256 is not None}
+
     def of_stage(self, stage: str) -> list[Commit]:
         """Return the commits of a stage, sorted by key."""
         return sorted(
@@ -125,6 +136,11 @@ class Manifest:
         replaced = [self.commits[commit.key]] if commit.key in self.commits else []
         return self._replace_commits({**self.commits, commit.key: commit}, replaced, generation)
 
+    def mark_damaged(self, keys: Collection[str]) -> "Manifest":
+        """Return the manifest with some commits without fingerprints, so that they are made again; files stay live."""
+        commits = {k: replace(commit, fingerprint="") if k in keys else commit for k, commit in self.commits.items()}
+        return replace(self, commits=commits)
+
     def remove_commits(self, keys: Collection[str], generation: int) -> "Manifest":
         """Return the manifest without some commits; their files are retired."""
         removed = [commit for key, commit in self.commits.items() if key in keys]
@@ -135,9 +151,10 @@ class Manifest:
     def _replace_commits(self, commits: dict[str, Commit], replaced: Iterable[Commit], generation: int) -> "Manifest":
         changed = replace(self, commits=commits, generation=generation)
         live = changed.live_paths()
-        dropped = {file.path for commit in replaced for file in commit.all_files} - live
+        dropped = {file.path: file.sha256 for commit in replaced for file in commit.all_files if file.path not in live}
         kept = tuple(item for item in self.retired if item.path not in live)
-        return replace(changed, retired=kept + tuple(Retired(path, generation) for path in sorted(dropped)))
+        added = tuple(Retired(path, generation, sha256=sha256) for path, sha256 in sorted(dropped.items()))
+        return replace(changed, retired=kept + added)
 
 
 def load(root: Path) -> Manifest:

@@ -1,10 +1,10 @@
 """A lake opened for SQL: an in-memory connection with its views and macros, read-only in fact."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import polars as pl
 
@@ -16,6 +16,7 @@ from tracklake.schemas import TABLES
 
 if TYPE_CHECKING:
     import duckdb
+    from duckdb.sqltypes import DuckDBPyType
 
 _EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", re.IGNORECASE)
 _WORD = re.compile(r'\w+|"(""|[^"])*"')
@@ -30,6 +31,19 @@ _PIVOT_HINT = (
     " A PIVOT that finds out the values by itself creates a type first; with the values named it is one SELECT: "
     "PIVOT ... ON lane IN (1, 2, 3)."
 )
+
+_PLAIN = {
+    *("boolean", "varchar", "enum", "sqlnull", "float", "double", "decimal"),
+    *(f"{sign}{size}int" for sign in ("", "u") for size in ("tiny", "small", "big", "huge")),
+    *("integer", "uinteger"),
+}
+"""DuckDB's types whose values any format holds as they are."""
+_POLARS_TYPES = {
+    *_PLAIN,
+    *("blob", "uuid", "date", "time", "timestamp", "timestamp_s", "timestamp_ms", "timestamp_ns"),
+    "timestamp with time zone",
+}
+"""DuckDB's types that Polars holds; others, such as INTERVAL, UNION and BIT, become text in a frame."""
 
 Parameters = Mapping[str, Any] | Sequence[Any]
 
@@ -74,14 +88,33 @@ class LakeResult:
     def pl(self) -> pl.DataFrame:
         """Return the rows as a Polars frame; whole numbers of 128 bits, as DuckDB's sums are, in 64 where they fit.
 
-        Where they do not, they are Decimal, which JSON writes as text.
+        Where they do not, they are Decimal, which JSON writes as text. Types that Polars lacks become text.
         """
-        frame = self._relation.pl()
+        frame = self._cast(_POLARS_TYPES).pl()
         wide = [column for column, kind in zip(frame, self.types, strict=True) if str(kind) in ("HUGEINT", "UHUGEINT")]
         fitting = [column.cast(pl.Int64, strict=False) for column in wide]
         return frame.with_columns(
             narrow for column, narrow in zip(wide, fitting, strict=True) if narrow.null_count() == column.null_count()
         )
+
+    def to_text(self, *, flat: bool = False) -> "LakeResult":
+        """Return the rows with values that JSON does not know (dates, intervals, bytes, UUIDs ...) as DuckDB's text.
+
+        Args:
+            flat: whether lists, structs and maps become text as a whole, for CSV.
+        """
+        return LakeResult(self._cast(_PLAIN, flat=flat))
+
+    def _cast(self, kept: Set[str], *, flat: bool = False) -> "duckdb.DuckDBPyRelation":
+        """Return the relation with types other than those kept, and other than lists and structs of them, as text."""
+        wanted = [_name_cast(kind, kept, flat=flat) for kind in self.types]
+        if all(name is None for name in wanted):
+            return self._relation
+        columns = []
+        for place, (column, name) in enumerate(zip(self.columns, wanted, strict=True), start=1):
+            value = f"#{place}" if name is None else f"CAST(#{place} AS {name})"
+            columns.append(f"{value} AS {_quote_name(column)}")
+        return self._relation.project(", ".join(columns))
 
     def limit(self, n: int, offset: int = 0) -> "LakeResult":
         """Return at most n rows, after the first `offset`."""
@@ -96,6 +129,29 @@ class LakeResult:
         _refuse_switches(expressions)
         with query_errors():
             return LakeResult(self._relation.project(expressions))
+
+
+def _quote_name(name: str) -> str:
+    """Return a name as a SQL identifier."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _name_cast(kind: "DuckDBPyType", kept: Set[str], *, flat: bool) -> str | None:
+    """Return the type to cast a column to, with text for types that are not kept; None: it stays as it is."""
+    if kind.id in kept:
+        return None
+    if flat or kind.id not in ("list", "array", "struct", "map"):
+        return "VARCHAR"
+    # An array's second child is its length.
+    children = cast("list[tuple[str, DuckDBPyType]]", [each for each in kind.children if each[0] != "size"])
+    inner = [_name_cast(child, kept, flat=False) for _, child in children]
+    if all(name is None for name in inner):
+        return None
+    names = [name or str(child) for name, (_, child) in zip(inner, children, strict=True)]
+    if kind.id == "struct":
+        fields = (f"{_quote_name(field)} {name}" for (field, _), name in zip(children, names, strict=True))
+        return f"STRUCT({', '.join(fields)})"
+    return f"MAP({names[0]}, {names[1]})" if kind.id == "map" else f"{names[0]}[]"
 
 
 class LakeConnection:

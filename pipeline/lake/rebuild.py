@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake.catalog import CATALOG
-from tracklake.pipeline.lake.files import STAGING, TABLE_BY_NAME, TENSORS
+from tracklake.pipeline.lake.files import STAGING, STORE, TABLE_BY_NAME, TENSORS
 from tracklake.pipeline.lake.manifest import (
     MANIFEST,
     Manifest,
@@ -70,8 +70,12 @@ def _list_committed(root: Path, document: dict[str, Any]) -> Iterator[str]:
 
 
 def _list_existing(root: Path) -> Iterator[str]:
-    """Return the files in the folders that are the lake's alone, named by a manifest or not."""
-    for folder in (root / name for name in (*TABLE_BY_NAME, TENSORS)):
+    """Return the files in the folders that are the lake's alone, named by a manifest or not.
+
+    Those in the folders of tables are links to others, unless the lake is of an earlier layout.
+    """
+    names = (STORE, TENSORS) if (root / STORE).is_dir() else (*TABLE_BY_NAME, TENSORS)
+    for folder in (root / name for name in names):
         yield from (file.relative_to(root).as_posix() for file in folder.rglob("*") if file.is_file())
 
 

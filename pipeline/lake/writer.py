@@ -10,14 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import catalog, files
+from tracklake.pipeline.lake import catalog, files, live_folders, session_end
+from tracklake.pipeline.lake.checksums import DamagedFile, find_damaged_files, forget_checksums
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
 from tracklake.pipeline.lake.rebuild import start_rebuild
+from tracklake.pipeline.lake.session_end import LOCK
 from tracklake.schemas.files import remove_unfinished
 
-LOCK = ".lock"
-"""Name of the lock's file in the lake."""
 KEPT_GENERATIONS = 2
 """Generations for which a replaced file is kept, in writing sessions."""
 
@@ -49,8 +49,10 @@ class Writer:
         with self._guard:
             if not files.is_intact(self.root, commit.all_files):
                 raise LakeError(f"{self.root}: files of {commit.key} vanished before they were committed. Run again.")
-            if self.manifest.commits.get(commit.key) != commit:
+            before = self.manifest.commits.get(commit.key)
+            if before != commit:
                 self._store(self.manifest.add_commit(commit, self._generation))
+                live_folders.show_commit(self.root, commit, [] if before is None else [before])
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -62,8 +64,19 @@ class Writer:
     def remove(self, keys: Collection[str]) -> None:
         """Remove commits from the lake; their files are retired like replaced ones."""
         with self._guard:
-            if not self.manifest.commits.keys().isdisjoint(keys):
+            removed = [commit for key, commit in self.manifest.commits.items() if key in keys]
+            if removed:
                 self._store(self.manifest.remove_commits(keys, self._generation))
+                live_folders.show_commit(self.root, None, removed)
+
+    def mark_damaged(self) -> list[DamagedFile]:
+        """Compare every live file with its checksum, and record commits that must be made again; returns the damage."""
+        with self._guard:
+            found = find_damaged_files(self.root, self.manifest)
+            marked = self.manifest.mark_damaged({file.key for file in found})
+            if marked != self.manifest:
+                self._store(marked)
+            return found
 
     def remember_origin(self, source: str) -> None:
         """Record a SOURCE as the last one, so that a message about a rebuild can name it."""
@@ -81,6 +94,7 @@ class Writer:
         with self._guard:
             self._refuse_child()
             catalog.rebuild_catalog(self.root, self.manifest)
+            live_folders.show_manifest(self.root, self.manifest)
             limit = self.manifest.generation - KEPT_GENERATIONS
             old = [item for item in self.manifest.retired if item.generation <= limit]
             live = self.manifest.live_paths()
@@ -89,6 +103,7 @@ class Writer:
                 self._store(replace(self.manifest, retired=tuple(i for i in self.manifest.retired if i not in old)))
             files.remove_orphans(self.root, self.manifest)
             shutil.rmtree(self.root / files.STAGING, ignore_errors=True)
+            session_end.record_end(self.root)
 
     def _refuse_child(self) -> None:
         if os.getpid() != self._process:
@@ -118,11 +133,9 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     descriptor = _open_lock(root)
     try:
         _acquire_lock(root, descriptor)
-        # What is said of its holder stays in the file where a session did not come to its end.
-        broken_off = bool(os.pread(descriptor, 1, 0))
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
-        writer = _open_writer(root, broken_off=broken_off, rebuild=rebuild)
+        writer = _open_writer(root, rebuild=rebuild)
         yield writer
         writer.finish()
         os.ftruncate(descriptor, 0)
@@ -171,22 +184,31 @@ def _acquire_lock(root: Path, descriptor: int) -> None:
         ) from None
 
 
-def _open_writer(root: Path, *, broken_off: bool, rebuild: bool) -> Writer:
+def _open_writer(root: Path, *, rebuild: bool) -> Writer:
     """Load the manifest (or make the first), delete what was half written, and bring the catalog up to date."""
+    is_new = rebuild
     try:
         manifest = start_rebuild(root) if rebuild else load(root)
         if rebuild:
             store_manifest(root, manifest)
     except LakeMissingError:
-        manifest = Manifest()
+        is_new, manifest = True, Manifest()
         store_manifest(root, manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
     remove_unfinished(root)
     remove_unfinished(root / files.REPORTS)
-    if broken_off and not rebuild:
+    forget_checksums()
+    adopted = live_folders.adopt_files(root, manifest)
+    if adopted != manifest:
+        manifest = adopted
+        store_manifest(root, manifest)
+    if is_new:
+        live_folders.show_manifest(root, manifest)
+    elif not session_end.has_ended(root, manifest):
         # Readers of the catalog must not fall behind by more generations than files are kept for.
         with suppress(LakeError):  # files are missing: this session may be the one that makes them again
             catalog.rebuild_catalog(root, manifest)
+        live_folders.show_manifest(root, manifest)
     return Writer(root, manifest)
 
 

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterable
 from contextvars import ContextVar
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import Commit, Writer, list_ingested, open_for_writing
+from tracklake.pipeline.lake import Commit, DamagedFileError, Writer, list_ingested, open_for_writing
 from tracklake.pipeline.orchestration.artifacts import summarise_report
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.orchestration.run_plan import (
@@ -134,6 +134,8 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest,
             result.notes += made.info.get("notes", [])
         else:
             _record_error(title, made, result)
+            if isinstance(made, DamagedFileError):
+                writer.mark_damaged()
         show.advance(stage, title)
 
 
@@ -181,8 +183,8 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: Ru
     writer.remember_sources(contents)
 
 
-def _work(request: RunRequest) -> dict[str, Any]:
-    """Run every requested stage whose outputs are missing or stale."""
+def _work(request: RunRequest, *, again: bool = False) -> dict[str, Any]:
+    """Run every requested stage whose outputs are missing or stale; once again if files turn out to be damaged."""
     result = RunResult()
     plan = _PLAN.get() or RunPlan(survey_source(request) if INGEST in request.steps else None)
     before = list_ingested(request.root) if request.rebuild else set()
@@ -204,6 +206,16 @@ def _work(request: RunRequest) -> dict[str, Any]:
             result.notes += explain_left_out(writer.manifest)
         result.notes += explain_not_rebuilt(before, writer.manifest)
         made = writer.manifest
+    if (
+        result.failed
+        and INGEST in request.steps
+        and not again
+        and any(not commit.fingerprint for commit in made.commits.values())
+    ):
+        repeated = _work(replace(request, rebuild=False), again=True)
+        built = {stage: result.built.get(stage, 0) + count for stage, count in repeated["built"].items()}
+        notes = [f"made again, as files of the lake were damaged: {result.failed[0]}", *repeated["notes"]]
+        return {**repeated, "built": {**result.built, **built}, "notes": notes}
     if REPORT in request.steps and not Planner(request.root, made, settings).find_outstanding(REPORT)[0]:
         result.notes += _publish(request.root)
     return asdict(result)

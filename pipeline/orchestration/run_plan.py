@@ -8,7 +8,16 @@ from typing import Any
 
 from tracklake.pipeline.ingest import ingest, removal
 from tracklake.pipeline.ingest.discovery import Digests, Discovery, discover
-from tracklake.pipeline.lake import Commit, LakeError, LakeMissingError, Manifest, Writer, load, open_for_writing
+from tracklake.pipeline.lake import (
+    Commit,
+    LakeError,
+    LakeMissingError,
+    Manifest,
+    Writer,
+    is_settled,
+    load,
+    open_for_writing,
+)
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
@@ -126,12 +135,14 @@ class RunPlan:
     Args:
         discovery: the source's raw files; None where nothing is ingested.
         ingest: the source compared with the lake; None where files have to be read first, or there is no lake yet.
-        is_idle: whether everything that was requested is in the lake already.
+        is_idle: whether everything that was requested is in the lake already, and the last session came to its end.
+        is_broken_off: whether only the end of the last session is missing.
     """
 
     discovery: Discovery | None = None
     ingest: IngestPlan | None = None
     is_idle: bool = False
+    is_broken_off: bool = False
 
 
 def survey_source(request: RunRequest) -> Discovery:
@@ -178,8 +189,9 @@ def plan_run(request: RunRequest, discovery: Discovery | None) -> RunPlan:
         if plan.jobs or plan.superseded or (request.prune and plan.missing):
             return RunPlan(discovery, plan)
     planner = Planner(request.root, manifest, request.get_settings())
-    is_idle = not any(any(planner.find_outstanding(stage.name)) for stage in request.list_stages())
-    return RunPlan(discovery, plan, is_idle)
+    is_done = not any(any(planner.find_outstanding(stage.name)) for stage in request.list_stages())
+    is_ended = is_done and is_settled(request.root, manifest)
+    return RunPlan(discovery, plan, is_idle=is_ended, is_broken_off=is_done and not is_ended)
 
 
 def conclude_idle(request: RunRequest, plan: RunPlan) -> RunResult:

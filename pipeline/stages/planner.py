@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, verify_files, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
@@ -121,14 +121,17 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     """Build what a job asks for, validate and write its tables, and return the commit to make.
 
     Raises:
+        DamagedFileError: a file that it reads is not as it was written.
         StageError: the stage refuses what it made.
         schemas.StructureError: a frame breaks its table's rules.
     """
     started = time.perf_counter()
+    manifest = load(root)
+    verify_files(root, _list_inputs(stage, manifest, job))
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
     notes: list[str] = []
-    for reader in _open_readers(stage, root, job):
+    for reader in _open_readers(stage, root, manifest, job):
         built = stage.build(reader, settings)
         result = built if isinstance(built, StageResult) else StageResult(built)
         for table, frame in result.tables.items():
@@ -141,8 +144,16 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     return make_commit(job, files, {**info, "notes": notes}, started)
 
 
-def _open_readers(stage: Stage, root: Path, job: Job) -> Iterator[LakeReader]:
-    lake = LakeReader(root, load(root), stage.after, job)
+def _list_inputs(stage: Stage, manifest: Manifest, job: Job) -> Iterator[LakeFile]:
+    """Yield the files that a job may read; a stage that comes after none reads all tables."""
+    for commit in manifest.commits.values():
+        if commit.tail in ("", job.tail or commit.tail):
+            read = commit.stage in stage.after
+            yield from (file for file in commit.all_files if read or (not stage.after and file.rows is not None))
+
+
+def _open_readers(stage: Stage, root: Path, manifest: Manifest, job: Job) -> Iterator[LakeReader]:
+    lake = LakeReader(root, manifest, stage.after, job)
     if stage.scope == "lake" or not stage.per_subset:
         yield lake
         return

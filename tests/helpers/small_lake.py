@@ -84,6 +84,8 @@ def check_lake(root: Path) -> None:
             assert (root / file.path).stat().st_size == file.bytes, file
         status = pl.read_parquet(root / entry.files["subset_status"][0].path, hive_partitioning=False, glob=False)
         assert status["backward_vehicles"].to_list() == [entry.info["number"]]
+    subsets = read_folder(root)["subset"]
+    assert subsets.n_unique() == len(subsets), "a replaced file is shown beside the one that replaced it"
     visible = [path for path in root.rglob("*.parquet") if ".staging" not in path.parts]
     for path in visible:
         assert pl.read_parquet(path, hive_partitioning=False, glob=False).height > 0, f"{path} is not whole"
@@ -103,13 +105,32 @@ def check_lake(root: Path) -> None:
 
 
 def find_files(root: Path) -> set[str]:
-    """Everything in the lake's folders of tables and tensors."""
-    kept = {*(table.name for table in TABLES), "tensors"}
+    """Everything in the lake's folders of contents: of tables and of tensors."""
     return {
         path.relative_to(root).as_posix()
         for path in root.rglob("*")
-        if path.is_file() and path.relative_to(root).parts[0] in kept
+        if path.is_file() and path.relative_to(root).parts[0] in (".files", "tensors")
     }
+
+
+def read_folder(root: Path, table: Table = SUBSET_STATUS) -> pl.DataFrame:
+    """The rows that a user's Polars finds in the folder of a table, whatever the lake is doing."""
+    if not any((root / table.name).rglob("*.parquet")):
+        return table.empty()
+    return pl.scan_parquet(
+        root / table.name, hive_partitioning=True, hive_schema=dict.fromkeys(table.partition, pl.String)
+    ).collect()
+
+
+def check_folder(root: Path, *, linked: bool = False) -> None:
+    """What the folders show after a session's end: exactly what is live, as links to it."""
+    manifest = load(root)
+    for table in (SUBSET_STATUS, VEHICLE_STARTS):
+        assert read_folder(root, table).height == sum(file.rows or 0 for file in manifest.live(table.name))
+    for file in manifest.live(SUBSET_STATUS.name):
+        (shown,) = (root / file.path.removeprefix(".files/")).parent.glob("*")
+        assert shown.read_bytes() == (root / file.path).read_bytes()
+        assert not linked or shown.samefile(root / file.path)
 
 
 def make_splits(rows: int) -> pl.DataFrame:
@@ -145,7 +166,7 @@ class Nursery:
         self.process.stdout.close()
 
 
-DEADLY = ("fsync", "replace", "unlink", "rmdir", "mkdir", "ftruncate")
+DEADLY = ("fsync", "replace", "rename", "link", "unlink", "rmdir", "mkdir", "ftruncate")
 
 
 def _die_at(step: int) -> None:

@@ -67,7 +67,7 @@ def export_csp(settings: Settings, out: Path, options: CspOptions, *, force: boo
     """
     root = settings.lake
     manifest = load(root)
-    refuse_taken(out, (*FILES, CARD), force=force, lake=root)
+    refuse_taken(out, (*FILES, CARD), force=force)
     subsets = _choose_subsets(root, manifest, options)
     rows = count_rows({(facts["dataset"], facts["subset"]): facts["dataset_id"] for facts in subsets})
     export = CspExport(out, options, [CspFile(*both) for both in zip(FILES, PARTS, strict=True)], rows)

@@ -52,7 +52,7 @@ def export_windows(
     """
     manifest = load(settings.lake)
     names = (*(f"{part}.{file_format}" for part in PARTS), CARD)
-    refuse_taken(out, names, force=force, lake=settings.lake)
+    refuse_taken(out, names, force=force)
     folder = TensorFolder.open(tensor_folder(settings.lake, manifest, settings))
     counts = {part: count_part(folder, part) for part in PARTS}
     if not any(samples for samples, _ in counts.values()):

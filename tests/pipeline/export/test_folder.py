@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tracklake.pipeline.export.folder import ExportError, refuse_taken, write_files
+from tracklake.pipeline.lake import LakeError, open_for_writing
 from tracklake.schemas.errors import FileAccessError
 
 NAMES = ("a", "b", "c")
@@ -36,11 +37,11 @@ def test_files_come_beside_what_is_there(tmp_path, there):
 def test_what_stands_in_the_way_is_found_before_any_work(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ExportError, match=r"file is not a folder that can be written to"):
-        refuse_taken(tmp_path / "file" / "out", NAMES, force=True, lake=tmp_path / "lake")
+        refuse_taken(tmp_path / "file" / "out", NAMES, force=True)
     (tmp_path / "out" / "b").mkdir(parents=True)
     with pytest.raises(ExportError, match=r"out: holds folders named b\."):
-        refuse_taken(tmp_path / "out", NAMES, force=True, lake=tmp_path / "lake")
-    refuse_taken(tmp_path / "new" / "out", NAMES, force=False, lake=tmp_path / "lake")
+        refuse_taken(tmp_path / "out", NAMES, force=True)
+    refuse_taken(tmp_path / "new" / "out", NAMES, force=False)
     assert contents(tmp_path) == {"file": "mine"}
 
 
@@ -86,17 +87,18 @@ def test_a_rename_that_fails_undoes_the_others(tmp_path, monkeypatch, step, afte
 
 def test_places_that_will_not_do(tmp_path):
     lake, out = tmp_path / "lake", tmp_path / "out"
-    (lake / "tracks").mkdir(parents=True)
+    with open_for_writing(lake):
+        pass
     for inside in (lake, lake / "tracks" / "x"):
-        with pytest.raises(ExportError, match="lies in the lake"):
-            refuse_taken(inside, NAMES, force=True, lake=lake)
-    refuse_taken(out, NAMES, force=False, lake=lake)
+        with pytest.raises(LakeError, match="lies in the lake"):
+            refuse_taken(inside, NAMES, force=True)
+    refuse_taken(out, NAMES, force=False)
     out.mkdir()
     (out / "other").write_text("")
-    refuse_taken(out, NAMES, force=False, lake=lake)
+    refuse_taken(out, NAMES, force=False)
     (out / "b").write_text("")
     with pytest.raises(ExportError, match=r"holds b\. Name another folder"):
-        refuse_taken(out, NAMES, force=False, lake=lake)
-    refuse_taken(out, NAMES, force=True, lake=lake)
+        refuse_taken(out, NAMES, force=False)
+    refuse_taken(out, NAMES, force=True)
     with pytest.raises(ExportError, match="is a file"):
-        refuse_taken(out / "b", NAMES, force=True, lake=lake)
+        refuse_taken(out / "b", NAMES, force=True)

@@ -10,6 +10,7 @@ from small_recordings import ENTRIES, KINDS, write_highd
 
 from tracklake.pipeline.ingest.removal import remove_recordings
 from tracklake.pipeline.lake import Commit, LakeError, connect, load, open_for_writing
+from tracklake.pipeline.lake.session_end import record_end
 from tracklake.pipeline.orchestration import flows
 
 HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
@@ -80,6 +81,7 @@ def copy(made, tmp_path) -> tuple[Path, Path]:
     shutil.copytree(made / "lake", tmp_path / "lake")
     manifest = tmp_path / "lake" / "manifest.json"
     manifest.write_text(manifest.read_text().replace(str(made / "raw"), str(tmp_path / "raw")))
+    record_end(tmp_path / "lake")
     return tmp_path / "raw", tmp_path / "lake"
 
 
@@ -133,10 +135,11 @@ def test_prune_removes_every_stages_tables_and_the_whole_lakes_are_made_again(co
     for table in ("tracks", "vehicles", "subsets", "samples", "neighbors", "splits", "findings", "sample_drops"):
         assert ask(root, f"SELECT count(*) FROM {table} WHERE subset LIKE '03-%'") == [(0,)], table
     assert ask(root, "SELECT count(*) FROM ingest_log WHERE recording = '03'") == [(0,)]
-    assert list(root.glob("tracks/**/subset=03-upper/*.parquet")) != [], "kept for readers"
+    assert list(root.glob(".files/tracks/**/subset=03-upper/*.parquet")) != [], "kept for readers"
+    assert list(root.glob("tracks/**/subset=03-upper/*.parquet")) == [], "and not shown"
     write_highd(raw, "06")
     ingest(raw, root)
-    assert list(root.glob("tracks/**/subset=03-upper/*.parquet")) == [], "two generations later"
+    assert list(root.glob(".files/tracks/**/subset=03-upper/*.parquet")) == [], "two generations later"
 
 
 def test_prune_with_nothing_gone_has_nothing_to_do(command, copy):
@@ -173,7 +176,7 @@ def test_a_swept_recording_is_made_again_in_spite_of_the_cache(ingest, copy):
         hidden = meta.rename(meta.with_name(".hidden"))
         assert len(ingest(raw, root)["refused"]) == 1, "02 lacks a file"
         hidden.rename(meta)
-    assert list(root.glob("tracks/**/subset=02-upper/*.parquet")) == []
+    assert list(root.glob(".files/tracks/**/subset=02-upper/*.parquet")) == []
     assert ingest(raw, root)["built"] == {"ingest": 1}
     assert counted(root)["02"] == ENTRIES
 

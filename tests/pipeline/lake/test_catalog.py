@@ -159,7 +159,7 @@ def test_a_subset_may_be_called_anything(tmp_path: Path, subset: str):
         asked = connection.execute("SELECT backward_vehicles FROM subset_status WHERE subset = ?", [subset])
         assert asked.fetchall() == [(4,)]
     files = manifest.live("subset_status")
-    assert all(len(Path(file.path).parts) == 4 for file in files)
+    assert all(len(Path(file.path).parts) == 5 for file in files)
     assert tmp_path.resolve() in (tmp_path / files[0].path).resolve().parents
 
 
@@ -169,7 +169,7 @@ def test_scan_reads_only_what_is_asked_for(tmp_path: Path):
     every = scan(tmp_path, manifest, VEHICLE_STARTS).collect()
     assert every.group_by("subset").len().sort("subset").rows() == [(subset, 3) for subset in sorted(SUBSETS)]
     assert every.schema == pl.Schema(VEHICLE_STARTS.dtypes)
-    shutil.rmtree(tmp_path / "vehicle_starts" / "dataset=highd" / "subset=01-lower")
+    shutil.rmtree(tmp_path / ".files" / "vehicle_starts" / "dataset=highd" / "subset=01-lower")
     assert scan(tmp_path, manifest, VEHICLE_STARTS, **UPPER).collect().height == 3
     nothing = scan(tmp_path, manifest, VEHICLE_STARTS, dataset="ngsim").collect()
     assert (nothing.height, nothing.schema) == (0, every.schema)
@@ -333,7 +333,7 @@ def test_a_result_reads_and_has_no_method_that_writes(lake: Path):
     with connect(lake) as connection:
         found = connection.sql("SELECT vehicle_id, class FROM vehicles ORDER BY 1")
         assert {name for name in dir(found) if not name.startswith("_")} == {
-            "columns", "count", "description", "fetchall", "fetchone", "limit", "pl", "project", "types",
+            "columns", "count", "description", "fetchall", "fetchone", "limit", "pl", "project", "to_text", "types",
         }  # fmt: skip
         assert {name for name in dir(connection) if not name.startswith("_")} == {"close", "execute", "sql"}
         assert found.columns == [column[0] for column in found.description] == ["vehicle_id", "class"]

@@ -79,7 +79,11 @@ def test_deaths_at_random_moments(root: Path, nursery: Nursery):
     manifest = load(root)
     assert find_files(root) == manifest.live_paths() | {item.path for item in manifest.retired}
     assert {item.generation for item in manifest.retired} == {manifest.generation, manifest.generation - 1}
-    assert sorted(path.name for path in root.iterdir() if path.name.startswith(".")) == [".lock"]
+    assert sorted(path.name for path in root.iterdir() if path.name.startswith(".")) == [
+        ".files",
+        ".lock",
+        ".session",
+    ]
     assert not [path for path in root.rglob("*") if path.is_dir() and not any(path.iterdir())]
 
 

@@ -26,7 +26,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_macro_reads_its_subset_and_no_other(several: Path, tmp_path: Path, name: str):
     root = tmp_path / "lake"
     shutil.copytree(several, root)
-    for file in root.glob("*/*/subset=[bc]/*.parquet"):
+    for file in root.glob(".files/*/*/subset=[bc]/*.parquet"):
         file.write_bytes(b"x" * file.stat().st_size)
     with connect(several) as whole, connect(root) as connection:
         expected = whole.sql(f"FROM {call(name)}").fetchall()

@@ -53,7 +53,7 @@ HOLD = (
 
 
 def status_path(number: int) -> str:
-    return f"subset_status/dataset=highd/subset=01-upper/part-{number:016x}.parquet"
+    return f".files/subset_status/dataset=highd/subset=01-upper/part-{number:016x}.parquet"
 
 
 def commit_status(root: Path, number: int | None) -> None:
@@ -114,13 +114,13 @@ def test_any_sequence_of_sessions_keeps_exactly_what_is_live_or_lately_replaced(
                 writer.commit(put(root, subset, number, make_status(subset, number), **values))
                 if contents.get(subset) != number:
                     generation, changed = generation + (not changed), True
-                    path = f"subset_status/dataset=highd/subset={subset}/part-"
+                    path = f".files/subset_status/dataset=highd/subset={subset}/part-"
                     if subset in contents:
                         replaced[f"{path}{contents[subset]:016x}.parquet"] = generation
                     replaced.pop(f"{path}{number:016x}.parquet", None)
                     contents[subset] = number
         replaced = {path: since for path, since in replaced.items() if since > generation - 2}
-        live = {f"subset_status/dataset=highd/subset={s}/part-{n:016x}.parquet" for s, n in contents.items()}
+        live = {f".files/subset_status/dataset=highd/subset={s}/part-{n:016x}.parquet" for s, n in contents.items()}
         assert find_files(root) == live | replaced.keys()
         assert load(root).generation == generation
         found = scan(root, load(root), SUBSET_STATUS).collect()

@@ -121,7 +121,7 @@ def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(raw, t
         finished.commits["ingest/highd/04"].fingerprint,
     )
     # Files that were removed are made again, and a changed file is another content.
-    shutil.rmtree(root / "tracks")
+    shutil.rmtree(root / ".files" / "tracks")
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     with (raw / "04_tracks.csv").open("a") as file:
         file.write("\n")

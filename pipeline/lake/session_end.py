@@ -1,0 +1,47 @@
+"""The end of a writing session: what it leaves is recorded, so that one that was broken off is noticed later."""
+
+import json
+from pathlib import Path
+
+from tracklake.pipeline.lake.catalog import CATALOG
+from tracklake.pipeline.lake.checksums import hash_file
+from tracklake.pipeline.lake.files import REPORTS, STAGING, find_orphans
+from tracklake.pipeline.lake.live_folders import is_shown
+from tracklake.pipeline.lake.manifest import MANIFEST, Manifest
+from tracklake.schemas.files import list_unfinished, write_file
+
+SESSION = ".session"
+"""File of the lake with the checksums of the manifest and the catalog at the end of the last session."""
+LOCK = ".lock"
+"""Name of the lock's file in the lake; it names the process that writes, and is empty after a session's end."""
+
+
+def record_end(root: Path) -> None:
+    """Record that manifest and catalog belong together; a session's last step but the release of the lock."""
+    write_file(root / SESSION, json.dumps(_describe_state(root)).encode())
+
+
+def is_settled(root: Path, manifest: Manifest) -> bool:
+    """Return whether the last session came to its end, nothing has changed since, and none is going on."""
+    try:
+        return not (root / LOCK).stat().st_size and has_ended(root, manifest)
+    except OSError:
+        return False
+
+
+def has_ended(root: Path, manifest: Manifest) -> bool:
+    """Return whether a session's end has been reached since the manifest and the catalog were changed.
+
+    The catalog is then the one made of this manifest, the live folders show what is live, and nothing is left lying.
+    """
+    try:
+        if json.loads((root / SESSION).read_text(encoding="utf-8")) != _describe_state(root):
+            return False
+    except (OSError, ValueError):
+        return False
+    leftovers = (root / STAGING).exists() or list_unfinished(root) or list_unfinished(root / REPORTS)
+    return not leftovers and not find_orphans(root, manifest) and is_shown(root, manifest)
+
+
+def _describe_state(root: Path) -> dict[str, str]:
+    return {name: hash_file(root / name, again=True) for name in (MANIFEST, CATALOG)}
