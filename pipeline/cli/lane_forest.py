@@ -86,47 +86,18 @@ def lane_forest(
     with command(quiet=quiet, json=json) as terminal:
         if use and (seed, examples, augment, settings_given) != (None,) * 4:
             raise typer.BadParameter("--use scores a forest as it is: give no --seed, --examples, --augment or --set")
-        forest_settings = _read_forest_settings(examples, augment, settings_given or [])
+        wanted = None if use else _read_forest_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
         comparable = print_comparability(terminal, settings.lake, folder, published=True)
         out = settings.lake / RUNS / FOLDER
-        if use:
-            forest = _open_forest(out / FOREST, folder)
-            forest_settings = LaneForestSettings.read(forest.facts["settings"])
-        else:
-            forest = fit_lane_forest(folder, seed or 0, forest_settings)
-            with explain_file_errors(out):
-                out.mkdir(parents=True, exist_ok=True)
-                (out / SCORES).unlink(missing_ok=True)  # of another forest
-                forest.save(out / FOREST)
-        skipped: dict[str, str] = {}
-
-        def skip(name: str, why: str) -> None:
-            skipped[name] = why
-            terminal.print_problem(f"{name}: {why}", label="skipped")
-
-        predictors, reads = _find_predictors(settings.lake / RUNS, folder, runs or [], skip)
-        scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=skip)
-        record = {
-            "forest": forest.facts,
-            "features": list(forest.names),
-            **asdict(scores),
-            "learning_curve": [],
-            "passed_by": skipped,
-        }
+        forest = _open_forest(out / FOREST, folder) if wanted is None else _fit_forest(out, folder, seed or 0, wanted)
+        record = _score_forest(terminal, settings.lake / RUNS, folder, forest, runs or [], published=bool(comparable))
         _write_scores(out / SCORES, record)
-        _show_scores(terminal, folder, scores, forest, published=bool(comparable))
-        no_curve = ""
+        no_curve = None
         if learning_curve:
-            try:
-                curve = learn_curve(folder, settings=forest_settings)
-            except TracklakeError as impossible:
-                no_curve = str(impossible)
-            else:
-                record["learning_curve"] = [asdict(point) for point in curve]
-                _write_scores(out / SCORES, record)
-                _show_curve(terminal, curve)
+            no_curve = _add_curve(terminal, record, folder, forest.settings)
+            _write_scores(out / SCORES, record)
         terminal.print_line(
             f"forest {out / FOREST}; coefficients of all features and scores by stratum: {out / SCORES}"
         )
@@ -161,8 +132,47 @@ def _open_forest(file: Path, folder: TensorFolder) -> LaneForest:
     return forest
 
 
-def _write_scores(file: Path, record: dict[str, Any]) -> None:
+def _fit_forest(out: Path, folder: TensorFolder, seed: int, settings: LaneForestSettings) -> LaneForest:
+    """Fit a forest and store it; the scores of an earlier forest are removed before."""
+    forest = fit_lane_forest(folder, seed, settings)
+    with explain_file_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / SCORES).unlink(missing_ok=True)
+        forest.save(out / FOREST)
+    return forest
 
+
+def _score_forest(
+    terminal: Terminal, models: Path, folder: TensorFolder, forest: LaneForest, runs: list[str], *, published: bool
+) -> dict[str, Any]:
+    """Score a forest beside models and runs, print the scores, and return the record that is stored."""
+    skipped: dict[str, str] = {}
+
+    def skip(name: str, why: str) -> None:
+        skipped[name] = why
+        terminal.print_problem(f"{name}: {why}", label="skipped")
+
+    predictors, reads = _find_predictors(models, folder, runs, skip)
+    scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=skip)
+    _show_scores(terminal, folder, scores, forest, published=published)
+    features = list(forest.names)
+    return {"forest": forest.facts, "features": features, **asdict(scores), "learning_curve": [], "skipped": skipped}
+
+
+def _add_curve(
+    terminal: Terminal, record: dict[str, Any], folder: TensorFolder, settings: LaneForestSettings
+) -> str | None:
+    """Fit the learning curve, print it and add it to the record; the reason where it is impossible."""
+    try:
+        curve = learn_curve(folder, settings=settings)
+    except TracklakeError as impossible:
+        return str(impossible)
+    record["learning_curve"] = [asdict(point) for point in curve]
+    _show_curve(terminal, curve)
+    return None
+
+
+def _write_scores(file: Path, record: dict[str, Any]) -> None:
     write_file(file, json_format.dumps(record, indent=1, allow_nan=False).encode())
 
 
@@ -221,7 +231,6 @@ def _show_left_out(terminal: Terminal, horizon_s: float, start_s: float, scores:
 
 
 def _show_curve(terminal: Terminal, curve: list[LearningPoint]) -> None:
-
     points = [
         [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_format_percent, figures)]
         for own in curve

@@ -52,7 +52,7 @@ def test_the_forest_and_its_scores_are_stored(done, copied):
     }
     assert stored["left_out"] == sum(stored["left_out_by_reason"].values())
     assert tuple(stored["left_out_by_reason"]) == LEFT_OUT
-    assert (stored["learning_curve"], stored["passed_by"]) == ([], {})
+    assert (stored["learning_curve"], stored["skipped"]) == ([], {})
     assert str(folder / "forest.skops") in done.out
 
 
@@ -116,7 +116,7 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
     assert [own for own in reported["cells"] if own["model"] == "good"] == [own | {"model": "good"} for own in straight]
     assert [own for own in reported["cells"] if own["model"] != "good"] == scored["cells"]
     assert json.loads(alone.out)["cells"] == reported["cells"]
-    assert json.loads(alone.out)["passed_by"] == {}, "it was not asked for"
+    assert json.loads(alone.out)["skipped"] == {}, "it was not asked for"
     assert refused.code == 1
     assert "were in its training part" in refused.err
     reasons = {
@@ -125,11 +125,11 @@ def test_a_stored_forest_is_scored_again_beside_new_runs(command, copied, kept):
         "of-an-unknown-model": "unknown model `crystal-ball`",
         "on-these-recordings": "were in its training part",
     }
-    assert reported["passed_by"].keys() == reasons.keys()
+    assert reported["skipped"].keys() == reasons.keys()
     for name, reason in reasons.items():
-        assert reason in reported["passed_by"][name]
+        assert reason in reported["skipped"][name]
         assert f"skipped: {name}: " in finished.err
-    assert written["passed_by"] == reported["passed_by"]
+    assert written["skipped"] == reported["passed_by"]
 
 
 def test_settings_are_the_forests(command, copied, kept):

@@ -170,7 +170,7 @@ class Short:
         (Short(), r"expected places of shape \(10, 4, 2\), got \(10, 3, 2\)"),
     ],
 )
-def test_places_that_are_none_are_refused_or_their_model_is_passed_by(one_change, model, message):
+def test_places_that_are_none_are_refused_or_their_model_is_skipped(one_change, model, message):
     """A cell of NaN would be the middle one."""
     forest, straight = constant_forest("k", "k", "k", "k"), {"straight": ConstantVelocity(SHORT)}
     with pytest.raises(TracklakeError, match=message):
