@@ -52,6 +52,7 @@ docs: install
 	$(BIN)/python -m tracklake.schemas.markdown > docs/tables.md
 	$(BIN)/python -m tracklake.schemas.tensors_markdown > docs/tensors.md
 	$(BIN)/python -m tracklake.schemas.protocols_markdown > docs/protocols.md
+	$(BIN)/python -m tracklake.schemas.references_markdown > docs/references.md
 	$(BIN)/python -m tracklake.schemas.quality_markdown > docs/quality_json.md
 	$(BIN)/python -m tracklake.training.models.markdown > docs/models.md
 	$(BIN)/python -m tracklake.quality_reports.rules.markdown > docs/rules.md

@@ -3,7 +3,7 @@
     python benchmarks/split.py [--seeds N]
 
 117 subsets of six sites with 0.12 to 0.50 vehicles per lane and second, as highD has, and entries (78 k to 0.77 M);
-the numbers themselves are drawn. Beside them stands what the study that validates highD published of its own split.
+the numbers themselves are drawn. Beside them stands what Hamalainen (2020) published of its own split.
 """
 
 import argparse

@@ -9,9 +9,10 @@ from typing import cast
 
 from tracklake.schemas.completeness import PUBLISHED_TOTALS
 from tracklake.schemas.quality_tracks import IncomparableRecording, PublishedFigures, RecordingFacts
+from tracklake.schemas.references import HAMALAINEN
 
 SOURCE = (
-    "the appendices of the study that validates NGSIM and highD (speeds averaged per vehicle and second, errors by the "
+    f"the appendices of {HAMALAINEN.name} (speeds averaged per vehicle and second, errors by the "
     "rules' default thresholds); vehicles and entries: the publishers' totals"
 )
 

@@ -110,20 +110,20 @@ PROTOCOLS = {
 """Protocols by name; the first is the default."""
 
 MEANINGS: Mapping[str, str] = {
-    "csp": "The windows of convolutional social pooling (Deo and Trivedi 2018), on a split that does not leak: "
+    "csp": "The windows of convolutional social pooling, Deo and Trivedi (2018), on a split that does not leak: "
     "flow-balanced, which is ours. Left open: the paper does not say how short a future may be; as its code, we ask "
     "for 0.2 s, and what is missing of the 5 s is masked.",
     "csp-2018": "The same windows on the split of that paper's code: every recording cut at 70 and 80 % of its highest "
     "vehicle id. For comparison with published tables only: its parts share frames and neighbors, which "
     "`tracklake split` counts. Left open: the paper does not say that the cut is by the highest id; its code does.",
-    "highd-flow-balanced": "The same windows on the flow-balanced split of carriageways, as the study that validated "
-    "that model on highD in 2020 evaluates. Left open: it publishes the balance that its split reaches, not the "
+    "highd-flow-balanced": "The same windows on the flow-balanced split of carriageways, as Hamalainen (2020), "
+    "who validated that model on highD, evaluates. Left open: it publishes the balance that its split reaches, not the "
     "split.",
-    "mha-2020": "Multi-head attention on highD (Kim et al. 2020): errors along and across the road up to 3 s. Left "
+    "mha-2020": "Multi-head attention on highD, Kim et al. (2020): errors along and across the road up to 3 s. Left "
     "open, and set by us: the length of the history (3 s), the rate (5 Hz), how short a future may be, and the split, "
     "which is unpublished (flow-balanced here).",
-    "grid-2021": "Lane change by random forest and occupancy grid (Choi et al. 2021): 2 s of history, 2 s of future at "
-    "10 Hz, 70 % of the recordings for training, mean absolute errors at every half second. Left open, and set by us: "
-    "which recordings train (drawn by `split_seed`), how short a future may be; its own recordings are not public.",
+    "grid-2021": "Lane change by random forest and occupancy grid, Choi et al. (2021): 2 s of history, 2 s of future "
+    "at 10 Hz, 70 % of the recordings for training, mean absolute errors at every half second. Left open, and set by "
+    "us: which recordings train (drawn by `split_seed`), how short a future may be; its own recordings are not public.",
 }
 """Meaning of each protocol: its source, and the choices that the source leaves open."""

@@ -4,6 +4,7 @@ import sys
 
 from tracklake.schemas.markdown import format_table
 from tracklake.schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
+from tracklake.schemas.references import link_references
 
 HEAD = """# Protocols
 
@@ -30,7 +31,7 @@ def write_protocols() -> str:
     lines += ["", "H and F are positions of a history, the sample's own included, and of a future. Headlines:", ""]
     lines += [f"- `{name}`: {meaning}" for name, meaning in HEADLINES.items()]
     for name in PROTOCOLS:
-        lines += ["", f"## {name}", "", MEANINGS[name]]
+        lines += ["", f"## {name}", "", link_references(MEANINGS[name])]
     return "\n".join(lines) + "\n"
 
 

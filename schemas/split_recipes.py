@@ -13,7 +13,7 @@ SPLIT_NAMES: tuple[SplitName, ...] = get_args(SplitName)
 FLOW_BALANCED, TIME_BLOCKS, CSP_2018, BY_RECORDING = SPLIT_NAMES
 
 MEANINGS: Mapping[str, str] = {
-    FLOW_BALANCED: "whole carriageways, chosen so that vehicles_per_lane_s (the study calls it flow) is distributed "
+    FLOW_BALANCED: "whole carriageways, chosen so that vehicles_per_lane_s (flow in Hamalainen (2020)) is distributed "
     "alike in all parts",
     TIME_BLOCKS: "stretches of time of a carriageway with a purge between them, allocated by the rule of flow-balanced",
     CSP_2018: "every carriageway cut at 70 and 80 % of its highest vehicle id, as conv-social-pooling's code does; for "

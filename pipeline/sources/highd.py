@@ -14,6 +14,7 @@ from tracklake.pipeline.sources.highd_rows import DIRECTION, add_directions, spl
 from tracklake.pipeline.sources.levelx import RECORDING, TRACKS, VEHICLES, LevelxFormat
 from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, SourceError, Subset
 from tracklake.pipeline.transforms.tracks.orientation import LOWER, UPPER, orient_highd
+from tracklake.schemas import references
 from tracklake.schemas.columns import Origin
 from tracklake.schemas.completeness import RECORDING_META, TRACKS_META
 from tracklake.schemas.raw_highd import (
@@ -181,8 +182,7 @@ HIGHD = Source(
     name="highd",
     title="highD: naturalistic vehicle trajectories on German highways",
     licence="non-commercial, on request from levelXdata (highd-dataset.com)",
-    citation="Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset. IEEE ITSC. "
-    "doi.org/10.1109/ITSC.2018.8569552",
+    citation=references.KRAJEWSKI.full,
     signature="highD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with the headers as shipped",
     version=2,
     detect=HIGHD_FORMAT.detect,

@@ -34,6 +34,7 @@ from tracklake.pipeline.sources.source import (
 )
 from tracklake.pipeline.transforms.tracks.identities import identify_vehicles
 from tracklake.pipeline.transforms.tracks.orientation import DIRECTIONS, orient_ngsim
+from tracklake.schemas import references
 from tracklake.schemas.columns import FOOT_M
 from tracklake.schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
@@ -237,8 +238,7 @@ NGSIM = Source(
     name="ngsim",
     title="Next Generation Simulation (NGSIM) vehicle trajectories",
     licence="public domain (U.S. Department of Transportation)",
-    citation="U.S. Department of Transportation Federal Highway Administration (2016). Next Generation Simulation "
-    "(NGSIM) Vehicle Trajectories and Supporting Data. doi.org/10.21949/1504477",
+    citation=references.NGSIM.full,
     signature="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
     "Global_Time, Local_X, Local_Y, v_Vel",
     version=3,

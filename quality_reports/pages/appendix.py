@@ -1,4 +1,4 @@
-"""Tables of speeds and errors as in the validating study, each row of the lake followed by the published one."""
+"""Tables of speeds and errors as in Hamalainen (2020), each row of the lake followed by the published one."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,13 +9,13 @@ from tracklake.schemas.quality import Quality
 from tracklake.schemas.quality_tracks import PublishedFigures
 
 FIGURES = ("min_mps", "p2_5_mps", "median_mps", "p97_5_mps", "max_mps", "mean_mps", "std_mps")
-"""Columns of speeds_per_second.sql that the study publishes, in m/s."""
+"""Columns of speeds_per_second.sql that Hamalainen (2020) publishes, in m/s."""
 COUNTED = (
     ("headway", "negative_headway_recorded"),
     ("acceleration", "high_acceleration"),
     ("slow", "low_constant_speed"),
 )
-"""Errors that the study counts, and the rules that count them in the same way."""
+"""Errors that Hamalainen (2020) counts, and the rules that count them in the same way."""
 COUNTS = ("vehicles", "vehicle_share", "entries", "entry_share")
 """Figures of each of these errors."""
 
@@ -38,7 +38,7 @@ def compare_speeds(quality: Quality) -> list[Row]:
 
 
 def count_errors(quality: Quality) -> list[Row]:
-    """Count the study's three errors per dataset and subset, each row followed by the published one where there is one.
+    """Count the three errors of Hamalainen (2020) per dataset and subset, each row followed by the published one.
 
     Returns:
         Rows with label, dataset, subset, is_published and, for each error, `<error>_<count>` of COUNTED and COUNTS.

@@ -17,6 +17,7 @@ from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, collect
 from tracklake.schemas.quality import Provenance, Quality
+from tracklake.schemas.references import EDIE, HAMALAINEN, Reference, find_references
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
                 for row in rule["subsets"]
             },
             settings=flatten(_omit_files(quality["provenance"])),
+            references=_list_references(quality),
             compared_speeds=compare_speeds(quality),
             counted_errors=count_errors(quality),
             compared_splits=compare_splits(quality["splits"]),
@@ -90,6 +92,11 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
             horizons=sorted({row["seconds"] for score in quality["model_scores"] for row in score["rows"]}),
         )
     )
+
+
+def _list_references(quality: Quality) -> list[Reference]:
+    """List the references of what the page shows: of its rules, of its flows and of published figures."""
+    return find_references(" ".join([HAMALAINEN.name, EDIE.name, *(rule["source"] for rule in quality["rules"])]))
 
 
 def _omit_files(provenance: Provenance) -> dict[str, object]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.rules.rule import Case
 from tracklake.schemas.markdown import format_table
+from tracklake.schemas.references import link_references
 
 HEAD = """# Rules
 
@@ -44,7 +45,7 @@ def _write_section(rule: Rule) -> Iterator[str]:
     yield f"- Thresholds: {', '.join(thresholds)}"
     yield f"- Reads: {', '.join(f'`{name}`' for name in rule.columns)}"
     yield f"- Compared: {rule.compared}"
-    yield f"- Source: {rule.source}"
+    yield f"- Source: {link_references(rule.source)}"
     yield ""
     yield from _write_example(rule.case)
     yield ""

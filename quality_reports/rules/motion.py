@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.quality_reports.rules.rule import DESIGN, PUNZO, Case, Rule, Threshold, recorded
+from tracklake.quality_reports.rules.rule import DESIGN, PUNZO, STUDY, Case, Rule, Threshold, recorded
 
 HIGH_ACCELERATION = Rule(
     name="high_acceleration",
@@ -10,7 +10,7 @@ HIGH_ACCELERATION = Rule(
     unit="m/s2",
     thresholds=(Threshold("high_acceleration_mps2", 3.05, "m/s2"),),
     meaning="the recorded acceleration exceeds the threshold (10 ft/s², rounded up)",
-    source=f"{DESIGN}; implausible accelerations in NGSIM: {PUNZO}",
+    source=f"{STUDY}; {DESIGN}; implausible accelerations in NGSIM: {PUNZO}",
     breaks=lambda limits: pl.col("accel_mps2") > recorded(limits["high_acceleration_mps2"]),
     value=pl.col("accel_mps2"),
     extreme="max",
@@ -25,7 +25,7 @@ LOW_CONSTANT_SPEED = Rule(
     thresholds=(Threshold("low_constant_speed_mps", 1.524, "m/s"),),
     meaning="the recorded speed is above zero and at most the threshold (5 ft/s exactly) while the recorded "
     "acceleration is exactly zero: a frozen measurement rather than a crawling vehicle",
-    source=DESIGN,
+    source=f"{STUDY}; {DESIGN}",
     breaks=lambda limits: (
         (pl.col("speed_mps") > 0)
         & (pl.col("speed_mps") <= recorded(limits["low_constant_speed_mps"]))
@@ -43,7 +43,7 @@ BACKWARD = Rule(
     unit="m/s",
     thresholds=(Threshold("backward_mps", 0.0, "m/s"),),
     meaning="the recorded speed along the direction of travel is below the threshold: the vehicle reverses",
-    source=f"{DESIGN}; known of highD recordings 25, 26 and 36",
+    source=f"{STUDY}: highD recordings 25, 26 and 36; {DESIGN}",
     breaks=lambda limits: pl.col("speed_mps") < recorded(limits["backward_mps"]),
     value=pl.col("speed_mps"),
     extreme="min",

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.quality_reports.rules.rule import COIFMAN, DESIGN, Case, Limits, Rule, Threshold, recorded
+from tracklake.quality_reports.rules.rule import COIFMAN, DESIGN, STUDY, Case, Limits, Rule, Threshold, recorded
 
 NEGATIVE_HEADWAY = Rule(
     name="negative_headway",
@@ -10,7 +10,7 @@ NEGATIVE_HEADWAY = Rule(
     unit="m",
     thresholds=(Threshold("negative_headway_m", 0.0, "m"),),
     meaning="the bumper-to-bumper gap to the leader, from positions, is below the threshold: two vehicles overlap",
-    source=f"{DESIGN}; found in NGSIM by {COIFMAN}",
+    source=f"{STUDY}; {DESIGN}; found in NGSIM by {COIFMAN}",
     breaks=lambda limits: pl.col("gap_m") < limits["negative_headway_m"],
     value=pl.col("gap_m"),
     extreme="min",
@@ -26,7 +26,7 @@ NEGATIVE_HEADWAY_RECORDED = Rule(
     meaning="the recorded headway less the leader's length is below the threshold, whatever the positions say: how the "
     "published counts were made. Headways recorded from bumper to bumper (those that are nearer to gap_m as they "
     "stand, in the subset's median) count without taking the length off again",
-    source=f"{DESIGN}; the published counts of NGSIM's negative headways",
+    source=f"{STUDY}, whose counts of NGSIM's negative headways it repeats; {DESIGN}",
     breaks=lambda limits: pl.col("recorded_gap_m") < limits["negative_headway_recorded_m"],
     value=pl.col("recorded_gap_m"),
     extreme="min",

@@ -7,14 +7,14 @@ from typing import Any, Literal
 import polars as pl
 
 from tracklake.quality_reports.rules.derived import trace
+from tracklake.schemas import references
 
 Severity = Literal["error", "warning", "info"]
 Limits = Mapping[str, float]
 """Values of thresholds by name."""
 
 DESIGN = "docs/DESIGN.md, section 5"
-COIFMAN = "Coifman and Li (2017)"
-PUNZO = "Punzo, Borzacchiello and Ciuffo (2011)"
+STUDY, COIFMAN, PUNZO = references.HAMALAINEN.name, references.COIFMAN.name, references.PUNZO.name
 """Sources that several rules cite."""
 
 

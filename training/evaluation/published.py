@@ -8,32 +8,14 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from tracklake.schemas import references
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 
-DEO_2018 = (
-    "Deo and Trivedi 2018, Convolutional Social Pooling for Vehicle Trajectory Prediction, IEEE/CVF CVPR Workshops, "
-    "1468-1476, doi 10.1109/CVPRW.2018.00196"
-)
-VALIDATION_2020 = "the study that validates convolutional social pooling on NGSIM and highD (2020)"
-MESSAOUD_2021 = (
-    "Messaoud, Yahiaoui, Verroust-Blondet and Nashashibi 2021, Attention Based Vehicle Trajectory Prediction, IEEE "
-    "Transactions on Intelligent Vehicles 6(1), 175-185, doi 10.1109/TIV.2020.2991952"
-)
-CHEN_2022 = (
-    "Chen, Zhang, Zhao, Hu, Tan and Yang 2022, Intention-Aware Vehicle Trajectory Prediction Based on Spatial-Temporal "
-    "Dynamic Attention Network for Internet of Vehicles, IEEE Transactions on Intelligent Transportation Systems "
-    "23(10), 19471-19483, doi 10.1109/TITS.2022.3170551"
-)
-QUOTED_ON_HIGHD = "convolutional social pooling on highD, as later comparisons quote it"
-KIM_2020 = (
-    "Kim, Kim, Kim, Cho and Huh 2020, Multi-Head Attention based Probabilistic Vehicle Trajectory Prediction, IEEE "
-    "Intelligent Vehicles Symposium, arXiv 2004.03842; its split is unpublished"
-)
-CHOI_2021 = (
-    "Choi, Yim, Baek and Lee 2021, Machine Learning-Based Vehicle Trajectory Prediction Using V2V Communications and "
-    "On-Board Sensors, Electronics 10(4), 420, doi 10.3390/electronics10040420; 932 trajectories of the authors' own "
-    "vehicles"
-)
+DEO_2018, HAMALAINEN_2020 = references.DEO.full, references.HAMALAINEN.full
+MESSAOUD_2021, CHEN_2022 = references.MESSAOUD.full, references.CHEN.full
+KIM_2020 = f"{references.KIM.full}; its split is unpublished"
+CHOI_2021 = f"{references.CHOI.full}; 932 trajectories of the authors' own vehicles"
+QUOTED_ON_HIGHD = f"{references.DEO.name} on highD, as later comparisons quote it"
 
 OWN_DATA = "own"
 """Name of the dataset of figures on recordings that only their authors have."""
@@ -80,11 +62,11 @@ PUBLISHED = (
     _rmse("v-lstm", DEO_2018, "ngsim", 0.68, 1.65, 2.91, 4.46, 6.27),
     _rmse("cs-lstm", DEO_2018, "ngsim", 0.61, 1.27, 2.09, 3.10, 4.37),
     _rmse("cs-lstm-m", DEO_2018, "ngsim", 0.62, 1.29, 2.13, 3.20, 4.52),
-    _rmse("cs-lstm-m", VALIDATION_2020, "ngsim", 0.59, 1.29, 2.14, 3.18, 4.48),
+    _rmse("cs-lstm-m", HAMALAINEN_2020, "ngsim", 0.59, 1.29, 2.14, 3.18, 4.48),
     _rmse("MHA-LSTM", MESSAOUD_2021, "ngsim", 0.41, 1.01, 1.74, 2.67, 3.83),
     _rmse("STDAN", CHEN_2022, "ngsim", 0.42, 1.01, 1.69, 2.56, 3.67),
     _rmse("cs-lstm", QUOTED_ON_HIGHD, "highd", 0.22, 0.61, 1.24, 2.10, 3.27),
-    _rmse("cs-lstm-m", VALIDATION_2020, "highd", 0.26, 0.78, 1.54, 2.69, 7.85),
+    _rmse("cs-lstm-m", HAMALAINEN_2020, "highd", 0.26, 0.78, 1.54, 2.69, 7.85),
     _both_axes("kalman-cv", (0.71, 1.67, 3.41), (0.17, 0.55, 1.31)),
     _both_axes("v-lstm", (0.72, 1.94, 3.81), (0.13, 0.31, 0.65)),
     _both_axes("lstm-encoder-decoder", (0.69, 1.77, 3.21), (0.14, 0.32, 0.58)),
@@ -95,10 +77,10 @@ PUBLISHED = (
     _mae("stacked-lstm", 0.62, 1.19, 1.42, 1.81),
     _mae("lstm-encoder-decoder", 0.58, 0.82, 1.23, 1.47),
 )
-"""Published lines. The validating study's own line is the model with maneuvers: it gives braking accuracies as well."""
+"""Published lines. The line of Hamalainen (2020) is the model with maneuvers: it gives braking accuracies as well."""
 
 BRAKING_ACCURACY = {"ngsim": 0.8929, "highd": 0.9994}
-"""Accuracy of longitudinal maneuvers in the validating study, by dataset; the same at every horizon of its lines."""
+"""Accuracy of longitudinal maneuvers in Hamalainen (2020), by dataset; the same at every horizon of its lines."""
 
 CELL_ACCURACY_S = _HALVES
 """Horizons of CELL_ACCURACY, s."""
@@ -126,7 +108,7 @@ def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl
             **shared,
             **{name: getattr(line, name) for name in ("model", "reference", "dataset")},
             "seconds": seconds,
-            "longitudinal_accuracy": BRAKING_ACCURACY[line.dataset] if line.reference == VALIDATION_2020 else None,
+            "longitudinal_accuracy": BRAKING_ACCURACY[line.dataset] if line.reference == HAMALAINEN_2020 else None,
             **{name: values[at] for name, values in line.figures.items()},
         }
         for line in lines

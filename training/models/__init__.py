@@ -8,6 +8,7 @@ from itertools import accumulate
 from typing import Any, Literal
 from typing import Protocol as Interface
 
+from tracklake.schemas import references
 from tracklake.schemas.errors import MissingExtraError, UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.models.prediction import Prediction
@@ -71,7 +72,7 @@ class Model:
     Args:
         name: name on the command line.
         meaning: one line for the documentation.
-        source: publication; empty where the model is ours.
+        source: publication, by its name in `schemas.references`; empty where the model is ours.
         module: module of `training.models`, imported only when the model is built.
         builder: class in the module; takes the protocol, and the parameters as keywords.
         parameters: the model's own parameters with their defaults.
@@ -104,11 +105,13 @@ class Model:
         return make(protocol, **{**self.parameters, **parameters})
 
 
-DEO = "Deo and Trivedi 2018, Convolutional Social Pooling for Vehicle Trajectory Prediction (CVPR workshops)"
-BAR_SHALOM = "Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2"
-SCHUBERT = "Schubert, Richter and Wanielik 2008, Comparison and evaluation of advanced motion models"
-KIM = "Kim et al. 2020, Multi-Head Attention based Probabilistic Vehicle Trajectory Prediction (IEEE IV)"
-CHOI = "Choi et al. 2021, random-forest lane change and LSTM encoder-decoder on an occupancy grid"
+DEO, BAR_SHALOM, SCHUBERT = (
+    references.DEO.name,
+    f"{references.BAR_SHALOM.name}, section 6.2.2",
+    references.SCHUBERT.name,
+)
+KIM, CHOI = references.KIM.name, references.CHOI.name
+"""Publications of the models, by name."""
 
 _SQUARED = (Phase("mse", 8),)
 _CONVOLUTIONAL = Recipe((Phase("mse", 5), Phase("nll", 3)))

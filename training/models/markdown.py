@@ -2,6 +2,7 @@
 
 import sys
 
+from tracklake.schemas.references import link_references
 from tracklake.training.models import MODELS, Model
 
 _HEAD = """\
@@ -24,7 +25,7 @@ def write_models() -> str:
 def _describe(model: Model) -> str:
     """Return the section of one model."""
     lines = [f"## {model.name}", "", f"{model.meaning[0].upper()}{model.meaning[1:]}.", ""]
-    lines += [f"- source: {model.source or 'ours'}", f"- reads: the {model.reads}"]
+    lines += [f"- source: {link_references(model.source) or 'ours'}", f"- reads: the {model.reads}"]
     if model.parameters:
         lines.append(f"- parameters: {', '.join(f'`{name}` = {value}' for name, value in model.parameters.items())}")
     if (recipe := model.recipe) is not None:

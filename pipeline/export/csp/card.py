@@ -5,6 +5,7 @@ from pathlib import Path
 
 from tracklake.pipeline.export.csp.result import CspExport
 from tracklake.pipeline.transforms.csp.parts import REASONS
+from tracklake.schemas.references import DEO
 
 CARD = "DATA_CARD.md"
 """Name of the card's file."""
@@ -36,7 +37,7 @@ def write_card(path: Path, export: CspExport) -> None:
         "# TrainSet.mat, ValSet.mat, TestSet.mat",
         "",
         f"Written by tracklake {version('tracklake')}: `tracklake {' '.join(('export csp', *options))}`, in the format",
-        "of conv-social-pooling (Deo and Trivedi 2018, github.com/nachiket92/conv-social-pooling).",
+        f"of conv-social-pooling (github.com/nachiket92/conv-social-pooling): {DEO.full}",
         "",
         *([f"**{export.synthetic}**", ""] if export.synthetic else []),
         CLEAN if export.options.clean else ORIGINAL,

@@ -39,8 +39,8 @@ def allocate_flow_balanced(
     Coverage is counted in missing (site, direction, part), shares in vehicles. A constraint that cannot be met is
     `relaxed`, with the reason. Among the allocations that meet the constraints best, the one is chosen with the least
     sum, over pairs of parts, of the absolute differences of the weighted mean and of the weighted population standard
-    deviation of `vehicles_per_lane_s`, which the study calls flow; among equals the one with the larger standard
-    deviation in eval.
+    deviation of `vehicles_per_lane_s`, which Hamalainen (2020) calls flow; among equals the one with the larger
+    standard deviation in eval.
 
     If subsets are given in blocks, all of this applies to blocks.
 

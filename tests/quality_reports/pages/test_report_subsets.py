@@ -299,7 +299,7 @@ def test_the_published_figures_add_up():
         "slow_vehicles",
     ):
         assert sum(part[name] for part in parts) == whole["ngsim"][name], name
-    # As the study says of all: 10.51 % of the vehicles with negative headways, 3.30 % at low constant speeds.
+    # As Hamalainen (2020) says of all: 10.51 % of the vehicles with negative headways, 3.30 % at low constant speeds.
     assert f"{whole['ngsim']['headway_vehicles'] / whole['ngsim']['vehicles']:.2%}" == "10.51%"
     assert f"{whole['ngsim']['slow_vehicles'] / whole['ngsim']['vehicles']:.2%}" == "3.30%"
 

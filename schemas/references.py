@@ -1,0 +1,166 @@
+"""References: every publication and data set that definitions, rules, models and figures come from, in full.
+
+docs/references.md is derived from this list; other generated pages link to it by `link_references`.
+"""
+
+import re
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A publication or a data set.
+
+    Args:
+        name: authors and year as texts cite them, for example `Deo and Trivedi (2018)`.
+        text: full reference: authors, year, title, place, pages.
+        used_for: what tracklake takes from it.
+        doi: digital object identifier; empty without one.
+        url: address, where there is no identifier.
+    """
+
+    name: str
+    text: str
+    used_for: str
+    doi: str = ""
+    url: str = ""
+
+    @property
+    def address(self) -> str:
+        """Web address; empty where none is known."""
+        return f"https://doi.org/{self.doi}" if self.doi else self.url
+
+    @property
+    def full(self) -> str:
+        """Full reference in one line, with its address where there is one."""
+        return f"{self.text} {self.address}".rstrip()
+
+    @property
+    def anchor(self) -> str:
+        """Anchor of its heading in docs/references.md."""
+        return re.sub(r"[^a-z0-9 -]", "", self.name.lower()).replace(" ", "-")
+
+
+HAMALAINEN = Reference(
+    "Hamalainen (2020)",
+    "Hamalainen, D. (2020). Validation of a Machine-Learning Based Vehicle Trajectory Prediction Model with Improved "
+    "Data and Data Management. Papers in Resource Analysis 23, Saint Mary's University of Minnesota.",
+    "error counts and speeds of NGSIM and highD, late starts, the flow-balanced split, excluded subsets, scores of "
+    "convolutional social pooling with maneuvers",
+)
+NGSIM = Reference(
+    "NGSIM (2016)",
+    "U.S. Department of Transportation Federal Highway Administration (2016). Next Generation Simulation (NGSIM) "
+    "Vehicle Trajectories and Supporting Data.",
+    "the data set, its units and meanings",
+    doi="10.21949/1504477",
+)
+KRAJEWSKI = Reference(
+    "Krajewski et al. (2018)",
+    "Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset: A Drone Dataset of Naturalistic "
+    "Vehicle Trajectories on German Highways for Validation of Highly Automated Driving Systems. IEEE International "
+    "Conference on Intelligent Transportation Systems (ITSC), 2118-2125.",
+    "the highD data set and its format",
+    doi="10.1109/ITSC.2018.8569552",
+)
+COIFMAN = Reference(
+    "Coifman and Li (2017)",
+    "Coifman, B., Li, L. (2017). A critical evaluation of the Next Generation Simulation (NGSIM) vehicle trajectory "
+    "dataset. Transportation Research Part B 105, 362-377.",
+    "errors known in NGSIM: negative gaps and overlapping vehicles",
+    doi="10.1016/j.trb.2017.09.018",
+)
+PUNZO = Reference(
+    "Punzo, Borzacchiello and Ciuffo (2011)",
+    "Punzo, V., Borzacchiello, M. T., Ciuffo, B. (2011). On the assessment of vehicle trajectory data accuracy and "
+    "application to the Next Generation SIMulation (NGSIM) program data. Transportation Research Part C 19(6), "
+    "1243-1262.",
+    "internal consistency, implausible accelerations and jerk",
+    doi="10.1016/j.trc.2010.12.007",
+)
+EDIE = Reference(
+    "Edie (1963)",
+    "Edie, L. C. (1963). Discussion of traffic stream measurements and definitions. Proceedings of the Second "
+    "International Symposium on the Theory of Traffic Flow, 139-154.",
+    "flow, density and speed over a region of time and space",
+)
+DEO = Reference(
+    "Deo and Trivedi (2018)",
+    "Deo, N., Trivedi, M. M. (2018). Convolutional Social Pooling for Vehicle Trajectory Prediction. IEEE/CVF CVPR "
+    "Workshops, 1468-1476.",
+    "protocol csp, the models v-lstm, cs-lstm and cs-lstm-m, the format of `export csp` "
+    "(code: https://github.com/nachiket92/conv-social-pooling)",
+    doi="10.1109/CVPRW.2018.00196",
+)
+KIM = Reference(
+    "Kim et al. (2020)",
+    "Kim, H., Kim, D., Kim, G., Cho, J., Huh, K. (2020). Multi-Head Attention based Probabilistic Vehicle Trajectory "
+    "Prediction. IEEE Intelligent Vehicles Symposium, 1720-1725.",
+    "protocol mha-2020 and the models attention-h2, -h4 and -h8; its split is unpublished",
+    url="https://arxiv.org/abs/2004.03842",
+)
+CHOI = Reference(
+    "Choi et al. (2021)",
+    "Choi, D., Yim, J., Baek, M., Lee, S. (2021). Machine Learning-Based Vehicle Trajectory Prediction Using V2V "
+    "Communications and On-Board Sensors. Electronics 10(4), 420.",
+    "protocol grid-2021, lane changes by random forest, grid cells, stacked-lstm and lstm-encoder-decoder; 932 "
+    "trajectories of the authors' own vehicles",
+    doi="10.3390/electronics10040420",
+)
+MESSAOUD = Reference(
+    "Messaoud et al. (2021)",
+    "Messaoud, K., Yahiaoui, I., Verroust-Blondet, A., Nashashibi, F. (2021). Attention Based Vehicle Trajectory "
+    "Prediction. IEEE Transactions on Intelligent Vehicles 6(1), 175-185.",
+    "published scores on NGSIM",
+    doi="10.1109/TIV.2020.2991952",
+)
+CHEN = Reference(
+    "Chen et al. (2022)",
+    "Chen, X., Zhang, H., Zhao, F., Hu, Y., Tan, C., Yang, J. (2022). Intention-Aware Vehicle Trajectory Prediction "
+    "Based on Spatial-Temporal Dynamic Attention Network for Internet of Vehicles. IEEE Transactions on Intelligent "
+    "Transportation Systems 23(10), 19471-19483.",
+    "published scores on NGSIM",
+    doi="10.1109/TITS.2022.3170551",
+)
+BAR_SHALOM = Reference(
+    "Bar-Shalom, Li and Kirubarajan (2001)",
+    "Bar-Shalom, Y., Li, X. R., Kirubarajan, T. (2001). Estimation with Applications to Tracking and Navigation. "
+    "Wiley, section 6.2.2.",
+    "the model kalman-cv",
+    doi="10.1002/0471221279",
+)
+SCHUBERT = Reference(
+    "Schubert, Richter and Wanielik (2008)",
+    "Schubert, R., Richter, E., Wanielik, G. (2008). Comparison and evaluation of advanced motion models for vehicle "
+    "tracking. 11th International Conference on Information Fusion.",
+    "the model ctrv",
+)
+GRAVES = Reference(
+    "Graves (2013)",
+    "Graves, A. (2013). Generating Sequences With Recurrent Neural Networks.",
+    "outputs as bivariate normal densities",
+    url="https://arxiv.org/abs/1308.0850",
+)
+
+REFERENCES = (
+    *(HAMALAINEN, NGSIM, KRAJEWSKI, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
+    GRAVES,
+)
+"""All references, the one whose method tracklake builds on first."""
+
+
+def link_references(text: str, page: str = "references.md") -> str:
+    """Turn the names of references in a Markdown text into links to their entries.
+
+    Args:
+        text: Markdown that cites references by name.
+        page: address of docs/references.md from the text's page.
+    """
+    for reference in REFERENCES:
+        text = text.replace(reference.name, f"[{reference.name}]({page}#{reference.anchor})")
+    return text
+
+
+def find_references(text: str) -> list[Reference]:
+    """Find the references that a text cites by name, in the order of REFERENCES."""
+    return [reference for reference in REFERENCES if reference.name in text]
