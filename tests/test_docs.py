@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from lake_sources import SAMPLE
+from simulated import simulate_once
 
 from tracklake.quality_reports.rules.markdown import write_rules
 from tracklake.quality_reports.rules.registry import RULES
@@ -28,7 +30,12 @@ def newcomer(command, lake, sample, tmp_path):
     return replace(command, folder=tmp_path)
 
 
-SHORTER = {"--seconds 60": "--seconds 1", "--minutes 0.2": "--minutes 0.1", "--examples 1000": "--examples 200"}
+SHORTER = {
+    "--seconds 60": "--seconds 1",
+    "--minutes 0.2 --seed 3": " ".join(SAMPLE),
+    "--examples 1000": "--examples 200",
+}
+"""Options of the README's commands with shorter ones; the sample is that of the session, simulated already."""
 
 
 @pytest.mark.usefixtures("plain_flows")
@@ -42,7 +49,8 @@ def test_the_commands_of_the_readme_run_as_printed(newcomer):
         shorter = line
         for printed, run in SHORTER.items():
             shorter = shorter.replace(printed, run)
-        done = (newcomer.here if number else newcomer.alone)(*shlex.split(shorter, comments=True)[1:])
+        with simulate_once():
+            done = (newcomer.here if number else newcomer.alone)(*shlex.split(shorter, comments=True)[1:])
         assert done.code == 0, f"{line}: {done.err}"
         assert done.out, line
 

@@ -24,29 +24,32 @@ def opened(lake):
         yield opened
 
 
-@pytest.fixture
-def workplace(lake, sample, tmp_path):
+def make_workplace(folder: Path, lake: Path, sample: Path) -> Path:
     """A user's folder with a lake, the sample, and packages of the user's own with the names of our folders."""
-    shutil.copytree(lake.root, tmp_path / "lake")
-    (tmp_path / "sample").symlink_to(sample)
+    shutil.copytree(lake, folder / "lake")
+    (folder / "sample").symlink_to(sample)
     for name in ("training", "schemas", "pipeline", "quality_reports"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text("raise ImportError('a folder of the user')\n")
-    return tmp_path
+        (folder / name).mkdir()
+        (folder / name / "__init__.py").write_text("raise ImportError('a folder of the user')\n")
+    return folder
 
 
-@pytest.mark.parametrize("code", [PAGE, CELLS], ids=["docs/python.md", "quickstart.ipynb"])
-def test_the_examples_run_beside_folders_of_the_same_names(workplace, command, code):
+def test_the_examples_run_beside_folders_of_the_same_names(lake, sample, tmp_path, command):
+    """Those of docs/python.md, then those of the notebook, each in a folder of its own."""
+    code = "import os\n"
+    for name, examples in (("page", PAGE), ("notebook", CELLS)):
+        folder = make_workplace(tmp_path / name, lake.root, sample)
+        code += f"os.chdir({str(folder)!r})\nexec({examples!r}, {{}})\nprint('finished')\n"
     done = subprocess.run(
-        [sys.executable, "-c", code + "\nprint('finished')"],
-        cwd=workplace,
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
         env=command.environment,
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "finished"
+    assert done.stdout.splitlines().count("finished") == 2
 
 
 def test_the_notebook_is_committed_without_outputs():

@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
 
@@ -12,7 +13,16 @@ import polars as pl
 import pytest
 from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
 
-from tracklake.pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
+from tracklake.pipeline.lake import (
+    QueryError,
+    connect,
+    load,
+    open_for_writing,
+    query,
+    query_errors,
+    scan,
+)
+from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
 
@@ -210,6 +220,13 @@ def lake(folder: Path) -> Path:
     return folder / "lake"
 
 
+@pytest.fixture(scope="module")
+def opened(folder: Path) -> Iterator[LakeConnection]:
+    """One connection for all: no statement may spoil it for the next."""
+    with connect(folder / "lake") as connection:
+        yield connection
+
+
 def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -240,9 +257,8 @@ def snapshot(folder: Path) -> dict[str, bytes]:
         ("PIVOT (SELECT 1 AS lane, 8 AS n) ON lane IN (1, 2) USING sum(n)", 8),
     ],
 )
-def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
-    with connect(lake) as connection:
-        row = query(connection, sql).fetchone()
+def test_what_reads_is_admitted(opened: LakeConnection, sql: str, first: object):
+    row = query(opened, sql).fetchone()
     assert row is not None
     assert row[0] == first
 
@@ -280,15 +296,14 @@ def test_what_reads_is_admitted(lake: Path, sql: str, first: object):
         "FROM read_csv('https://example.org/x.csv')", "FROM 's3://bucket/x.parquet'", "FROM lake", "SELECT ?",
     ],
 )  # fmt: skip
-def test_what_writes_or_looks_elsewhere_is_refused(lake: Path, folder: Path, sql: str):
+def test_what_writes_or_looks_elsewhere_is_refused(opened: LakeConnection, lake: Path, folder: Path, sql: str):
     filled = sql.format(lake=lake, out=folder / "out", secret=folder / "secret.csv")
     before = snapshot(folder)
-    with connect(lake) as connection:
-        # Some are refused on asking, the others when DuckDB first touches the file.
-        with pytest.raises(QueryError), query_errors():
-            query(connection, filled).fetchall()
-        assert connection.execute("SELECT count(*) FROM vehicles").fetchall() == [(3,)]
-        assert connection.execute("SELECT count(*) FROM duckdb_tables()").fetchall() == [(0,)]
+    # Some are refused on asking, the others when DuckDB first touches the file.
+    with pytest.raises(QueryError), query_errors():
+        query(opened, filled).fetchall()
+    assert opened.execute("SELECT count(*) FROM vehicles").fetchall() == [(3,)]
+    assert opened.execute("SELECT count(*) FROM duckdb_tables()").fetchall() == [(0,)]
     assert snapshot(folder) == before
 
 

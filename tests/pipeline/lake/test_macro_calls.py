@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import duckdb
@@ -10,6 +11,7 @@ from macro_lake import CALLS, CHANGES, PAIRS, call, put_subset
 
 from tracklake.pipeline.lake import QueryError, connect
 from tracklake.pipeline.lake.macros import MACROS
+from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import TRACKS
 
 
@@ -22,54 +24,64 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("name", CALLS)
-def test_a_macro_reads_its_subset_and_no_other(several: Path, tmp_path: Path, name: str):
-    root = tmp_path / "lake"
-    shutil.copytree(several, root)
+@pytest.fixture(scope="module")
+def opened(several: Path) -> Iterator[LakeConnection]:
+    with connect(several) as connection:
+        yield connection
+
+
+@pytest.fixture(scope="module")
+def unreadable(several: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LakeConnection]:
+    """The same lake, where nothing but subset a can be read."""
+    root = shutil.copytree(several, tmp_path_factory.mktemp("unreadable") / "lake")
     for file in root.glob(".files/*/*/subset=[bc]/*.parquet"):
         file.write_bytes(b"x" * file.stat().st_size)
-    with connect(several) as whole, connect(root) as connection:
-        expected = whole.sql(f"FROM {call(name)}").fetchall()
-        assert connection.sql(f"FROM {call(name)}").fetchall() == expected
-        for subset, parameters in (("'a'", None), ("$asked", {"asked": "a"})):
-            explained = f"EXPLAIN (ANALYZE, FORMAT json) FROM {call(name, subset)}"
-            plan = whole.sql(explained, parameters).fetchall()[0][1]
-            # Of four, or of one where the others were left out even earlier; for every reading there is.
-            counts = re.findall(r'"Scanning Files": "(\d+)/[14]"', plan)
-            assert counts == ["1"] * plan.count('"Function": "READ_PARQUET"')
-        with pytest.raises(duckdb.Error):
-            connection.sql("SELECT sum(x_m) FROM tracks").fetchall()
+    with connect(root) as connection:
+        yield connection
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_a_subset_of_two_data_sets_gives_both_apart(tmp_path: Path, name: str):
+def test_a_macro_reads_its_subset_and_no_other(opened: LakeConnection, unreadable: LakeConnection, name: str):
+    expected = opened.sql(f"FROM {call(name)}").fetchall()
+    assert unreadable.sql(f"FROM {call(name)}").fetchall() == expected
+    for subset, parameters in (("'a'", None), ("$asked", {"asked": "a"})):
+        explained = f"EXPLAIN (ANALYZE, FORMAT json) FROM {call(name, subset)}"
+        plan = opened.sql(explained, parameters).fetchall()[0][1]
+        # Of four, or of one where the others were left out even earlier; for every reading there is.
+        counts = re.findall(r'"Scanning Files": "(\d+)/[14]"', plan)
+        assert counts == ["1"] * plan.count('"Function": "READ_PARQUET"')
+    with pytest.raises(duckdb.Error):
+        unreadable.sql("SELECT sum(x_m) FROM tracks").fetchall()
+
+
+def test_a_subset_of_two_data_sets_gives_both_apart(tmp_path: Path):
     here = {"highd": PAIRS + CHANGES, "ngsim": [{**row, "x_m": row["x_m"] + 10.0} for row in PAIRS[:7] + CHANGES]}
-    expected = []
+    expected: dict[str, list] = {name: [] for name in CALLS}
     for dataset, entries in here.items():
         put_subset(tmp_path / dataset, entries, dataset=dataset)
         put_subset(tmp_path / "both", entries, dataset=dataset)
         with connect(tmp_path / dataset) as connection:
-            expected += connection.sql(f"FROM {call(name)}").fetchall()
+            for name, rows in expected.items():
+                rows += connection.sql(f"FROM {call(name)}").fetchall()
     with connect(tmp_path / "both") as connection:
-        assert connection.sql(f"FROM {call(name)}").fetchall() == expected
-    assert {row[0] for row in expected} == set(here)
+        for name, rows in expected.items():
+            assert connection.sql(f"FROM {call(name)}").fetchall() == rows, name
+            assert {row[0] for row in rows} == set(here), name
 
 
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.parametrize("alias", ["subsets", "entry", "asked", "tracks", "recording", "follower", "vehicle"])
-def test_arguments_may_be_columns_whatever_their_table_is_called(several: Path, name: str, alias: str):
+def test_arguments_may_be_columns_whatever_their_table_is_called(opened: LakeConnection, name: str, alias: str):
     """Never taken for a column of the macro's own tables, which would give every subset's rows for each."""
-    with connect(several) as connection:
-        expected = {
-            subset: connection.sql(f"SELECT count(*) FROM {call(name, repr(subset))}").fetchall()[0][0]
-            for subset in ("a", "c")
-        }
-        for argument in (f'"{alias}".subset', "subset"):
-            found = connection.sql(
-                f'SELECT asked_for, count(*) FROM (SELECT subset, subset AS asked_for FROM subsets) AS "{alias}",'
-                f" {call(name, argument)} AS given WHERE asked_for <> 'b' GROUP BY ALL"
-            ).fetchall()
-            assert dict(found) == {subset: rows for subset, rows in expected.items() if rows}
+    expected = {
+        subset: opened.sql(f"SELECT count(*) FROM {call(name, repr(subset))}").fetchall()[0][0] for subset in ("a", "c")
+    }
+    for argument in (f'"{alias}".subset', "subset"):
+        found = opened.sql(
+            f'SELECT asked_for, count(*) FROM (SELECT subset, subset AS asked_for FROM subsets) AS "{alias}",'
+            f" {call(name, argument)} AS given WHERE asked_for <> 'b' GROUP BY ALL"
+        ).fetchall()
+        assert dict(found) == {subset: rows for subset, rows in expected.items() if rows}
 
 
 def test_macros_take_named_arguments_and_parameters(several: Path):
@@ -86,37 +98,34 @@ def test_macros_take_named_arguments_and_parameters(several: Path):
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_a_querys_own_tables_do_not_take_the_lakes_place(several: Path, name: str):
+def test_a_querys_own_tables_do_not_take_the_lakes_place(opened: LakeConnection, name: str):
     names = ("tracks", "vehicles", "subsets", "asked", "entry", "recording", "counted", "cells", "lanes", "section")
     own = ", ".join(f"{name} AS (SELECT 1 AS one)" for name in names)
-    with connect(several) as connection:
-        expected = connection.sql(f"FROM {call(name)}").fetchall()
-        assert connection.sql(f"WITH {own} FROM {call(name)}").fetchall() == expected
+    expected = opened.sql(f"FROM {call(name)}").fetchall()
+    assert opened.sql(f"WITH {own} FROM {call(name)}").fetchall() == expected
 
 
-@pytest.mark.parametrize("name", CALLS)
-def test_the_catalog_carries_the_macros_also_after_a_move(several: Path, tmp_path: Path, monkeypatch, name: str):
+def test_the_catalog_carries_the_macros_also_after_a_move(opened, several: Path, tmp_path: Path, monkeypatch):
     shutil.copytree(several, tmp_path / "moved")
-    with connect(several) as connection:
-        expected = connection.sql(f"FROM {call(name)}").fetchall()
     monkeypatch.chdir(tmp_path / "moved")
     with duckdb.connect("catalog.duckdb", read_only=True) as plain:
-        assert plain.sql(f"FROM {call(name)}").fetchall() == expected
+        for name in CALLS:
+            query = f"FROM {call(name)}"
+            assert plain.sql(query).fetchall() == opened.sql(query).fetchall(), name
 
 
 @pytest.mark.parametrize("macro", MACROS, ids=lambda macro: macro.name)
-def test_a_macro_says_what_it_gives(several: Path, macro):
+def test_a_macro_says_what_it_gives(opened: LakeConnection, macro):
     """Its file's header: meaning, parameters with theirs, and all columns in order."""
     header = [line.removeprefix("--").strip() for line in macro.statement.splitlines() if line.startswith("--")]
     paragraphs = [part.split("\n") for part in "\n".join(header).split("\n\n")]
     assert paragraphs[0][0] == macro.meaning
     assert tuple(line.split(":")[0] for line in paragraphs[-2]) == macro.parameters
-    with connect(several) as connection:
-        columns = connection.sql(f"FROM {call(macro.name)}").columns
-        listed = connection.sql(
-            f"SELECT parameters, comment FROM duckdb_functions() WHERE function_name = '{macro.name}' AND NOT internal"
-        )
-        assert listed.fetchall() == [(list(macro.parameters), macro.meaning)]
+    columns = opened.sql(f"FROM {call(macro.name)}").columns
+    listed = opened.sql(
+        f"SELECT parameters, comment FROM duckdb_functions() WHERE function_name = '{macro.name}' AND NOT internal"
+    )
+    assert listed.fetchall() == [(list(macro.parameters), macro.meaning)]
     if macro.name == "track":
         assert columns == list(TRACKS.dtypes)
     else:

@@ -17,6 +17,8 @@ from tracklake.pipeline.lake import Commit, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas import SPLITS
 
+pytestmark = pytest.mark.usefixtures("empty_charts")
+
 LOW = {"high_acceleration_mps2": 1.0}
 
 
@@ -46,8 +48,9 @@ def put_split(root: Path, part_of_02: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Path:
+def whole(empty_charts, tmp_path_factory) -> Path:
     """Two recordings, validated, with their pages and the overview."""
+    del empty_charts
     raw, root = (tmp_path_factory.mktemp("pages") / name for name in ("raw", "lake"))
     for number in ("01", "02"):
         write_highd(raw, number)
