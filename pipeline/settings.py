@@ -27,6 +27,9 @@ class Settings(BaseSettings):
     runner: Literal["threads", "dask"] = Field(
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"
     )
+    refusals_fail: bool = Field(
+        False, description="a Prefect run that refused files ends as Failed, not as CompletedWithRefusals"
+    )
     dask_address: str | None = Field(None, description="address of a Dask scheduler; none: a cluster on this machine")
     thresholds: dict[str, float] = Field(
         default_factory=dict, description="thresholds of the rules by name, such as high_acceleration_mps2"

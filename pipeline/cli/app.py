@@ -30,7 +30,7 @@ COMMANDS = {
     "lane-forest": "Fit a forest that predicts lane changes; score it, and the grid cells that models predict.",
     "export": "Write the lake's data in other projects' formats.",
     "sample": "Generate recordings in the raw formats with SUMO, with known defects and their truth.",
-    "serve": "Serve the flows as Prefect deployments (run, ingest, quality) until interrupted.",
+    "serve": "Serve the flows as Prefect deployments, by hand or on a schedule, until interrupted.",
 }
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
 

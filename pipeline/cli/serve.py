@@ -1,18 +1,39 @@
 """`tracklake serve`: the flows as Prefect deployments."""
 
-import os
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from tracklake.pipeline.cli.command import FAILED, command
-from tracklake.pipeline.orchestration.flows import serve_deployments
+from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.options import LakeOption
+from tracklake.pipeline.orchestration.prefect_home import import_flows
+
+MIN_INTERVAL_S = 1.0
+"""Shortest time between two scheduled runs, in seconds."""
 
 
-def serve() -> None:
-    """Serve the flows as Prefect deployments (run, ingest, quality) until interrupted."""
-    if not os.environ.get("PREFECT_API_URL"):
-        typer.echo("PREFECT_API_URL is not set: no server would record the runs. Start one, for instance", err=True)
-        typer.echo("  prefect server start\n  export PREFECT_API_URL=http://127.0.0.1:4200/api", err=True)
-        raise typer.Exit(FAILED)
+def serve(
+    source: Annotated[
+        Path | None, typer.Argument(metavar="[SOURCE]", help="A raw file, or a folder to watch with a schedule.")
+    ] = None,
+    lake: LakeOption = None,
+    cron: Annotated[
+        str | None, typer.Option("--cron", help="When to run the pipeline on SOURCE, such as '0 3 * * *'.")
+    ] = None,
+    interval: Annotated[
+        float | None,
+        typer.Option("--interval", metavar="SECONDS", min=MIN_INTERVAL_S, help="Run it again after so many seconds."),
+    ] = None,
+) -> None:
+    """Serve the flows as Prefect deployments, by hand or on a schedule, until interrupted."""
     with command():
-        serve_deployments()
+        if cron is not None and interval is not None:
+            raise typer.BadParameter("give --cron or --interval, not both")
+        if source is None and (cron is not None or interval is not None):
+            raise typer.BadParameter("--cron and --interval need SOURCE, the file or folder to run on")
+        settings = read_settings(lake=lake)
+        import_flows()
+        deployments = import_module("tracklake.pipeline.orchestration.deployments")
+        deployments.serve_deployments(settings.lake, source, cron, interval)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,13 @@ from tracklake.pipeline.cli.summary import show_assessment, show_headline, show_
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.lake import load, refuse_foreign, refuse_if_busy
 from tracklake.pipeline.lake.files import REPORTS
+from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 from tracklake.schemas.columns import DATASETS
 from tracklake.schemas.errors import explain_file_errors
-
-FLOWS = "tracklake.pipeline.orchestration.flows"
-"""Module that imports Prefect, which takes seconds: imported only where there is work to do."""
 
 SURVEY_S = 0.3
 """Time to wait for the survey of a source before Prefect is imported beside it, in seconds."""
@@ -83,7 +80,7 @@ def run_steps(
     if plan.is_broken_off:
         terminal.print_line("the last session was broken off before its end, which is done now", style="dim")
     with terminal.show_stages(), explain_file_errors(request.root):
-        result: RunResult = import_module(FLOWS).execute(request, plan)
+        result: RunResult = import_flows().execute(request, plan)
         return result
 
 
@@ -96,7 +93,7 @@ def _survey_while_importing(request: RunRequest) -> Discovery:
         discovery = thread.submit(survey_source, request)
         with suppress(TimeoutError):
             return discovery.result(timeout=SURVEY_S)
-        import_module(FLOWS)
+        import_flows()
         return discovery.result()
 
 

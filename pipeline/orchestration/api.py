@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake import LakeError, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
     RunRequest,
@@ -58,9 +59,7 @@ def run(
     if plan.is_idle:
         return conclude_idle(request, plan)
     refuse_if_busy(request.root, rebuild=rebuild)
-    from tracklake.pipeline.orchestration.flows import execute  # Prefect takes seconds to import
-
-    result = execute(request, plan)
+    result: RunResult = import_flows().execute(request, plan)
     if result.failed:
         raise LakeError("\n".join(result.failed))
     return result

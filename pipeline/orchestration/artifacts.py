@@ -1,15 +1,26 @@
-"""Artifacts of a flow run in Prefect's UI, as plain values: the report's tables of figures and its address."""
+"""What Prefect's UI shows of a flow run: its name, the report's figures and address, its refusals and notes."""
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import httpx
+from prefect.artifacts import create_table_artifact
+from prefect.context import FlowRunContext
+
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import REPORTS
+from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 
+OUR_FAULTS = (400, 422)
+"""HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
+MAX_NAMED = 3
+"""Most recordings in a run's name."""
 MAX_NAME_CHARS = 40
 """Longest part of the lake's folder name in a key, in characters."""
 
@@ -56,11 +67,7 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
         OSError: the lake has no report.
     """
     quality = json.loads((root / REPORTS / DOCUMENT).read_text(encoding="utf-8"))
-    lake, name = load(root), root.resolve().name
-
-    def make_key(what: str) -> str:
-        return "-".join(filter(None, ("tracklake", what, _make_slug(name), _make_slug(lake.lake_id)[:8])))
-
+    make_key = partial(_make_key, root=root, lake_id=load(root).lake_id)
     tables = [
         FigureTable(make_key("findings"), "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
         FigureTable(
@@ -77,9 +84,73 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
     ]
     page = (root / REPORTS / PAGE).resolve()
     # Brackets would end the link's text in the Markdown that Prefect makes of it.
-    text = "quality report of " + re.sub(r"[^\w .-]", "_", name)
+    text = "quality report of " + re.sub(r"[^\w .-]", "_", root.resolve().name)
     where = "A page on the disk of the machine that made it; browsers open it by its address, not by a click."
     return tables, ReportLink(make_key("report"), where, page.as_uri(), text)
+
+
+def tabulate_messages(root: Path, lake_id: str, result: RunResult) -> FigureTable:
+    """Return a table of a run's failures, refusals and notes, with the level that each has in the run's log.
+
+    Args:
+        root: folder of the lake.
+        lake_id: id of the lake.
+        result: result of the run.
+    """
+    kinds = (
+        ("failed", "ERROR", result.failed),
+        ("refused", "WARNING", result.refused),
+        ("note", "INFO", result.notes),
+        ("removed", "INFO", result.removed),
+        ("skipped, no raw data", "INFO", result.skipped),
+    )
+    rows = [
+        {"kind": kind, "level": level, "message": message}
+        for kind, level, messages in kinds
+        for message in dict.fromkeys(messages)
+    ]
+    key = _make_key("messages", root=root, lake_id=lake_id)
+    return FigureTable(key, "What the run has to say: failures, refusals, notes.", rows)
+
+
+def name_run(request: RunRequest, recordings: list[str]) -> None:
+    """Name the flow run after its source, or lake, and recordings: `run highd: 04, 05`."""
+    context = FlowRunContext.get()
+    if context is None or context.flow_run is None:
+        return
+    named = ", ".join(recordings[:MAX_NAMED]) or "nothing new"
+    if len(recordings) > MAX_NAMED:
+        named += f" and {len(recordings) - MAX_NAMED} more"
+    place = Path(request.source or request.lake).name
+    name = f"{context.flow_run.name.partition(' ')[0]} {place}: {named}"
+    attach(partial(context.client.set_flow_run_name, context.flow_run.id, name))
+
+
+def publish(tables: list[FigureTable]) -> list[str]:
+    """Attach tables to the flow run; returns a note where Prefect's API fails."""
+    make = create_table_artifact
+    return attach(*(partial(make, table=t.rows, key=t.key, description=t.description) for t in tables))
+
+
+def attach(*calls: Callable[[], object]) -> list[str]:
+    """Call Prefect's API for what only shows a run; returns a note where it fails.
+
+    The lake is whole without it, so that a server that is busy, missing or forbids it fails no run. One that
+    understands the request and calls it wrong has found a fault of ours, which is raised.
+    """
+    try:
+        for call in calls:
+            call()
+    except (httpx.TransportError, httpx.HTTPStatusError) as failed:
+        if isinstance(failed, httpx.HTTPStatusError) and failed.response.status_code in OUR_FAULTS:
+            raise
+        reason = str(failed).splitlines()[0] if str(failed) else type(failed).__name__
+        return [f"Prefect did not take all that describes this run ({reason}); the lake and its report are whole"]
+    return []
+
+
+def _make_key(what: str, *, root: Path, lake_id: str) -> str:
+    return "-".join(filter(None, ("tracklake", what, _make_slug(root.resolve().name), _make_slug(lake_id)[:8])))
 
 
 def _make_slug(text: str) -> str:

@@ -1,283 +1,220 @@
 """Prefect flows: ingest, quality, and the whole run; one task per (stage, recording), records in and records out.
 
-The only importer of Prefect. It runs tasks, retries them, shows runs and artifacts, and serves deployments. It caches
-nothing: what is done already is decided by the lake's fingerprints (`pipeline.orchestration.run_plan`), so that an idle
-rerun never comes here.
+Prefect runs tasks, retries them, and shows runs and artifacts. It caches nothing: what is done already is decided by
+the lake's fingerprints (`pipeline.orchestration.run_plan`), so that an idle command never comes here.
 """
 
 import logging
 import os
-import socket
-import threading
-import time
-from collections.abc import Iterable
 from contextvars import ContextVar
-from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tracklake.schemas.errors import FileAccessError, MissingExtraError, TracklakeError, describe_error
-
-# Prefect reads these on import. Its telemetry shares the embedded server's database and locks it.
-os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
-os.environ.setdefault("DO_NOT_TRACK", "1")
-
-import httpx
-from prefect import flow, task
-from prefect.artifacts import create_link_artifact, create_table_artifact
-from prefect.cache_policies import NO_CACHE
+from prefect import flow
+from prefect.artifacts import create_link_artifact
 from prefect.client.schemas.objects import State
-from prefect.futures import PrefectFuture, as_completed
+from prefect.logging import get_run_logger
 from prefect.logging.handlers import PrefectConsoleHandler
-from prefect.settings import PREFECT_API_URL, PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+from prefect.states import Completed, Failed
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
+from pydantic import Field
+from typing_extensions import TypedDict
 
-from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import Commit, DamagedFileError, Writer, list_ingested, open_for_writing
-from tracklake.pipeline.orchestration.artifacts import summarise_report
-from tracklake.pipeline.orchestration.progress import reporter
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.orchestration.artifacts import attach, name_run, publish, summarise_report, tabulate_messages
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
     QUALITY_STEPS,
     RunPlan,
     RunRequest,
     RunResult,
-    explain_left_out,
-    explain_not_rebuilt,
-    plan_ingest,
-    remember_hashes,
-    remember_places,
-    remove_missing,
+    conclude_idle,
+    plan_run,
     survey_source,
 )
+from tracklake.pipeline.orchestration.server import use_server
+from tracklake.pipeline.orchestration.tasks import do_work
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.sources import RawFile, SourceError
-from tracklake.pipeline.stages.planner import Planner, build_job
-from tracklake.pipeline.stages.registry import STAGE_BY_NAME
-from tracklake.pipeline.stages.stage import INGEST, Job
-from tracklake.schemas import StructureError
+from tracklake.pipeline.sources import SourceError
+from tracklake.pipeline.stages.planner import Planner
+from tracklake.pipeline.stages.stage import INGEST
+from tracklake.schemas.columns import Dataset
+from tracklake.schemas.errors import MissingExtraError, TracklakeError
 
 REPORT = "report"
 """Name of the stage whose figures a run shows as artifacts."""
-OUR_FAULTS = (400, 422)
-"""HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
-SERVER_START_S = 120.0
-"""Longest wait for the embedded server, in seconds."""
+COMPLETED_WITH_REFUSALS = "CompletedWithRefusals"
+"""Name of the final state of a run that did everything but for refused files."""
+MAX_MESSAGES = 3
+"""Most messages in a final state; the run's log and artifacts hold all."""
 FEW_THREADS: Any = ThreadPoolTaskRunner(max_workers=min(os.cpu_count() or 1, 4))
 """Task runner of served flows: as many recordings in memory at once as the settings' default."""
+
+if TYPE_CHECKING:
+    SettingsChanges = dict[str, Any]
+else:
+    # Prefect shows a form with every setting, of which only those that are filled in are sent.
+    SettingsChanges = TypedDict(
+        "SettingsChanges",
+        {
+            name: Annotated[field.annotation, Field(description=field.description)]
+            for name, field in Settings.model_fields.items()
+            if name != "lake"
+        },
+        total=False,
+    )
+
+LockTimeout = Annotated[float, Field(ge=0)]
 
 _PLAN: ContextVar[RunPlan | None] = ContextVar("plan", default=None)
 """What `execute` hands to its flow beside the parameters, which Prefect stores, limits in size and shows."""
 
-Results = Iterable[tuple[str, Any]]
-"""Titles of tasks with their results or errors."""
+
+class FlowFailedError(TracklakeError):
+    """The end of a flow in which work failed, or nothing of the source could be used; it carries the result."""
+
+    def __init__(self, message: str, result: RunResult) -> None:
+        super().__init__(message)
+        self.result = result
 
 
-def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
-    """Retry what a busy disk or a network share may cause; nothing else becomes right by a retry."""
-    return isinstance(state.result(raise_on_failure=False), OSError | FileAccessError)
+def _plan_here(request: RunRequest) -> RunPlan:
+    """Plan a request that no command has planned: that of a deployment.
 
-
-TASK: dict[str, Any] = {
-    "cache_policy": NO_CACHE,
-    "persist_result": False,
-    "retries": 2,
-    "retry_delay_seconds": 1,
-    "retry_condition_fn": _is_io_error,
-}
-"""Options of every task: nothing is cached, and input and output are tried three times."""
-
-
-@task(task_run_name="read {title}", **TASK)
-def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
-    """Read one file that holds several recordings into the staging folder."""
-    del title
-    return ingest.read_file(Path(lake), dataset, RawFile.from_dict(file))
-
-
-@task(task_run_name="{stage} {title}", **TASK)
-def build(stage: str, title: str, lake: str, job: dict[str, Any], settings: dict[str, Any]) -> Commit:
-    """Do one stage's work on one recording: read, transform, validate, write; returns the commit to make."""
-    del title
-    if stage == INGEST:
-        return ingest.build(Path(lake), Job(**job))
-    return build_job(STAGE_BY_NAME[stage], Path(lake), Job(**job), Settings(**settings))
-
-
-def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
-    """Yield (title, result or error) of each future as it ends."""
-    for future in as_completed(list(futures)):
-        future.wait()
-        yield futures[future], future.state.result(raise_on_failure=False)
-
-
-def _record_error(title: str, error: BaseException, result: RunResult) -> None:
-    """Sort an error: bad input is refused and the others go on; anything else is a failure."""
-    if isinstance(error, SourceError | StructureError):
-        result.refused.append(str(error))
-    else:
-        result.failed.append(f"{title}: {describe_error(error)}")
-
-
-def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult) -> None:
-    """Run a stage's jobs and commit each as it ends."""
-    if not jobs:
-        return
-    show = reporter()
-    show.begin(stage, len(jobs))
-    settings = request.get_settings().model_dump(mode="json")
-    futures = {build.submit(stage, job.title, request.lake, asdict(job), settings): job.title for job in jobs}
-    for title, made in _await_results(futures):
-        if isinstance(made, Commit):
-            writer.commit(made)
-            result.built[stage] = result.built.get(stage, 0) + 1
-            result.notes += made.info.get("notes", [])
-        else:
-            _record_error(title, made, result)
-            if isinstance(made, DamagedFileError):
-                writer.mark_damaged()
-        show.advance(stage, title)
-
-
-def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult) -> None:
-    """Read what must be read to know its recordings, then make each recording that is not in the lake."""
-    discovery, plan = prepared.discovery, prepared.ingest
-    assert discovery is not None
-    result.refused += discovery.refusals
-    result.skipped += discovery.skipped
-    unknown = ingest.find_unread_files(discovery, writer.manifest)
-    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
-    if plan is None or plan.manifest != writer.manifest:  # there was no lake, or it has changed since
-        plan = plan_ingest(request, discovery, writer.manifest)
-    result.refused += plan.conflicts
-    remember_places(writer, request, plan)
-    remember_hashes(writer.root, discovery)
-    remove_missing(writer, request, plan, result)
-    needed = {
-        file.sha256: (job.inputs["dataset"], file)
-        for job in plan.jobs
-        if ingest.needs_spill(job)
-        for file in ingest.list_files(job)
-        if not ingest.locate_spill(writer.root, file).exists()
-    }
-    _read_all(writer, needed, request, result)
-    _build_all(writer, INGEST, plan.jobs, request, result)
-
-
-def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: RunRequest, result: RunResult) -> None:
-    if not files:
-        return
-    show = reporter()
-    show.begin("read", len(files))
-    futures = {
-        read_file.submit(file.name, request.lake, dataset, file.to_dict()): sha256
-        for sha256, (dataset, file) in files.items()
-    }
-    contents = {}
-    for sha256, record in _await_results(futures):
-        if isinstance(record, dict):
-            contents[sha256] = record
-        else:
-            _record_error(files[sha256][1].name, record, result)
-        show.advance("read", files[sha256][1].name)
-    writer.remember_sources(contents)
-
-
-def _work(request: RunRequest, *, again: bool = False) -> dict[str, Any]:
-    """Run every requested stage whose outputs are missing or stale; once again if files turn out to be damaged."""
-    result = RunResult()
-    plan = _PLAN.get() or RunPlan(survey_source(request) if INGEST in request.steps else None)
-    before = list_ingested(request.root) if request.rebuild else set()
-    if request.rebuild and (plan.discovery is None or not plan.discovery.units):
-        raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not rebuilt.")
-    settings = request.get_settings()
-    with open_for_writing(request.root, rebuild=request.rebuild) as writer:
-        if INGEST in request.steps:
-            _ingest(writer, request, plan, result)
-        for stage in request.list_stages():
-            if result.failed and stage.after:
-                continue  # it builds on what failed; the report, which comes after no stage, shows what there is
-            if INGEST in request.steps and not writer.manifest.of_stage(INGEST):
-                continue  # everything was refused
-            jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(stage.name)
-            writer.remove(stale)
-            _build_all(writer, stage.name, jobs, request, result)
-        if set(request.steps) & {"repair", "samples", "split", "tensors"}:
-            result.notes += explain_left_out(writer.manifest)
-        result.notes += explain_not_rebuilt(before, writer.manifest)
-        made = writer.manifest
-    if (
-        result.failed
-        and INGEST in request.steps
-        and not again
-        and any(not commit.fingerprint for commit in made.commits.values())
-    ):
-        repeated = _work(replace(request, rebuild=False), again=True)
-        built = {stage: result.built.get(stage, 0) + count for stage, count in repeated["built"].items()}
-        notes = [f"made again, as files of the lake were damaged: {result.failed[0]}", *repeated["notes"]]
-        return {**repeated, "built": {**result.built, **built}, "notes": notes}
-    if REPORT in request.steps and not Planner(request.root, made, settings).find_outstanding(REPORT)[0]:
-        result.notes += _publish(request.root)
-    return asdict(result)
-
-
-def _publish(root: Path) -> list[str]:
-    """Attach the report's tables and its address to the flow run; returns a note where Prefect's API fails.
-
-    The lake is whole without them, so that a server that is busy, missing or forbids it fails no run. One that
-    understands the request and calls it wrong has found a fault of ours, which is raised.
+    Raises:
+        SourceError: nothing in the source can be used.
+        LakeError: there is no lake to work on.
     """
-    tables, link = summarise_report(root)
+    if INGEST not in request.steps:
+        load(request.root)
+        return plan_run(request, None)
+    discovery = survey_source(request)
+    if not discovery.units:
+        raise SourceError("\n".join(discovery.refusals))
+    return plan_run(request, discovery)
+
+
+def _run_request(request: RunRequest, lock_timeout_s: float = 0.0) -> State[Any]:
+    """Carry out a request and return the flow's final state, with the result as its data.
+
+    A result with failures is Failed, and so is one without anything usable; refusals alone have a state of their own.
+    """
     try:
-        for table in tables:
-            create_table_artifact(table=table.rows, key=table.key, description=table.description)
-        create_link_artifact(link=link.address, link_text=link.text, key=link.key, description=link.description)
-    except (httpx.TransportError, httpx.HTTPStatusError) as failed:
-        if isinstance(failed, httpx.HTTPStatusError) and failed.response.status_code in OUR_FAULTS:
-            raise
-        reason = str(failed).splitlines()[0] if str(failed) else type(failed).__name__
-        return [f"Prefect did not take the report's tables as artifacts ({reason}); the lake and its report are whole"]
-    return []
+        plan = _PLAN.get() or _plan_here(request)
+        settings = request.get_settings()
+        if plan.is_idle:
+            name_run(request, [])
+            result, manifest = conclude_idle(request, plan), load(request.root)
+        else:
+            result, manifest = do_work(request, plan, lock_timeout_s)
+    except TracklakeError as error:
+        get_run_logger().error("%s", error)
+        return Failed(message=_shorten(str(error).splitlines()), data=error)
+    if REPORT in request.steps and not Planner(request.root, manifest, settings).find_outstanding(REPORT)[0]:
+        tables, link = summarise_report(request.root)
+        show = partial(create_link_artifact, link_text=link.text, key=link.key, description=link.description)
+        result.notes += publish(tables) or attach(partial(show, link=link.address))
+    messages = tabulate_messages(request.root, manifest.lake_id, result)
+    for row in messages.rows:
+        get_run_logger().log(logging.getLevelName(row["level"]), "%s: %s", row["kind"], row["message"])
+    if messages.rows:
+        result.notes += publish([messages])
+    return _conclude(result, usable=bool(manifest.of_stage(INGEST)), settings=settings)
 
 
-@flow(name="tracklake-run", validate_parameters=False, task_runner=FEW_THREADS)
+def _conclude(result: RunResult, *, usable: bool, settings: Settings) -> State[Any]:
+    """Return the final state of a run whose work has ended."""
+    refusals = f"{len(result.refused)} refused: {_shorten(result.refused)}"
+    if result.failed or (result.refused and (settings.refusals_fail or not usable)):
+        message = _shorten(result.failed) if result.failed else refusals
+        return Failed(message=message, data=FlowFailedError(message, result))
+    if result.refused:
+        return Completed(name=COMPLETED_WITH_REFUSALS, message=refusals, data=asdict(result))
+    built = ", ".join(f"{stage} {count}" for stage, count in result.built.items())
+    return Completed(message=built or "nothing to do: the lake is up to date", data=asdict(result))
+
+
+def _shorten(messages: list[str]) -> str:
+    rest = len(messages) - MAX_MESSAGES
+    return "\n".join([*messages[:MAX_MESSAGES], *([f"and {rest} more, see the log"] if rest > 0 else [])])
+
+
+SERVED: dict[str, Any] = {"validate_parameters": False, "task_runner": FEW_THREADS}
+"""Options of every flow; Prefect's server checks the parameters of deployments itself."""
+
+
+@flow(name="tracklake-run", flow_run_name="run {source}", **SERVED)
 def run(
     lake: str,
     source: str,
-    dataset: str | None = None,
-    settings: dict[str, Any] | None = None,
+    dataset: Dataset | None = None,
+    settings: SettingsChanges | None = None,
     replace: bool = False,
     prune: bool = False,
     rebuild: bool = False,
-) -> dict[str, Any]:
-    """Run the whole pipeline: raw files to tables, findings, repair, samples, split, tensors, score and report."""
-    return _work(RunRequest(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild))
+    lock_timeout_s: LockTimeout = 3600.0,
+) -> State[Any]:
+    """Run the whole pipeline: raw files to tables, findings, repair, samples, split, tensors, score and report.
+
+    Args:
+        lake: folder of the lake; it is created if missing.
+        source: raw file, or folder with any mix of raw files.
+        dataset: read the source's files as this dataset's only; empty: detect it.
+        settings: settings that differ from tracklake.toml and the environment of `tracklake serve`.
+        replace: let files of the source replace a recording's earlier files that the source lacks.
+        prune: remove recordings whose files were in the source and are missing now.
+        rebuild: make the whole lake again, also one of another schema version.
+        lock_timeout_s: longest wait for another process that writes to the lake, in seconds.
+    """
+    request = RunRequest(lake, ALL_STEPS, source, dataset, settings or {}, replace, prune, rebuild)
+    return _run_request(request, lock_timeout_s)
 
 
-@flow(name="tracklake-ingest", validate_parameters=False, task_runner=FEW_THREADS)
+@flow(name="tracklake-ingest", flow_run_name="ingest {source}", **SERVED)
 def ingest_files(
     lake: str,
     source: str,
-    dataset: str | None = None,
-    settings: dict[str, Any] | None = None,
+    dataset: Dataset | None = None,
+    settings: SettingsChanges | None = None,
     replace: bool = False,
     prune: bool = False,
     rebuild: bool = False,
-) -> dict[str, Any]:
-    """Ingest raw files: to tracks, vehicles and subsets."""
-    return _work(RunRequest(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild))
+    lock_timeout_s: LockTimeout = 3600.0,
+) -> State[Any]:
+    """Ingest raw files: to tracks, vehicles and subsets.
+
+    Args:
+        lake: folder of the lake; it is created if missing.
+        source: raw file, or folder with any mix of raw files.
+        dataset: read the source's files as this dataset's only; empty: detect it.
+        settings: settings that differ from tracklake.toml and the environment of `tracklake serve`.
+        replace: let files of the source replace a recording's earlier files that the source lacks.
+        prune: remove recordings whose files were in the source and are missing now.
+        rebuild: make the whole lake again, also one of another schema version.
+        lock_timeout_s: longest wait for another process that writes to the lake, in seconds.
+    """
+    request = RunRequest(lake, (INGEST,), source, dataset, settings or {}, replace, prune, rebuild)
+    return _run_request(request, lock_timeout_s)
 
 
-@flow(name="tracklake-quality", validate_parameters=False, task_runner=FEW_THREADS)
-def quality(lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Make findings, late starts and the report of what is in the lake."""
-    return _work(RunRequest(lake, QUALITY_STEPS, settings=settings or {}))
+@flow(name="tracklake-quality", flow_run_name="quality {lake}", **SERVED)
+def quality(lake: str, settings: SettingsChanges | None = None, lock_timeout_s: LockTimeout = 3600.0) -> State[Any]:
+    """Make findings, late starts and the report of what is in the lake.
+
+    Args:
+        lake: folder of the lake.
+        settings: settings that differ from tracklake.toml and the environment of `tracklake serve`.
+        lock_timeout_s: longest wait for another process that writes to the lake, in seconds.
+    """
+    return _run_request(RunRequest(lake, QUALITY_STEPS, settings=settings or {}), lock_timeout_s)
 
 
-@flow(name="tracklake-stage", flow_run_name="tracklake-{stage}", validate_parameters=False, task_runner=FEW_THREADS)
-def run_stage(stage: str, lake: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+@flow(name="tracklake-stage", flow_run_name="{stage} {lake}", **SERVED)
+def run_stage(stage: str, lake: str, settings: SettingsChanges | None = None) -> State[Any]:
     """Run one stage over what is in the lake, or several (`repair+assess`)."""
-    return _work(RunRequest(lake, tuple(stage.split("+")), settings=settings or {}))
+    return _run_request(RunRequest(lake, tuple(stage.split("+")), settings=settings or {}))
 
 
 def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
@@ -293,18 +230,22 @@ def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
         chosen = run if tuple(request.steps) == ALL_STEPS else ingest_files
         parameters |= {"source": request.source, "dataset": request.dataset}
         parameters |= {"replace": request.replace, "prune": request.prune, "rebuild": request.rebuild}
+        parameters["lock_timeout_s"] = 0.0
     else:
         parameters["stage"] = "+".join(request.steps)
-    changed: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nothing uses it
-    if PREFECT_API_URL.value() is None:
-        changed[PREFECT_API_URL] = _embed_server()
-    with temporary_settings(changed):
+    heartbeat = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nothing uses it
+    with use_server() as notes, temporary_settings(heartbeat):
         _mute_console()  # after all that sets logging up
         token = _PLAN.set(plan)
         try:
-            return RunResult(**chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters))
+            made = chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters)
+            result = RunResult(**made)
+        except FlowFailedError as failed:
+            result = failed.result
         finally:
             _PLAN.reset(token)
+    result.notes += notes
+    return result
 
 
 def _choose_runner(settings: Settings) -> TaskRunner[Any]:
@@ -323,33 +264,6 @@ def _choose_runner(settings: Settings) -> TaskRunner[Any]:
     return DaskTaskRunner(cluster_kwargs=cluster)
 
 
-def _embed_server() -> str:
-    """Serve Prefect's API from a thread of this process and return its address.
-
-    The server that Prefect would start by itself is a process of its own, which outlives one that is killed. This one
-    ends with us, whatever happens, and spares a second interpreter's start. It is never stopped before: Prefect sends
-    its last logs and events to it while the interpreter exits.
-    """
-    import uvicorn
-    from prefect.server.api.server import create_app
-
-    listener = socket.socket()
-    listener.bind(("127.0.0.1", 0))
-    server = uvicorn.Server(uvicorn.Config(create_app(ephemeral=True), log_config=None, lifespan="on"))
-    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, name="prefect-server", daemon=True)
-    thread.start()
-    limit = time.monotonic() + SERVER_START_S
-    while not server.started:
-        if not thread.is_alive() or time.monotonic() > limit:
-            raise TracklakeError(
-                "Prefect's embedded server did not start. Look at PREFECT_HOME (its database may be of another "
-                "version: `prefect server database reset`), or set PREFECT_API_URL to a running server."
-            )
-        time.sleep(0.01)
-    return f"http://127.0.0.1:{listener.getsockname()[1]}/api"
-
-
 def _mute_console() -> None:
     """Keep Prefect's lines off the terminal; its server still gets them, and the user gets ours."""
     for name in (None, "prefect", *logging.root.manager.loggerDict):
@@ -357,11 +271,3 @@ def _mute_console() -> None:
         for handler in list(logger.handlers):
             if isinstance(handler, PrefectConsoleHandler):
                 logger.removeHandler(handler)
-
-
-def serve_deployments() -> None:
-    """Serve the flows as deployments until interrupted; runs are started from Prefect's UI, CLI or schedules."""
-    from prefect import serve
-
-    flows: dict[str, Any] = {"run": run, "ingest": ingest_files, "quality": quality}
-    serve(*(served.to_deployment(name, description=served.__doc__) for name, served in flows.items()))

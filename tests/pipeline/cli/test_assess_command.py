@@ -1,6 +1,7 @@
 """`tracklake repair --assess`, and what the windows are worth on the generated sample, whose truth is known."""
 
 import json
+from contextlib import nullcontext
 
 import polars as pl
 import pytest
@@ -143,8 +144,8 @@ def test_several_stages_are_one_flow(monkeypatch):
     orders = []
     run_stage = flows.run_stage.fn
     monkeypatch.setattr(flows, "run_stage", Flow())
-    monkeypatch.setattr(flows, "_embed_server", lambda: "http://127.0.0.1:9/api")
-    monkeypatch.setattr(flows, "_work", lambda order: orders.append(order) or {})
+    monkeypatch.setattr(flows, "use_server", lambda: nullcontext([]))
+    monkeypatch.setattr(flows, "_run_request", lambda order: orders.append(order) or {})
     for steps in (("repair",), ("repair", "assess", "report")):
         flows.execute(RunRequest("somewhere", steps))
         assert orders.pop() == RunRequest("somewhere", steps, settings={})

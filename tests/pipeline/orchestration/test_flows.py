@@ -1,10 +1,14 @@
-"""What Prefect adds: tasks that are seen, retries on I/O, deployments; and that it caches nothing."""
+"""What Prefect adds: tasks and ends that are seen, retries on I/O; and that it caches nothing."""
 
+import errno
 import json
+import logging
+import os
 import shutil
 import time
 from collections import Counter
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,9 +21,9 @@ from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
 from small_recordings import KINDS, write_highd
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import connect, load, open_for_writing
+from tracklake.pipeline.lake import LakeLockedError, LakeMissingError, connect, load, open_for_writing
 from tracklake.pipeline.lake.manifest import Manifest, store_manifest
-from tracklake.pipeline.orchestration import flows, run_plan
+from tracklake.pipeline.orchestration import artifacts, flows, run_plan, tasks
 from tracklake.pipeline.sources import SourceError
 
 pytestmark = [
@@ -97,10 +101,107 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
         raise SourceError("04_tracks.csv, line 7: no good")
 
     monkeypatch.setattr(ingest, "build", hopeless)
-    result = flows.ingest_files(str(tmp_path / "two"), str(raw))
-    assert result["refused"] == ["04_tracks.csv, line 7: no good"]
-    assert result["built"] == {}
+    with pytest.raises(flows.FlowFailedError, match=r"1 refused: 04_tracks\.csv, line 7: no good") as ended:
+        flows.ingest_files(str(tmp_path / "two"), str(raw))
+    assert ended.value.result.refused == ["04_tracks.csv, line 7: no good"]
+    assert ended.value.result.built == {}
     assert tries["hopeless"] == 1
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EFBIG, errno.EMFILE, errno.EROFS])
+def test_a_full_disk_is_not_tried_again(raw, tmp_path, monkeypatch, number):
+    tries = Mock(side_effect=OSError(number, os.strerror(number)))
+    monkeypatch.setattr(ingest, "build", tries)
+    with pytest.raises(flows.FlowFailedError, match=os.strerror(number)):
+        flows.ingest_files(str(tmp_path / "lake"), str(raw))
+    assert tries.call_count == 1
+
+
+def read_run(root: Path):
+    """The latest flow run on a lake, as its server shows it, with its log."""
+    with get_client(sync_client=True) as client:
+        latest = client.read_flow_runs(sort=FlowRunSort.START_TIME_DESC)  # 200 of them
+        return next(run for run in latest if run.parameters.get("lake") == str(root))
+
+
+@pytest.fixture
+def logged(caplog) -> pytest.LogCaptureFixture:
+    """What the runs log; the shared tests' server is sent no logs."""
+    logger = logging.getLogger("prefect.flow_runs")
+    logger.addHandler(caplog.handler)
+    yield caplog
+    logger.removeHandler(caplog.handler)
+
+
+def test_refusals_are_a_state_a_log_and_an_artifact(raw, tmp_path, logged):
+    (raw / "other.csv").write_text("a,b\n1,2\n")
+    root = tmp_path / "lake"
+    result = flows.ingest_files(str(root), str(raw))
+    assert result["built"] == {"ingest": 1}
+    (message,) = result["refused"]
+    assert "other.csv" in message
+    made = read_run(root)
+    assert (made.state.name, made.state.type.value) == ("CompletedWithRefusals", "COMPLETED")
+    assert made.state.message == f"1 refused: {message}"
+    assert made.name == "ingest raw: 04"
+    (artifact,) = artifacts_of(root)["tracklake-messages"]
+    assert json.loads(artifact.data) == [{"kind": "refused", "level": "WARNING", "message": message}]
+    assert f"refused: {message}" in [record.getMessage() for record in logged.records if record.levelname == "WARNING"]
+    # Nothing is to be done, and the refusal is not forgotten; a setting makes it a failure.
+    with pytest.raises(flows.FlowFailedError, match="1 refused"):
+        flows.ingest_files(str(root), str(raw), settings={"refusals_fail": True})
+    again = read_run(root)
+    assert (again.state.name, again.name) == ("Failed", "ingest raw: nothing new")
+    assert len(artifacts_of(root)["tracklake-messages"]) == 2
+
+
+def test_work_that_broke_off_fails_the_run_and_is_returned_to_the_command(raw, tmp_path, monkeypatch, logged):
+    write_highd(raw, "05")
+    real = ingest.build
+
+    def break_one(root, job):
+        if job.title == "05":
+            raise RuntimeError("boom")
+        return real(root, job)
+
+    monkeypatch.setattr(ingest, "build", break_one)
+    request = run_plan.RunRequest(str(tmp_path / "lake"), ("ingest",), str(raw))
+    result = flows.execute(request)
+    assert result.built == {"ingest": 1}
+    (failure,) = result.failed
+    assert "RuntimeError: boom" in failure
+    made = read_run(tmp_path / "lake")
+    assert (made.state.name, made.name) == ("Failed", "ingest raw: 04, 05")
+    assert "boom" in made.state.message
+    assert any("failed: 05: " in record.getMessage() for record in logged.records if record.levelname == "ERROR")
+
+
+def test_a_deployment_on_nothing_usable_fails_and_makes_no_lake(tmp_path):
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(SourceError, match=r"other\.csv"):
+        flows.run(str(tmp_path / "lake"), str(tmp_path / "raw"))
+    assert "other.csv" in read_run(tmp_path / "lake").state.message
+    with pytest.raises(LakeMissingError):
+        flows.quality(str(tmp_path / "lake"))
+    assert read_run(tmp_path / "lake").state.name == "Failed"
+    assert not (tmp_path / "lake").exists()
+
+
+def test_a_run_waits_for_a_lake_that_another_process_writes_to(raw, tmp_path, monkeypatch, logged):
+    monkeypatch.setattr(tasks, "LOCK_POLL_S", 0.05)
+    root = tmp_path / "lake"
+    with ThreadPoolExecutor(max_workers=1) as other:
+        with open_for_writing(root):
+            with pytest.raises(LakeLockedError, match="is writing to this lake"):
+                flows.ingest_files(str(root), str(raw), lock_timeout_s=0.1)
+            assert read_run(root).state.name == "Failed"
+            assert "This run waits up to 0.1 s for it." in logged.text
+            run_here = copy_context().run
+            ended = other.submit(run_here, flows.ingest_files, str(root), str(raw), lock_timeout_s=60)
+            time.sleep(0.5)
+            assert not ended.done()
+        assert ended.result()["built"] == {"ingest": 1}
 
 
 def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(raw, tmp_path, calls):
@@ -135,7 +236,7 @@ def searches(monkeypatch) -> tuple[Mock, Mock]:
     """Counts how often the source was searched, and compared with the lake."""
     discover, plan = Mock(wraps=run_plan.discover), Mock(wraps=run_plan.plan_ingest)
     monkeypatch.setattr(run_plan, "discover", discover)
-    for user in (run_plan, flows):
+    for user in (run_plan, tasks):
         monkeypatch.setattr(user, "plan_ingest", plan)
     return discover, plan
 
@@ -206,6 +307,8 @@ def test_the_report_is_seen_as_artifacts_of_the_run(sample, tmp_path):
     assert result["failed"] == []
     assert not any("artifacts" in note for note in result["notes"])
     found = artifacts_of(root)
+    (messages,) = found.pop("tracklake-messages")
+    assert [row["message"] for row in json.loads(messages.data)] == list(dict.fromkeys(result["notes"]))
     assert {key: len(made) for key, made in found.items()} == dict.fromkeys(
         [f"tracklake-{what}" for what in ("findings", "subsets", "ingestion", "completeness", "report")], 1
     )
@@ -236,7 +339,7 @@ def test_the_report_is_seen_as_artifacts_of_the_run(sample, tmp_path):
     # A run that finds the report up to date shows it again, as that run's; one of another stage does not.
     flows.quality(str(root))
     flows.run_stage("validate", str(root))
-    assert {len(made) for made in artifacts_of(root).values()} == {2}
+    assert {len(made) for key, made in artifacts_of(root).items() if key in found} == {2}
 
 
 @pytest.mark.parametrize(
@@ -250,36 +353,19 @@ def test_the_report_is_seen_as_artifacts_of_the_run(sample, tmp_path):
         (TypeError("table is no list"), True),
     ],
 )
-def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(lake, monkeypatch, failure, is_ours):
+def test_a_run_does_not_fail_with_prefects_api_and_does_with_a_fault_of_ours(monkeypatch, failure, is_ours):
     def refuse(**_table):
         if isinstance(failure, int):
             request = httpx.Request("POST", "http://prefect/api/artifacts/")
             raise httpx.HTTPStatusError(f"answered {failure}", request=request, response=httpx.Response(failure))
         raise failure
 
-    monkeypatch.setattr(flows, "create_table_artifact", refuse)
+    monkeypatch.setattr(artifacts, "create_table_artifact", refuse)
+    table = artifacts.FigureTable("tracklake-some", "Some.", [{"a": 1}])
     if is_ours:
         with pytest.raises((httpx.HTTPStatusError, TypeError)):
-            flows._publish(lake.root)
+            artifacts.publish([table])
     else:
-        (note,) = flows._publish(lake.root)
+        (note,) = artifacts.publish([table])
         says = {503: "answered 503", 403: "answered 403"}.get(failure, str(failure) or "ReadTimeout")
-        assert note.startswith(f"Prefect did not take the report's tables as artifacts ({says}); the lake")
-
-
-def test_serve_offers_the_flows_as_deployments(command, tmp_path):
-    alone = command.alone("serve")
-    assert alone.code == 1
-    assert "PREFECT_API_URL" in alone.err
-    process = replace(command, folder=tmp_path).start("serve")
-    try:
-        names: set[str] = set()
-        limit = time.monotonic() + 60
-        with get_client(sync_client=True) as client:
-            while len(names) < 3 and process.poll() is None and time.monotonic() < limit:
-                names = {deployment.name for deployment in client.read_deployments()}
-                time.sleep(0.3)
-        assert names == {"run", "ingest", "quality"}
-    finally:
-        process.kill()
-        process.communicate()
+        assert note.startswith(f"Prefect did not take all that describes this run ({says}); the lake")

@@ -1,0 +1,236 @@
+"""Prefect's tasks, one per (stage, recording), records in and records out; and the work that submits them."""
+
+import errno
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.objects import State
+from prefect.futures import PrefectFuture, as_completed
+from prefect.logging import get_run_logger
+
+from tracklake.pipeline.ingest import ingest
+from tracklake.pipeline.lake import (
+    Commit,
+    DamagedFileError,
+    LakeLockedError,
+    Manifest,
+    Writer,
+    list_ingested,
+    open_for_writing,
+)
+from tracklake.pipeline.orchestration.artifacts import name_run
+from tracklake.pipeline.orchestration.progress import reporter
+from tracklake.pipeline.orchestration.run_plan import (
+    RunPlan,
+    RunRequest,
+    RunResult,
+    explain_left_out,
+    explain_not_rebuilt,
+    plan_ingest,
+    remember_hashes,
+    remember_places,
+    remove_missing,
+)
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources import RawFile, SourceError
+from tracklake.pipeline.stages.planner import Planner, build_job
+from tracklake.pipeline.stages.registry import STAGE_BY_NAME
+from tracklake.pipeline.stages.stage import INGEST, Job
+from tracklake.schemas import StructureError
+from tracklake.schemas.errors import FileAccessError, describe_error
+
+LASTING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EROFS, errno.EACCES, errno.EPERM)
+"""Errors of the operating system that a second try does not cure: full disks, limits, missing rights."""
+LOCK_POLL_S = 1.0
+"""Time between two looks at a lake that another process writes to, in seconds."""
+
+Results = Iterable[tuple[str, Any]]
+"""Titles of tasks with their results or errors."""
+
+
+def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
+    """Retry what a busy disk or a network share may cause; nothing else becomes right by a retry."""
+    error = state.result(raise_on_failure=False)
+    cause = error.__cause__ if isinstance(error, FileAccessError) else error
+    return isinstance(cause, OSError) and cause.errno not in LASTING
+
+
+TASK: dict[str, Any] = {
+    "cache_policy": NO_CACHE,
+    "persist_result": False,
+    "retries": 2,
+    "retry_delay_seconds": 1,
+    "retry_condition_fn": _is_io_error,
+}
+"""Options of every task: nothing is cached, and input and output are tried three times."""
+
+
+@task(task_run_name="read {title}", **TASK)
+def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
+    """Read one file that holds several recordings into the staging folder."""
+    del title
+    return ingest.read_file(Path(lake), dataset, RawFile.from_dict(file))
+
+
+@task(task_run_name="{stage} {title}", **TASK)
+def build(stage: str, title: str, lake: str, job: dict[str, Any], settings: dict[str, Any]) -> Commit:
+    """Do one stage's work on one recording: read, transform, validate, write; returns the commit to make."""
+    del title
+    if stage == INGEST:
+        return ingest.build(Path(lake), Job(**job))
+    return build_job(STAGE_BY_NAME[stage], Path(lake), Job(**job), Settings(**settings))
+
+
+def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
+    """Yield (title, result or error) of each future as it ends."""
+    for future in as_completed(list(futures)):
+        future.wait()
+        yield futures[future], future.state.result(raise_on_failure=False)
+
+
+def _record_error(title: str, error: BaseException, result: RunResult) -> None:
+    """Sort an error: bad input is refused and the others go on; anything else is a failure."""
+    if isinstance(error, SourceError | StructureError):
+        result.refused.append(str(error))
+    else:
+        result.failed.append(f"{title}: {describe_error(error)}")
+
+
+def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult) -> None:
+    """Run a stage's jobs and commit each as it ends."""
+    if not jobs:
+        return
+    show = reporter()
+    show.begin(stage, len(jobs))
+    settings = request.get_settings().model_dump(mode="json")
+    futures = {build.submit(stage, job.title, request.lake, asdict(job), settings): job.title for job in jobs}
+    for title, made in _await_results(futures):
+        if isinstance(made, Commit):
+            writer.commit(made)
+            result.built[stage] = result.built.get(stage, 0) + 1
+            result.notes += made.info.get("notes", [])
+        else:
+            _record_error(title, made, result)
+            if isinstance(made, DamagedFileError):
+                writer.mark_damaged()
+        show.advance(stage, title)
+
+
+def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult) -> None:
+    """Read what must be read to know its recordings, then make each recording that is not in the lake."""
+    discovery, plan = prepared.discovery, prepared.ingest
+    assert discovery is not None
+    result.refused += discovery.refusals
+    result.skipped += discovery.skipped
+    unknown = ingest.find_unread_files(discovery, writer.manifest)
+    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
+    if plan is None or plan.manifest != writer.manifest:  # there was no lake, or it has changed since
+        plan = plan_ingest(request, discovery, writer.manifest)
+    result.refused += plan.conflicts
+    name_run(request, [job.title for job in plan.jobs])
+    remember_places(writer, request, plan)
+    remember_hashes(writer.root, discovery)
+    remove_missing(writer, request, plan, result)
+    needed = {
+        file.sha256: (job.inputs["dataset"], file)
+        for job in plan.jobs
+        if ingest.needs_spill(job)
+        for file in ingest.list_files(job)
+        if not ingest.locate_spill(writer.root, file).exists()
+    }
+    _read_all(writer, needed, request, result)
+    _build_all(writer, INGEST, plan.jobs, request, result)
+
+
+def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: RunRequest, result: RunResult) -> None:
+    if not files:
+        return
+    show = reporter()
+    show.begin("read", len(files))
+    futures = {
+        read_file.submit(file.name, request.lake, dataset, file.to_dict()): sha256
+        for sha256, (dataset, file) in files.items()
+    }
+    contents = {}
+    for sha256, record in _await_results(futures):
+        if isinstance(record, dict):
+            contents[sha256] = record
+        else:
+            _record_error(files[sha256][1].name, record, result)
+        show.advance("read", files[sha256][1].name)
+    writer.remember_sources(contents)
+
+
+def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[RunResult, Manifest]:
+    """Run every requested stage whose outputs are missing or stale; once again if files turn out to be damaged.
+
+    Args:
+        request: what the user asked for.
+        plan: what was found out for it.
+        lock_timeout_s: longest wait for another process that writes to the lake, in seconds.
+
+    Returns:
+        What was done, and the lake as it is then.
+    """
+    result = RunResult()
+    manifest = _work_once(request, plan, result, lock_timeout_s)
+    if (
+        result.failed
+        and INGEST in request.steps
+        and any(not commit.fingerprint for commit in manifest.commits.values())
+    ):
+        note = f"made again, as files of the lake were damaged: {result.failed[0]}"
+        result = RunResult(built=result.built, notes=[note])
+        manifest = _work_once(replace(request, rebuild=False), plan, result, lock_timeout_s)
+    return result, manifest
+
+
+def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeout_s: float) -> Manifest:
+    before = list_ingested(request.root) if request.rebuild else set()
+    if request.rebuild and (plan.discovery is None or not plan.discovery.units):
+        raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not rebuilt.")
+    settings = request.get_settings()
+    with ExitStack() as stack:
+        writer = _await_writer(stack, request, lock_timeout_s)
+        if INGEST in request.steps:
+            _ingest(writer, request, plan, result)
+        else:
+            name_run(request, [commit.tail.rpartition("/")[2] for commit in writer.manifest.of_stage(INGEST)])
+        for stage in request.list_stages():
+            if result.failed and stage.after:
+                continue  # it builds on what failed; the report, which comes after no stage, shows what there is
+            if INGEST in request.steps and not writer.manifest.of_stage(INGEST):
+                continue  # everything was refused
+            jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(stage.name)
+            writer.remove(stale)
+            _build_all(writer, stage.name, jobs, request, result)
+        if set(request.steps) & {"repair", "samples", "split", "tensors"}:
+            result.notes += explain_left_out(writer.manifest)
+        result.notes += explain_not_rebuilt(before, writer.manifest)
+        return writer.manifest
+
+
+def _await_writer(stack: ExitStack, request: RunRequest, timeout_s: float) -> Writer:
+    """Open the lake for writing, as soon as no other process writes to it.
+
+    Raises:
+        LakeLockedError: another process still does after the timeout.
+    """
+    limit = time.monotonic() + timeout_s
+    told = False
+    while True:
+        try:
+            return stack.enter_context(open_for_writing(request.root, rebuild=request.rebuild))
+        except LakeLockedError as busy:
+            if time.monotonic() >= limit:
+                raise
+            if not told:
+                get_run_logger().info("%s This run waits up to %g s for it.", busy, timeout_s)
+                told = True
+            time.sleep(LOCK_POLL_S)
