@@ -9,6 +9,7 @@ import pytest
 
 from tracklake.schemas.protocols import CSP, HEADLINES, MEANINGS, PROTOCOLS, Protocol
 from tracklake.schemas.protocols_markdown import write_protocols
+from tracklake.schemas.references import link_references
 from tracklake.schemas.split_recipes import SPLIT_NAMES
 
 ROOT = Path(__file__).parents[2]
@@ -74,6 +75,6 @@ def test_the_page_of_protocols_is_current():
     page = (ROOT / "docs" / "protocols.md").read_text()
     assert page == write_protocols(), "run `make docs`"
     for name, protocol in PROTOCOLS.items():
-        assert f"\n## {name}\n\n{MEANINGS[name]}\n" in page
+        assert f"\n## {name}\n\n{link_references(MEANINGS[name])}\n" in page
         assert f"| `{name}` | {protocol.rate_hz} |" in page
         assert page.count(protocol.digest) == 1
