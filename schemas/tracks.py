@@ -21,21 +21,32 @@ TRACKS = Table(
         "time_s": column(pl.Float64, "since the recording's first frame", unit="s", ge=0),
         "x_m": column(
             pl.Float64,
-            "front centre along the direction of travel",
+            "front centre along the direction of travel; highD: box's middle + length/2 * cos(heading), to 1 mm",
             unit="m",
             ge=-2_000,
             le=20_000,
         ),
         "y_m": column(
             pl.Float64,
-            "front centre from the carriageway's left edge (arterials: the street's), positive to the driver's right",
+            "front centre from the carriageway's left edge (arterials: the street's), positive to the driver's right; "
+            "highD: box's middle + length/2 * sin(heading), to 1 mm",
             unit="m",
             ge=-2_000,
             le=2_000,
         ),
+        "heading_rad": column(
+            pl.Float32,
+            "direction in which the body points, 0 along the road, positive to the driver's right, to 0.0001: that of "
+            "the recorded velocity over 0.2 s, below 2 m/s the last one; null where the source has none (NGSIM)",
+            unit="rad",
+            nullable=True,
+            ge=-1.6,
+            le=1.6,
+        ),
         "lane": column(
             pl.Int16,
-            "1 is the driver's leftmost; null where the source has none",
+            "1 is the driver's leftmost; as recorded, so that y_m may lie in the next lane just before or after a lane "
+            "change; null where the source has none",
             nullable=True,
             ge=0,
         ),
@@ -68,7 +79,8 @@ TRACKS = Table(
         ),
         "lateral_speed_mps": column(
             pl.Float32,
-            "positive to the driver's right; recorded where the source has it, else central difference of y_m",
+            "positive to the driver's right; recorded where the source has it (highD: of the body's middle), else "
+            "central difference of y_m",
             unit="m/s",
             nullable=True,
         ),
@@ -96,7 +108,8 @@ TRACKS = Table(
         ),
         "gap_m": column(
             pl.Float64,
-            "leader's front - leader's length - own front, rounded to 1 mm; negative = overlap; null = no leader",
+            "leader's front - leader's length - own front, rounded to 1 mm; exact where the leader points along the "
+            "road, less than 1 cm too small at 2 degrees and 15 m; negative = overlap; null = no leader",
             unit="m",
             nullable=True,
         ),

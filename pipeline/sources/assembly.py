@@ -40,6 +40,8 @@ def assemble_subset(
     entries = add_kinematics(entries, rate_hz).with_columns(
         dataset=pl.lit(dataset), subset=pl.lit(name), time_s=(pl.col("frame") - first_frame) / rate_hz
     )
+    if "heading_rad" not in entries.columns:
+        entries = entries.with_columns(heading_rad=pl.lit(None, pl.Float32))
     if "lateral_speed_mps" not in entries.columns:
         entries = entries.with_columns(lateral_speed_mps=central_difference("y_m", rate_hz))
     entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)

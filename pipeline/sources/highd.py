@@ -126,8 +126,8 @@ def _to_subset(
     upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)
-    entries = orient_highd(entries, direction, upper_m, lower_m).select(
-        *("frame", "x_m", "y_m", "lane", "speed_mps", "accel_mps2", "lateral_speed_mps"),
+    entries = orient_highd(entries, direction, upper_m, lower_m, meta["frameRate"]).select(
+        *("frame", "x_m", "y_m", "heading_rad", "lane", "speed_mps", "accel_mps2", "lateral_speed_mps"),
         vehicle_id="id",
         leader_id=leader.then(pl.col("precedingId")),
         follower_id=pl.when(pl.col("followingId") != 0).then(pl.col("followingId")),

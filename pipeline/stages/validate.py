@@ -47,6 +47,6 @@ STAGE = Stage(
     scope="recording",
     after=(INGEST,),
     settings=(_describe_rules, "max_backward_share"),
-    version=2,
+    version=3,
     build=build,
 )

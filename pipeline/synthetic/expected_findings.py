@@ -33,7 +33,7 @@ SIZES_M = {
 
 @dataclass(frozen=True)
 class Entry:
-    """One row of a file in SI units along the direction of travel; `y` counts from the leftmost marking."""
+    """One row of a file in SI units: the front centre, `y` from the leftmost marking, `heading` to the right in rad."""
 
     front: float
     length: float
@@ -45,6 +45,27 @@ class Entry:
     width: float = 0.0
     lane: int = 1
     kind: str = "car"
+    heading: float = 0.0
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Middle of the body: along and across the road."""
+        back = self.length / 2
+        return self.front - back * math.cos(self.heading), self.y - back * math.sin(self.heading)
+
+    @property
+    def corners(self) -> list[tuple[float, float]]:
+        """Corners of the body, in turn."""
+        ahead = math.cos(self.heading), math.sin(self.heading)
+        x, y = self.middle
+        turns = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+        return [
+            (
+                x + (long * self.length * ahead[0] - wide * self.width * ahead[1]) / 2,
+                y + (long * self.length * ahead[1] + wide * self.width * ahead[0]) / 2,
+            )
+            for long, wide in turns
+        ]
 
 
 @dataclass(frozen=True)
@@ -178,7 +199,7 @@ def breaks_frame_gap(scene: Scenery, key: Key) -> bool:
 
 
 def breaks_overlap(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks overlap: the boxes meet along and across the road, by half a millimetre or more."""
+    """Test whether an entry breaks overlap: no side of a box parts the two; they meet by half a millimetre or more."""
     own, keys = scene.entries[key], scene.in_frame[key[1]]
     for step in (-1, 1):
         place = scene.frame_place[key] + step
@@ -186,12 +207,21 @@ def breaks_overlap(scene: Scenery, key: Key) -> bool:
             other = scene.entries[keys[place]]
             if abs(other.front - own.front) > LONGEST_M:
                 break
-            along = min(own.front - (other.front - other.length), other.front - (own.front - own.length))
-            across = (own.width + other.width) / 2 - abs(own.y - other.y)
-            if round(min(along, across), 3) > 0:
+            if round(min(_reach_into(own, other), _reach_into(other, own)), 3) > 0:
                 return True
             place += step
     return False
+
+
+def _reach_into(one: Entry, other: Entry) -> float:
+    """Compute how far two boxes overlap along or across the first, whichever is less; negative = apart."""
+    cosine, sine = math.cos(one.heading), math.sin(one.heading)
+    depths = []
+    for axis in ((cosine, sine), (-sine, cosine)):
+        own = [axis[0] * x + axis[1] * y for x, y in one.corners]
+        theirs = [axis[0] * x + axis[1] * y for x, y in other.corners]
+        depths.append(min(max(own) - min(theirs), max(theirs) - min(own)))
+    return min(depths)
 
 
 def breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
@@ -271,7 +301,8 @@ def breaks_outside_lane(scene: Scenery, key: Key) -> bool:
     if not 1 <= entry.lane < len(markings):
         return False
     left, right = markings[entry.lane - 1], markings[entry.lane]
-    return round(left - entry.y, 3) > 0 or round(entry.y - right, 3) > 0
+    across = entry.middle[1]
+    return round(left - across, 3) > 0 or round(across - right, 3) > 0
 
 
 RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {

@@ -4,6 +4,7 @@ Choices where the format leaves some: `dhw` is bumper to bumper (0 without a lea
 `ttc` = dhw / closing speed, both 0 where that speed is 0 or there is no leader; `numFrames`, `initialFrame` and
 `finalFrame` describe the rows in the file, so that a late start begins late in the metadata as well and a missing
 frame is not counted; minima of nothing are -1. Sight distances run from the vehicle's centre to the window's ends.
+The simulated `y` and lateral speed are those of the body's middle, by which `laneId` is written, too.
 """
 
 from collections.abc import Mapping

@@ -112,6 +112,7 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
     name = f"{recording}_tracks.csv"
     count = FileCount(name, "highd", recording)
     seen = set()
+    rows: dict[tuple[int, int], list[float]] = {}
     for line in _lines(folder / name)[1:]:
         count.read += 1
         parts = _usable(line, ",", 25)
@@ -127,25 +128,63 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
             continue
         seen.add(line)
         count.kept += 1
-        vehicle, frame = int(numbers[1]), int(numbers[0])
+        rows[int(numbers[1]), int(numbers[0])] = numbers
+    found.files.append(count)
+    headings = find_headings(
+        {key: (numbers[6], numbers[7]) for key, numbers in rows.items()}, direction, float(facts[1])
+    )
+    fronts = {}
+    for key, numbers in rows.items():
+        middle = numbers[2] + numbers[4] / 2
+        fronts[key] = (-middle if direction[key[0]] == 1 else middle) + numbers[4] / 2 * math.cos(headings[key])
+    hindmost = min((front for (vehicle, _), front in fronts.items() if direction[vehicle] == 1), default=0.0)
+    for (vehicle, frame), numbers in rows.items():
         left = direction[vehicle] == 1
         along = -1 if left else 1
         middle, lanes, lane = numbers[3] + numbers[5] / 2, len(upper) - 1, int(numbers[24])
+        heading, half = headings[vehicle, frame], numbers[4] / 2
         entry = Entry(
-            front=-numbers[2] if left else numbers[2] + numbers[4],
+            front=round(fronts[vehicle, frame] - (hindmost if left else 0), 3),
             length=numbers[4],
             speed=along * numbers[6],
             accel=along * numbers[8],
             leader=int(numbers[16]),
             headway=numbers[12],
-            y=upper[-1] - middle if left else middle - lower[0],
+            y=round((upper[-1] - middle if left else middle - lower[0]) + half * math.sin(heading), 3),
             width=numbers[5],
             lane=lanes + 2 - lane if left else lane - lanes - 2,
             kind=kinds[vehicle],
+            heading=round(heading, 4),
         )
         subset = f"{recording}-{'upper' if left else 'lower'}"
         found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry
-    found.files.append(count)
+
+
+def find_headings(
+    velocities: dict[tuple[int, int], tuple[float, float]], direction: dict[int, int], rate_hz: float
+) -> dict[tuple[int, int], float]:
+    """Find where vehicles point, rad to the right of the road, one entry after the other.
+
+    Args:
+        velocities: x and y velocity in the image by vehicle and frame.
+        direction: drivingDirection by vehicle; 1 drives left.
+        rate_hz: frame rate.
+    """
+    headings: dict[tuple[int, int], float] = {}
+    last: dict[int, float] = {}
+    for vehicle, frame in sorted(velocities):
+        near = [velocities[vehicle, frame]]
+        for step in (-1, 1):
+            away = 1
+            while away / rate_hz <= 0.1 and (vehicle, frame + step * away) in velocities:
+                near.append(velocities[vehicle, frame + step * away])
+                away += 1
+        sign = -1 if direction[vehicle] == 1 else 1
+        ahead, aside = (sign * sum(velocity[axis] for velocity in near) / len(near) for axis in (0, 1))
+        if ahead > 0 and math.hypot(ahead, aside) >= 2:
+            last[vehicle] = math.atan2(aside, ahead)
+        headings[vehicle, frame] = last.get(vehicle, 0.0)
+    return headings
 
 
 def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:

@@ -107,13 +107,17 @@ def measure_lane_stays(scene: Scene) -> Floats:
 
 
 def measure_way_out_of_lane(scene: Scene) -> Floats:
-    """Measure how far y_m lies outside the markings of the entry's lane, m, to 1 mm; 0 inside; NaN if unknown."""
+    """Measure how far the body's middle lies outside the markings of the entry's lane, m, to 1 mm; NaN if unknown.
+
+    The middle lies half a length behind the front centre, against the heading. 0 = inside.
+    """
     if scene.lane_markings_m is None or len(scene.lane_markings_m) < 2:
         return np.full(scene.height, np.nan)
     markings = np.asarray(scene.lane_markings_m, np.float64)
     known = (scene.lane >= 1) & (scene.lane < len(markings))
     lane = np.where(known, scene.lane, 1)
-    y = scene.tracks["y_m"].to_numpy()
+    half_length = scene.trait("length_m")[scene.track].astype(np.float64) / 2
+    y = scene.tracks["y_m"].to_numpy() - half_length * np.sin(scene.headings)
     outside = np.maximum(np.maximum(markings[lane - 1] - y, y - markings[lane]), 0.0)
     return np.where(known, np.round(outside, 3), np.nan)
 

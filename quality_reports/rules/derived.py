@@ -14,7 +14,7 @@ from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
 
 MOTION = ("vehicle_id", "frame", "x_m", "speed_mps", "frame_rate_hz")
 ACCELERATION = ("vehicle_id", "frame", "accel_mps2", "frame_rate_hz")
-PLANE = ("vehicle_id", "frame", "x_m", "y_m", "length_m", "width_m")
+PLANE = ("vehicle_id", "frame", "x_m", "y_m", "heading_rad", "length_m", "width_m")
 LANE_ORDER = ("vehicle_id", "frame", "x_m", "lane")
 LEADER = ("vehicle_id", "frame", "x_m", "leader_id")
 
@@ -39,7 +39,9 @@ DERIVED: dict[str, Derived] = {
     "jerk_mps3": Derived(along.measure_jerk, ACCELERATION),
     "jerk_reversals": Derived(along.count_jerk_reversals, ACCELERATION),
     "lane_stay_s": Derived(along.measure_lane_stays, ("vehicle_id", "frame", "lane", "frame_rate_hz")),
-    "out_of_lane_m": Derived(along.measure_way_out_of_lane, ("y_m", "lane", "lane_markings_m")),
+    "out_of_lane_m": Derived(
+        along.measure_way_out_of_lane, ("vehicle_id", "y_m", "heading_rad", "length_m", "lane", "lane_markings_m")
+    ),
     "overlap_m": Derived(within.measure_overlaps, PLANE),
     "nearest_ahead_m": Derived(within.measure_nearest_ahead, LANE_ORDER),
     "leader_ahead_m": Derived(within.measure_leader_ahead, LEADER),

@@ -184,8 +184,8 @@ OUTSIDE_LANE = Rule(
     severity="info",
     unit="m",
     thresholds=(Threshold("outside_lane_m", 0.0, "m"),),
-    meaning="the vehicle's front centre lies outside the markings of its lane by more than the threshold, to 1 mm; "
-    "checked where the markings are known",
+    meaning="the middle of the vehicle's body lies outside the markings of its lane by more than the threshold, to 1 "
+    "mm; it is half a length behind the front centre. Checked where the markings are known",
     source=DESIGN,
     breaks=lambda limits: pl.col("out_of_lane_m") > limits["outside_lane_m"],
     value=pl.col("out_of_lane_m"),

@@ -86,6 +86,12 @@ class Scene:
         return np.rint(x * UNITS_PER_M).astype(np.int64)
 
     @cached_property
+    def headings(self) -> Floats:
+        """Direction of each entry's body, rad, 0 where the source records none, (N,)."""
+        headings: Floats = self.tracks["heading_rad"].cast(pl.Float64).fill_null(0.0).to_numpy()
+        return headings
+
+    @cached_property
     def leader(self) -> Integers:
         """Track of the recorded leader, ABSENT where none is recorded or it has no track, (N,)."""
         return self._find_tracks(self.tracks["leader_id"].fill_null(ABSENT).to_numpy())

@@ -33,10 +33,10 @@ def sort_rows(*keys: NDArray[np.integer]) -> Integers:
 def measure_overlaps(scene: Scene) -> Floats:
     """Measure how deep an entry's box lies in that of another vehicle in the same frame, m, to 1 mm.
 
-    Depth is the least distance that one of the two would have to move, along or across the road, to be clear of the
-    other; of several overlaps the deepest. 0 = none: touching is not overlapping. Boxes reach back from the front
-    centre by the length and half the width to either side. NaN where the own size is unknown; others of unknown size
-    are skipped.
+    Depth is the least distance that one of the two would have to move, along or across either of them, to be clear of
+    the other; of several overlaps the deepest. 0 = none: touching is not overlapping. Boxes reach back from the front
+    centre by the length, against the heading (along the road where there is none), and half the width to either side.
+    NaN where the own size is unknown; others of unknown size are skipped.
     """
     length, width = (scene.trait(name)[scene.track] for name in ("length_m", "width_m"))
     known = ~(np.isnan(length) | np.isnan(width))
@@ -44,9 +44,12 @@ def measure_overlaps(scene: Scene) -> Floats:
     # In the order of (frame, x), those that can reach into a vehicle's rear are the ones right before it.
     order = sort_rows(scene.frame[rows], scene.x_units[rows])
     rows = rows[order]
-    frame, length, half = scene.frame[rows], length[rows].astype(np.float64), width[rows].astype(np.float64) / 2
-    x, y = (scene.tracks[name].to_numpy()[rows] for name in ("x_m", "y_m"))
-    rear = x - length
+    frame, x = scene.frame[rows], scene.tracks["x_m"].to_numpy()[rows]
+    boxes = _Boxes(scene, rows)
+    # No box reaches farther ahead of its front centre than its corners do.
+    ahead_m = float(np.max(boxes.half_width * np.abs(boxes.sine), initial=0.0))
+    rear = boxes.x - boxes.half_length * boxes.cosine - boxes.half_width * np.abs(boxes.sine) - ahead_m
+    side = boxes.half_length * np.abs(boxes.sine) + boxes.half_width * boxes.cosine
     depth = np.zeros(len(rows))
     ahead, step = np.arange(1, len(rows)), 1
     while ahead.size:
@@ -54,11 +57,9 @@ def measure_overlaps(scene: Scene) -> Floats:
         within = (x[behind] > rear[ahead]) & (frame[behind] == frame[ahead])
         ahead = ahead[within]
         behind = ahead - step
-        across = half[ahead] + half[behind] - np.abs(y[ahead] - y[behind])
-        meets = across > 0
-        first, second, across = behind[meets], ahead[meets], across[meets]
-        along = np.minimum(x[first] - rear[second], x[second] - rear[first])
-        deep = np.round(np.minimum(along, across), 3)
+        meets = side[ahead] + side[behind] > np.abs(boxes.y[ahead] - boxes.y[behind])
+        first, second = behind[meets], ahead[meets]
+        deep = np.round(np.minimum(boxes.measure_depth(first, second), boxes.measure_depth(second, first)), 3)
         depth[first] = np.maximum(depth[first], deep)
         depth[second] = np.maximum(depth[second], deep)
         step += 1
@@ -66,6 +67,32 @@ def measure_overlaps(scene: Scene) -> Floats:
     overlap = np.full(scene.height, np.nan)
     overlap[rows] = depth
     return overlap
+
+
+class _Boxes:
+    """Rectangles of entries in the plane: middles, half sizes and headings."""
+
+    def __init__(self, scene: Scene, rows: Integers) -> None:
+        self.half_length, self.half_width = (
+            scene.trait(name)[scene.track[rows]].astype(np.float64) / 2 for name in ("length_m", "width_m")
+        )
+        heading = scene.headings[rows]
+        self.cosine, self.sine = np.cos(heading), np.sin(heading)
+        x, y = (scene.tracks[name].to_numpy()[rows] for name in ("x_m", "y_m"))
+        self.x, self.y = x - self.half_length * self.cosine, y - self.half_length * self.sine
+
+    def measure_depth(self, one: Integers, other: Integers) -> Floats:
+        """Measure the lesser of how far two boxes overlap along and across the first, m; not above 0 = apart."""
+        x, y = self.x[other] - self.x[one], self.y[other] - self.y[one]
+        cosine, sine = self.cosine[one], self.sine[one]
+        # Of the angle between the two boxes.
+        turned = np.abs(cosine * self.cosine[other] + sine * self.sine[other])
+        askew = np.abs(sine * self.cosine[other] - cosine * self.sine[other])
+        length, width = self.half_length[other], self.half_width[other]
+        along = self.half_length[one] + length * turned + width * askew - np.abs(x * cosine + y * sine)
+        across = self.half_width[one] + length * askew + width * turned - np.abs(y * cosine - x * sine)
+        depth: Floats = np.minimum(along, across)
+        return depth
 
 
 def measure_nearest_ahead(scene: Scene) -> Floats:

@@ -16,7 +16,7 @@ CALLS = {
     "scene": "{subset}, 3",
     "track": "{subset}, 1",
 }
-EMPTY = {"leader_id": None, "follower_id": None, "gap_m": None, "headway_recorded_m": None}
+EMPTY = {"heading_rad": None, "leader_id": None, "follower_id": None, "gap_m": None, "headway_recorded_m": None}
 CLASSES = {1: "car", 2: "truck", 3: "car", 4: "motorcycle"}
 LENGTHS = {1: 4.0, 2: 12.0, 3: 5.0, 4: 2.0}
 

@@ -30,6 +30,7 @@ def scene_of(entries: dict[Key, Entry], surface: Surface = ANY_SURFACE) -> Scene
                 "frame": frame,
                 "x_m": entry.front,
                 "y_m": entry.y,
+                "heading_rad": entry.heading,
                 "lane": entry.lane,
                 "speed_mps": entry.speed,
                 "accel_mps2": entry.accel,

@@ -5,6 +5,7 @@ Formulas: DESIGN section 4, 'Orientation of highD' and 'NGSIM'.
 
 import polars as pl
 
+from tracklake.pipeline.transforms.tracks.headings import find_headings
 from tracklake.schemas.columns import FOOT_M
 
 UPPER, LOWER = 1, 2
@@ -17,39 +18,48 @@ DIRECTIONS = {EAST: "east", NORTH: "north", WEST: "west", SOUTH: "south"}
 """Names of NGSIM's directions by code."""
 
 
-def orient_highd(entries: pl.DataFrame, direction: int, upper_m: list[float], lower_m: list[float]) -> pl.DataFrame:
+def orient_highd(
+    entries: pl.DataFrame, direction: int, upper_m: list[float], lower_m: list[float], rate_hz: float
+) -> pl.DataFrame:
     """Turn one carriageway's boxes into the canonical frame.
 
-    The box (x, y, width, height) is axis-aligned with y pointing down: on the lower carriageway the front is the right
-    side and the driver's right is down; on the upper one the front is the left side and the driver's right is up.
+    The box (x, y, width, height) is axis-aligned with y pointing down, and its middle is the body's. On the lower
+    carriageway vehicles drive right and the driver's right is down; on the upper one they drive left and it is up. The
+    front centre lies half a length from the middle in the direction of the heading.
 
     Args:
-        entries: x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId of one carriageway, as in highD.
+        entries: id, frame, x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId of one carriageway, as in
+            highD, sorted by id, frame.
         direction: UPPER or LOWER.
         upper_m: y of the upper carriageway's lane markings in m, from the top.
         lower_m: y of the lower carriageway's lane markings in m, from the top.
+        rate_hz: frame rate.
 
     Returns:
-        The entries with x_m, y_m, lane, speed_mps, accel_mps2, lateral_speed_mps.
+        The entries with x_m and y_m, to 1 mm, heading_rad, lane, speed_mps, accel_mps2, lateral_speed_mps.
     """
-    upper_lanes = len(upper_m) - 1
-    centre_y = pl.col("y") + pl.col("height") / 2
-    if direction == LOWER:
-        return entries.with_columns(
-            x_m=pl.col("x") + pl.col("width"),
-            y_m=centre_y - lower_m[0],
-            lane=pl.col("laneId") - upper_lanes - 2,
-            speed_mps=pl.col("xVelocity"),
-            accel_mps2=pl.col("xAcceleration"),
-            lateral_speed_mps=pl.col("yVelocity"),
-        )
+    upper_lanes, sign = len(upper_m) - 1, -1 if direction == UPPER else 1
+    entries = entries.with_columns(
+        speed_mps=sign * pl.col("xVelocity"),
+        accel_mps2=sign * pl.col("xAcceleration"),
+        lateral_speed_mps=sign * pl.col("yVelocity"),
+        lane=upper_lanes + 2 - pl.col("laneId") if direction == UPPER else pl.col("laneId") - upper_lanes - 2,
+    )
+    names = ("id", "frame", "speed_mps", "lateral_speed_mps")
+    vehicle, frame, forward_mps, right_mps = (entries[name].to_numpy() for name in names)
+    headings = find_headings(vehicle, frame, forward_mps, right_mps, rate_hz)
+    cosine, sine = (pl.lit(pl.Series(values)) for values in headings)
+    half, middle_x, middle_y = (
+        pl.col("width") / 2,
+        pl.col("x") + pl.col("width") / 2,
+        pl.col("y") + pl.col("height") / 2,
+    )
+    front_x = sign * middle_x + half * cosine
+    left_edge_m = -upper_m[-1] if direction == UPPER else lower_m[0]
     return entries.with_columns(
-        x_m=pl.col("x").max() - pl.col("x"),
-        y_m=upper_m[-1] - centre_y,
-        lane=upper_lanes + 2 - pl.col("laneId"),
-        speed_mps=-pl.col("xVelocity"),
-        accel_mps2=-pl.col("xAcceleration"),
-        lateral_speed_mps=-pl.col("yVelocity"),
+        x_m=(front_x - front_x.min() if direction == UPPER else front_x).round(3),
+        y_m=(sign * middle_y + half * sine - left_edge_m).round(3),
+        heading_rad=sine.arcsin().round(4),
     )
 
 

@@ -41,8 +41,10 @@ def test_golden_numbers_of_the_upper_carriageway(tmp_path):
     assert tracks.select("vehicle_id", "frame").rows() == [(1, 1), (1, 2), (2, 1), (2, 2)]
     # Fronts are the left sides 100, 99, 60, 59, measured from the rightmost.
     assert tracks["x_m"].to_list() == close([0, 1, 40, 41])
-    # The carriageway's left edge is its lowest marking, 16; centres are 14, 14, 14, 10.
-    assert tracks["y_m"].to_list() == close([2, 2, 2, 6])
+    # The carriageway's left edge is its lowest marking, 16; middles are at 14, 14, 14, 10. Vehicle 1 moves 0.1 m/s to
+    # the left on average: its front is 4 / 2 * 0.1 / 25 = 0.008 m left of its middle.
+    assert tracks["y_m"].to_list() == [1.992, 1.992, 2, 6]
+    assert tracks["heading_rad"].to_list() == close([-0.004, -0.004, 0, 0])
     assert tracks["lane"].to_list() == [1, 1, 1, 2]
     assert tracks["speed_mps"].to_list() == close([25, 25, 25, -1])
     assert tracks["accel_mps2"].to_list() == close([-0.5, 0, 0, 0])

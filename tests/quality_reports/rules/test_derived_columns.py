@@ -1,5 +1,7 @@
 """Derived columns against numbers worked out by hand, and the order that they rely on."""
 
+import math
+
 import numpy as np
 import polars as pl
 import pytest
@@ -121,6 +123,22 @@ def test_overlap_is_the_least_way_to_be_clear():
     assert column(scene_of(entries), "overlap_m") == [2.0, 0.1, 2.0]
 
 
+def test_boxes_point_where_their_vehicles_do():
+    """Squares of 2 m, middles 2.2 m apart; one stands on its corner, which reaches 2^0.5 m from its middle."""
+    quarter = math.pi / 4
+    entries = driver(1, range(1, 2), x=101.0, length=2.0)
+    entries |= driver(2, range(1, 2), x=103.2, length=2.0)
+    assert column(scene_of(entries), "overlap_m") == [0.0, 0.0]
+    nose = math.cos(quarter)
+    entries |= driver(2, range(1, 2), x=102.2 + nose, length=2.0, y=2 + nose, heading=quarter)
+    assert column(scene_of(entries), "overlap_m") == [0.214, 0.214], "1 + 2^0.5 - 2.2"
+    # Two cars of 5 m, fronts 2.05 m apart: heading the same way or towards each other they are clear, and where they
+    # head apart, their tails, 2 * 5 sin(0.1) = 1 m nearer, meet.
+    for one, other, meets in ((0.1, 0.1, False), (0.1, -0.1, False), (-0.1, 0.1, True)):
+        entries = driver(1, range(1, 2), x=50.0, heading=one) | driver(2, range(1, 2), x=50.0, y=4.05, heading=other)
+        assert [depth > 0 for depth in column(scene_of(entries), "overlap_m")] == [meets, meets]
+
+
 def test_a_long_vehicle_overlaps_those_far_behind_its_front():
     entries = driver(1, range(1, 2), x=100.0, length=20.0)
     for vehicle, x in ((2, 99.0), (3, 90.0), (4, 81.0), (5, 80.0)):
@@ -180,6 +198,11 @@ def test_the_way_out_of_a_lane():
         change(entries, 1, [frame], y=float(y), lane=lane)
     assert column(scene_of(entries, road), "out_of_lane_m") == [0.0, 0.0, 0.25, 0.1, 0.0, 0.5, None]
     assert column(scene_of(entries), "out_of_lane_m") == [None] * 7
+    # The front has crossed the marking and the middle, 2.5 m behind, has not: 4.2 - 2.5 sin(0.1) = 3.950.
+    change(entries, 1, [1], y=4.2, heading=0.1)
+    assert column(scene_of(entries, road), "out_of_lane_m")[0] == 0.0
+    change(entries, 1, [1], heading=-0.1)
+    assert column(scene_of(entries, road), "out_of_lane_m")[0] == 0.45
 
 
 @pytest.mark.parametrize("name", sorted(DERIVED))
@@ -194,7 +217,7 @@ def test_every_derived_column_has_a_value_per_entry_and_leaves_the_others(name):
 
 def test_trace_leads_to_what_is_stored():
     assert trace(["speed_mps", "overlap_m", "length_m"]) == (
-        "speed_mps", "vehicle_id", "frame", "x_m", "y_m", "length_m", "width_m",
+        "speed_mps", "vehicle_id", "frame", "x_m", "y_m", "heading_rad", "length_m", "width_m",
     )  # fmt: skip
 
 

@@ -136,6 +136,7 @@ def random_scenes(draw) -> tuple[dict, Surface]:
                 headway=draw(st.sampled_from([0.0, 4.0, 5.0, 9.99])),
                 y=draw(st.sampled_from([2.0, 2.0, 3.9, 3.99, 4.0, 4.01])),
                 lane=lanes[place // 3 * 3] if draw(st.booleans()) else lanes[place],
+                heading=draw(st.sampled_from([0.0, 0.0, 0.125, -0.25])),
             )
     return entries, surface
 
@@ -193,6 +194,7 @@ def test_vehicles_of_unknown_size_leave_the_rules_about_size_unchecked():
         "overlap",
         "headway_mismatch",
         "implausible_size",
+        "outside_lane",
     }
 
 

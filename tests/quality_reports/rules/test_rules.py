@@ -66,8 +66,8 @@ def test_rules_read_declared_columns_only():
     assert all(set(derived.reads) <= known for derived in DERIVED.values())
     assert all(set(rule.columns) <= known for rule in RULES)
     columns = {rule.name: set(rule.columns) for rule in RULES}
-    assert columns["overlap"] == {"vehicle_id", "frame", "x_m", "y_m", "length_m", "width_m"}
-    assert columns["outside_lane"] == {"y_m", "lane", "lane_markings_m"}
+    assert columns["overlap"] == {"vehicle_id", "frame", "x_m", "y_m", "heading_rad", "length_m", "width_m"}
+    assert columns["outside_lane"] == {"vehicle_id", "y_m", "heading_rad", "length_m", "lane", "lane_markings_m"}
 
 
 BOUNDARIES = [
