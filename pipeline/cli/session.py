@@ -78,7 +78,9 @@ def run_steps(
         return conclude_idle(request, plan)
     refuse_if_busy(request.root, rebuild=rebuild)
     if plan.is_broken_off:
-        terminal.print_line("the last session was broken off before its end, which is done now", style="dim")
+        terminal.print_line(
+            "catalog and folders do not agree with the manifest: they are brought up to date", style="dim"
+        )
     with terminal.show_stages(), explain_file_errors(request.root):
         result: RunResult = import_flows().execute(request, plan)
         return result

@@ -79,7 +79,7 @@ def find_damage(root: Path, file: LakeFile, *, again: bool = False) -> str | Non
 
 
 def find_damaged_files(root: Path, manifest: Manifest) -> list[DamagedFile]:
-    """Return every live file that is damaged; all are read, whatever was read before."""
-    live = [(commit.key, file) for commit in manifest.commits.values() for file in commit.all_files]
+    """Return every live file that is damaged; all with a checksum are read, whatever was read before."""
+    live = ((commit.key, file) for commit in manifest.commits.values() for file in commit.all_files if file.sha256)
     found = ((key, file.path, find_damage(root, file, again=True)) for key, file in live)
     return sorted(DamagedFile(key, path, reason) for key, path, reason in found if reason is not None)

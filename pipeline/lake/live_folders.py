@@ -58,6 +58,18 @@ def is_shown(root: Path, manifest: Manifest) -> bool:
     return _find_shown(root) == names.keys() and all(_is_same(root / path, root / name) for name, path in names.items())
 
 
+def find_false_copies(root: Path, manifest: Manifest) -> list[str]:
+    """Return the names in the live folders that are no links to their contents, and hold other bytes."""
+    checksums = manifest.list_checksums()
+    return [
+        name
+        for name, path in list_names(manifest.commits.values()).items()
+        if (root / name).is_file()
+        and not ((root / path).exists() and (root / name).samefile(root / path))
+        and hash_file(root / name, again=True) != checksums.get(path)
+    ]
+
+
 def adopt_files(root: Path, manifest: Manifest) -> Manifest:
     """Bring the files of a lake of an earlier layout, live and retired, into the store; returns the manifest for it.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake import catalog, files, live_folders, session_end
-from tracklake.pipeline.lake.checksums import DamagedFile, find_damaged_files, forget_checksums
+from tracklake.pipeline.lake.checksums import forget_checksums
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
 from tracklake.pipeline.lake.rebuild import start_rebuild
@@ -69,14 +69,12 @@ class Writer:
                 self._store(self.manifest.remove_commits(keys, self._generation))
                 live_folders.show_commit(self.root, None, removed)
 
-    def mark_damaged(self) -> list[DamagedFile]:
-        """Compare every live file with its checksum, and record commits that must be made again; returns the damage."""
+    def mark_damaged(self, keys: Collection[str]) -> None:
+        """Record commits as damaged, so that the next run makes them again; their files stay live until then."""
         with self._guard:
-            found = find_damaged_files(self.root, self.manifest)
-            marked = self.manifest.mark_damaged({file.key for file in found})
+            marked = self.manifest.mark_damaged(keys)
             if marked != self.manifest:
                 self._store(marked)
-            return found
 
     def remember_origin(self, source: str) -> None:
         """Record a SOURCE as the last one, so that a message about a rebuild can name it."""

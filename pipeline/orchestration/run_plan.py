@@ -136,7 +136,7 @@ class RunPlan:
         discovery: the source's raw files; None where nothing is ingested.
         ingest: the source compared with the lake; None where files have to be read first, or there is no lake yet.
         is_idle: whether everything that was requested is in the lake already, and the last session came to its end.
-        is_broken_off: whether only the end of the last session is missing.
+        is_broken_off: whether all is done but the end of a session: it was killed, or the lake was copied or changed.
     """
 
     discovery: Discovery | None = None

@@ -21,6 +21,7 @@ from tracklake.pipeline.lake import (
     LakeLockedError,
     Manifest,
     Writer,
+    find_damaged_files,
     list_ingested,
     open_for_writing,
 )
@@ -118,7 +119,7 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest,
         else:
             _record_error(title, made, result)
             if isinstance(made, DamagedFileError):
-                writer.mark_damaged()
+                writer.mark_damaged({file.key for file in find_damaged_files(writer.root, writer.manifest)})
         show.advance(stage, title)
 
 

@@ -14,7 +14,7 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.planner import Planner, build_job
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 
-pytestmark = pytest.mark.usefixtures("prefect_here", "empty_charts")
+pytestmark = pytest.mark.usefixtures("plain_flows", "empty_charts")
 
 
 def flip(path: Path, place: int = 100) -> None:
@@ -129,7 +129,7 @@ def test_nothing_to_do_is_said_only_where_all_agrees(command, small, state):
     again = command.here("ingest", raw, "--lake", root)
     assert again.code == 0
     assert "nothing to do" not in again.out
-    assert "the last session was broken off before its end, which is done now" in again.out
+    assert "catalog and folders do not agree with the manifest" in again.out
     assert is_settled(root, load(root))
     assert "nothing to do" in command.here("ingest", raw, "--lake", root).out
     with duckdb.connect(str(root / "catalog.duckdb"), read_only=True) as plain:
@@ -137,10 +137,37 @@ def test_nothing_to_do_is_said_only_where_all_agrees(command, small, state):
     assert any((root / "tracks").rglob("*.parquet"))
 
 
+def test_check_reads_a_lake_that_another_process_writes(command, small):
+    _, root = small
+    flip(find_live(root, "tracks"))
+    with open_for_writing(root):
+        done = command.here("check", "--lake", root)
+    assert done.code == 1
+    assert "note: " in done.err
+    assert "is writing to this lake" in done.err
+    assert "its bytes are not those that were written" in done.err
+
+
+def test_a_damaged_copy_in_a_folder_is_found_and_linked_again(command, small):
+    """Copying a lake makes copies of its links, with their times."""
+    _, root = small
+    copied = root.with_name("copied")
+    shutil.copytree(root, copied)
+    shown = next((copied / "tracks").rglob("*.parquet"))
+    before = shown.read_bytes()
+    flip(shown)
+    done = command.here("check", "--lake", copied)
+    assert done.code == 0
+    assert f"damaged: {shown}: not the bytes of the live file" in done.err
+    assert "are up to date again" in done.out
+    assert shown.read_bytes() == before
+    assert command.here("check", "--lake", copied).err == ""
+
+
 def test_check_mends_a_session_that_was_broken_off(command, small):
     _, root = small
     (root / "catalog.duckdb").unlink()
     done = command.here("check", "--lake", root)
     assert done.code == 0
-    assert "the last session had been broken off" in done.out
+    assert "are up to date again" in done.out
     assert is_settled(root, load(root))

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_lake import Nursery, check_lake, find_files, write_round
+from small_lake import Nursery, check_folder, check_lake, find_files, write_round
 
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import is_settled, load
 
 STRIDE = 9
 """Steps of a session from one death to the next; 1 is thorough and takes half a minute."""
@@ -34,11 +34,14 @@ def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nurser
     step, number, deaths = 0, 3, 0
     while nursery.ask(f"die {number} {step}") == signal.SIGKILL:
         check_lake(root)
+        assert not is_settled(root, load(root)) or step < STRIDE
         deaths += 1
         if deaths % 3 == 0:  # three deaths on top of each other, then one session that ends
             write_round(root, number + 1)
         step, number = step + STRIDE, number + 2
     check_lake(root)
+    check_folder(root, linked=True)
+    assert is_settled(root, load(root))
     # Two subsets of two tables and a folder, the manifest, the catalog and the sweep are this many steps at least.
     assert 60 < step < 400
     assert load(root).commits["validate/highd/01-upper"].info["number"] == number
