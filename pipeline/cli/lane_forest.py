@@ -43,6 +43,9 @@ FOREST, SCORES = "forest.skops", "lane_forest.json"
 MODELS_BESIDE = ("constant-velocity", "ctrv")
 """Models scored beside the forest; they need no training."""
 
+PUBLISHED_PROTOCOL = "grid-2021"
+"""Protocol by which the published cell accuracies were measured."""
+
 OPTIONS_OF_THEIR_OWN = ("examples", "augmentation")
 """Settings of a forest that have options of their own and are no names for `--set`."""
 
@@ -89,7 +92,9 @@ def lane_forest(
         wanted = None if use else _read_forest_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
-        comparable = print_comparability(terminal, settings.lake, folder, published=True)
+        comparable = print_comparability(
+            terminal, settings.lake, folder, published=folder.protocol.name == PUBLISHED_PROTOCOL
+        )
         out = settings.lake / RUNS / FOLDER
         forest = _open_forest(out / FOREST, folder) if wanted is None else _fit_forest(out, folder, seed or 0, wanted)
         record = _score_forest(terminal, settings.lake / RUNS, folder, forest, runs or [], published=bool(comparable))
@@ -206,7 +211,7 @@ def _show_scores(
     """Print cell accuracies by horizon, those of the last horizon by stratum, and the maneuvers' accuracies."""
     protocol = folder.protocol
     terminal.print_line(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
-    _show_cells(terminal, scores.cells, published=published and protocol.name == "grid-2021")
+    _show_cells(terminal, scores.cells, published=published)
     rows = [
         [own.stratum, f"{own.n:,}", *map(_format_percent, (own.accuracy, *own.recall.values(), own.majority))]
         for own in scores.maneuvers

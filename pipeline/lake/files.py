@@ -12,7 +12,7 @@ from urllib.parse import quote, unquote
 import polars as pl
 
 from tracklake.pipeline.lake.checksums import hash_file
-from tracklake.pipeline.lake.errors import LakeMissingError
+from tracklake.pipeline.lake.errors import DamagedFileError, LakeMissingError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.files import sync
@@ -222,6 +222,7 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
 
     Raises:
         ValueError: the table is not partitioned by a column of `values`.
+        DamagedFileError: a live file is missing.
     """
     others = values.keys() - set(table.partition)
     if others:
@@ -231,6 +232,11 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
     for file in manifest.live(table.name):
         stated = read_partition(table, file.path)
         if values.items() <= stated.items():
+            if not (root / file.path).is_file():
+                raise DamagedFileError(
+                    f"{root / file.path}: a live file of the lake is missing; `tracklake run SOURCE --lake {root}` on "
+                    "the raw files makes it again"
+                )
             by_values.setdefault(tuple(stated.items()), []).append(root / file.path)
     if not by_values:
         return table.empty().lazy()

@@ -22,6 +22,7 @@ from tracklake.pipeline.lake import (
     query_errors,
     scan,
 )
+from tracklake.pipeline.lake.errors import DamagedFileError
 from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
@@ -181,6 +182,8 @@ def test_scan_reads_only_what_is_asked_for(tmp_path: Path):
     assert every.schema == pl.Schema(VEHICLE_STARTS.dtypes)
     shutil.rmtree(tmp_path / ".files" / "vehicle_starts" / "dataset=highd" / "subset=01-lower")
     assert scan(tmp_path, manifest, VEHICLE_STARTS, **UPPER).collect().height == 3
+    with pytest.raises(DamagedFileError, match=r"01-lower.*a live file of the lake is missing; `tracklake run"):
+        scan(tmp_path, manifest, VEHICLE_STARTS)
     nothing = scan(tmp_path, manifest, VEHICLE_STARTS, dataset="ngsim").collect()
     assert (nothing.height, nothing.schema) == (0, every.schema)
     assert scan(tmp_path, manifest, SUBSETS_TABLE).collect().equals(SUBSETS_TABLE.empty())
