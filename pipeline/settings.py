@@ -121,9 +121,9 @@ class Settings(BaseSettings):
             PROTOCOLS[self.protocol], **{name: value for name, value in changes.items() if value is not None}
         )
 
-    def get_split_recipe(self) -> SplitRecipe:
-        """Return the recipe of the split that tensors are made of."""
-        trains = self.get_protocol().split
+    def get_split_recipe(self, name: str | None = None) -> SplitRecipe:
+        """Return the recipe of a split; None: of the protocol's."""
+        trains = name or self.get_protocol().split
         return next(recipe for recipe in self.get_split_recipes() if recipe.name == trains)
 
     def get_split_recipes(self) -> list[SplitRecipe]:

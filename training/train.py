@@ -72,6 +72,7 @@ def train(
     progress: Progress | None = None,
     *,
     resume: bool | None = None,
+    without_evaluation: bool = False,
 ) -> dict[str, Any]:
     """Train a model on the training part, evaluate it on the evaluation part, and write the run.
 
@@ -85,6 +86,7 @@ def train(
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
         progress: called after every step.
         resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
+        without_evaluation: whether to train also where the evaluation part has no samples.
 
     Returns:
         Content of `metrics.json`: see `_describe_training`, and `evaluation`, null where there is no such part.
@@ -101,6 +103,12 @@ def train(
     if not entry.learns:
         return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
+    if not without_evaluation and len(folder.samples_of("eval")) == 0:
+        raise TracklakeError(
+            f"{tensors}: the split `{folder.split}` has no samples in `eval`, so the model would be scored on "
+            'nothing. Add recordings, or set split = "time-blocks" with a shorter `split_block_s` and run `tracklake '
+            "run` again; `--no-evaluation` trains all the same."
+        )
     with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())

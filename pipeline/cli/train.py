@@ -66,6 +66,9 @@ def train(
         bool | None,
         typer.Option("--resume/--anew", help="Continue an interrupted training with its own settings; or discard it."),
     ] = None,
+    no_evaluation: Annotated[
+        bool, typer.Option("--no-evaluation", help="Train also where the split has nothing to evaluate on.")
+    ] = False,
     device: Annotated[str | None, typer.Option("--device", help="cpu or cuda (default: cpu).")] = None,
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of torch (default: 1).")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the run; default: the model's.")] = None,
@@ -98,11 +101,14 @@ def train(
 
         try:
             with explain_file_errors(out), terminal.show_training(f"train {model}") as show:
-                metrics = train_model(model, tensors, out, config, show, resume=resume)
+                metrics = train_model(
+                    model, tensors, out, config, show, resume=resume, without_evaluation=no_evaluation
+                )
         except TrainingInterruptedError as stopped:
             again = [find_command(), "train", model, "--resume", *(["--name", name] if name is not None else [])]
             again += ["--lake", str(lake)] if lake is not None else []
             again += ["--protocol", protocol] if protocol is not None else []
+            again += ["--no-evaluation"] if no_evaluation else []
             raise report_failure(terminal, f"{stopped}\nTo go on: {shlex.join(again)}") from None
         if metrics["evaluation"] is not None:
             _show_scores(terminal, metrics["evaluation"])

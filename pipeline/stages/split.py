@@ -4,6 +4,7 @@ from typing import Any
 
 import polars as pl
 
+from tracklake.pipeline.lake import Manifest
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.split_leakage import Leakage, measure_leakage, open_tables, refuse_leaks
@@ -22,7 +23,7 @@ from tracklake.schemas import (
     SUBSETS,
 )
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.split_recipes import MEANINGS, SplitRecipe
+from tracklake.schemas.split_recipes import MEANINGS, TIME_BLOCKS, SplitRecipe
 
 
 def build(reader: LakeReader, settings: Settings) -> StageResult:
@@ -35,19 +36,49 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     made = {recipe: make_split(recipe, inputs) for recipe in settings.get_split_recipes()}
     measured = _measure_all(inputs, made)
     refuse_leaks(measured)
+    trains, reason = _choose_training_split(made, settings)
     frames = {
         SPLITS: [split.allocation.splits for split in made.values()],
         SPLIT_BALANCE: [split.allocation.balance for split in made.values()],
         SPLIT_LEFT_OUT: [split.left_out for split in made.values()],
-        SPLIT_RECIPES: [_describe_recipes(made, inputs.protocol)],
+        SPLIT_RECIPES: [_describe_recipes(made, trains)],
         SPLIT_LEAKAGE: [found.leakage for found in measured.values()],
         SPLIT_CONTEXT: [found.context for found in measured.values()],
         SPLIT_SHIFTS: [found.shifts for found in measured.values()],
     }
     return StageResult(
         {table: pl.concat(parts).sort(table.key) for table, parts in frames.items()},
-        notes=[note for recipe, split in made.items() for note in _write_notes(recipe, split, measured[recipe])],
+        info={"trains": trains},
+        notes=reason
+        + [note for recipe, split in made.items() for note in _write_notes(recipe, split, measured[recipe])],
     )
+
+
+def find_training_split(manifest: Manifest, settings: Settings) -> str:
+    """Return the name of the split that tensors are made of: the setting's, else what the lake's subsets allow."""
+    made = manifest.commits.get(STAGE.name)
+    return str((made.info if made is not None else {}).get("trains", settings.get_protocol().split))
+
+
+def _choose_training_split(made: dict[SplitRecipe, SplitResult], settings: Settings) -> tuple[str, list[str]]:
+    """Choose the split that tensors are made of: without a setting, one in which something is left to evaluate on.
+
+    Returns:
+        Its name, and a note where it is not the protocol's.
+    """
+    wanted = settings.get_protocol().split
+    able = [recipe.name for recipe, split in made.items() if _can_evaluate(split)]
+    if wanted in able or settings.split is not None or TIME_BLOCKS not in able:
+        return wanted, []
+    note = f"too few subsets for the split {wanted}, which would evaluate on nothing: tensors are made of {TIME_BLOCKS}"
+    return TIME_BLOCKS, [note]
+
+
+def _can_evaluate(split: SplitResult) -> bool:
+    """Return whether both the training and the evaluation part hold samples."""
+    counts = split.allocation.balance.group_by("part").agg(pl.col("samples").sum())
+    sampled = counts.filter(pl.col("samples") > 0)["part"].to_list()
+    return {"train", "eval"} <= set(sampled)
 
 
 def gather_subsets(reader: LakeReader, protocol: Protocol) -> pl.DataFrame:
@@ -94,14 +125,14 @@ def _measure_all(inputs: SplitInputs, made: dict[SplitRecipe, SplitResult]) -> d
         }
 
 
-def _describe_recipes(made: dict[SplitRecipe, SplitResult], protocol: Protocol) -> pl.DataFrame:
+def _describe_recipes(made: dict[SplitRecipe, SplitResult], trains: str) -> pl.DataFrame:
     """Return the rows of `split_recipes`."""
     rows = [
         {
             "split": recipe.name,
             "meaning": MEANINGS[recipe.name],
             "claims_no_leakage": recipe.claims_no_leakage,
-            "trains": recipe.name == protocol.split,
+            "trains": recipe.name == trains,
             "window_s": recipe.window_s,
             "digest": recipe.digest,
             "parameters": recipe.parameters,
@@ -133,6 +164,7 @@ def _describe_splits(settings: Settings) -> dict[str, Any]:
         "protocol": settings.get_protocol().digest,
         "splits": {recipe.name: recipe.digest for recipe in settings.get_split_recipes()},
         "seed": settings.split_seed,
+        "asked": settings.split,  # a split that is asked for is taken, whatever it leaves to evaluate on
     }
 
 
@@ -142,6 +174,6 @@ STAGE = Stage(
     scope="lake",
     after=(INGEST, "validate", "samples"),
     settings=(_describe_splits, "validation_part"),
-    version=3,
+    version=4,
     build=build,
 )

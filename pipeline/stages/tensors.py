@@ -12,6 +12,7 @@ from tracklake.pipeline.lake.files import TENSORS
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
+from tracklake.pipeline.stages.split import find_training_split
 from tracklake.pipeline.stages.stage import INGEST, Stage, StageError, StageResult
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
@@ -30,7 +31,8 @@ FINDING_COLUMNS = ("vehicle_id", "severity", "first_frame", "last_frame")
 def build(reader: LakeReader, settings: Settings) -> StageResult:
     """Build the arrays subset by subset, in the split's order, and put the folder into the lake at once."""
     root, protocol, storage = reader.root, settings.get_protocol(), settings.tensor_positions
-    splits, left_out = read_split(reader, protocol)
+    split = find_training_split(reader.manifest, settings)
+    splits, left_out = read_split(reader, split)
     included = list(_list_sampled_subsets(reader, splits, protocol))
     if not included:
         return StageResult(info={"path": None, "samples": 0}, notes=["no subset gives samples: no tensors"])
@@ -42,25 +44,25 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
             yield subset.facts, build_subset(subset, blocks, vehicles, protocol, storage)
 
     def write(folder: Path) -> None:
-        recipe = {**_describe_recipe(settings), "left_out_vehicles": left_out.height}
+        recipe = {**_describe_recipe(settings, split), "left_out_vehicles": left_out.height}
         write_tensors(folder, build_all(), splits, protocol, storage=storage, split_recipe=recipe)
 
-    path = find_free_path(root, f"{TENSORS}/{protocol.split}/{reader.job.fingerprint}")
+    path = find_free_path(root, f"{TENSORS}/{split}/{reader.job.fingerprint}")
     files = write_folder(root, path, write)
     index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}
     return StageResult(files={TENSORS: files}, info=info)
 
 
-def _describe_recipe(settings: Settings) -> dict[str, Any]:
+def _describe_recipe(settings: Settings, split: str) -> dict[str, Any]:
     """Return digest and parameters, by name, of the split that the tensors are made of."""
-    recipe = settings.get_split_recipe()
+    recipe = settings.get_split_recipe(split)
     return {"digest": recipe.digest, "parameters": json.loads(recipe.parameters)}
 
 
-def read_split(reader: LakeReader, protocol: Protocol) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return the rows of the protocol's split in `splits` and in `split_left_out`."""
-    named = pl.col("split") == protocol.split
+def read_split(reader: LakeReader, split: str) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return the rows of a split in `splits` and in `split_left_out`."""
+    named = pl.col("split") == split
     return reader.scan(SPLITS).filter(named).collect(), reader.scan(SPLIT_LEFT_OUT).filter(named).collect()
 
 
@@ -101,9 +103,13 @@ def _list_sampled_subsets(reader: LakeReader, splits: pl.DataFrame, protocol: Pr
 def _describe_settings(settings: Settings) -> dict[str, Any]:
     return {
         "protocol": settings.get_protocol().digest,
-        "split_recipe": _describe_recipe(settings),
         "positions": settings.tensor_positions,
     }
+
+
+def _find_inputs(_root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return the recipe of the split, which depends on the lake's subsets, for the one job over the whole lake."""
+    return {"": {"split_recipe": _describe_recipe(settings, find_training_split(manifest, settings))}}
 
 
 STAGE = Stage(
@@ -114,6 +120,7 @@ STAGE = Stage(
     settings=(_describe_settings,),
     version=6,
     build=build,
+    extra_inputs=_find_inputs,
 )
 
 
@@ -136,7 +143,8 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
             f"now: by {made['name']} ({made['digest']}). Run `tracklake run` with these settings, or set what they "
             "were made with."
         )
-    recipe, found = settings.get_split_recipe(), commit.built_from.get("split_recipe", {"digest": "unknown"})
+    recipe = settings.get_split_recipe(find_training_split(manifest, settings))
+    found = commit.built_from.get("split_recipe", {"digest": "unknown"})
     if found["digest"] != recipe.digest:
         raise StageError(
             f"{root}: the tensors were made by another recipe of the split {recipe.name} ({found['digest']}: "

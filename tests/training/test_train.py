@@ -335,6 +335,10 @@ def test_without_an_evaluation_part_there_is_no_score(tmp_path):
         tmp_path / "tensors", pl.concat([split_row("a", "train"), split_row("b", "train")]), subsets="ab"
     )
     assert train("constant-velocity", folder, tmp_path / "cv")["evaluation"] is None
+    with pytest.raises(TracklakeError, match=r"has no samples in `eval`.*--no-evaluation"):
+        train("lstm", folder, tmp_path / "run", FEW)
+    assert not (tmp_path / "run").exists()
+    assert train("lstm", folder, tmp_path / "run", FEW, without_evaluation=True)["evaluation"] is None
 
 
 def test_without_a_training_part_there_is_nothing_to_learn_from(tmp_path):

@@ -11,7 +11,7 @@ from tracklake.pipeline.lake import Manifest, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.split import gather_subsets
+from tracklake.pipeline.stages.split import find_training_split, gather_subsets
 from tracklake.pipeline.stages.split_makers import SplitInputs, make_split
 from tracklake.pipeline.transforms.csp.subset import CleanContext
 from tracklake.schemas import MISSING_STARTS, SPLITS, SUBSET_STATUS, VEHICLE_STARTS
@@ -47,16 +47,17 @@ def read_context(
         )
     Planner(root, manifest, settings).require("split")
     names = {facts["dataset"] for facts in subsets}
-    splits = scan(root, manifest, SPLITS).filter(split=protocol.split).collect()
+    name = find_training_split(manifest, settings)
+    splits = scan(root, manifest, SPLITS).filter(split=name).collect()
     parts = splits.select("dataset", "part").unique().rows()
     if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
-        recipe = settings.get_split_recipe()
+        recipe = settings.get_split_recipe(name)
         reader = LakeReader(root, manifest)
         inputs = SplitInputs(reader, gather_subsets(reader, protocol), protocol)
         allocation = make_split(replace(recipe, validation=True), inputs).allocation
         splits = allocation.splits
         notes.append(
-            f"the lake's split {protocol.split} has no validation part; the files hold the split that "
+            f"the lake's split {name} has no validation part; the files hold the split that "
             "`validation_part = true` makes: TestSet.mat is not the lake's eval part, and TrainSet.mat may hold some "
             "of it"
         )

@@ -13,6 +13,7 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import split
 from tracklake.pipeline.stages.stage import Job, StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.hashing import hash_values
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitRecipe
 
 MAKERS = {"tracks": "ingest", "vehicles": "ingest", "subsets": "ingest", "subset_status": "validate",
@@ -281,3 +282,40 @@ def test_time_blocks_are_balanced_by_what_is_left_when_vehicles_are_left_out(tmp
     assert index["split_recipe"]["parameters"]["block_s"] == 10
     assert index["split_recipe"]["digest"] == settings.get_split_recipe().digest
     assert {part: n for part, n in index["samples_by_part"].items() if n} == context
+
+
+@pytest.fixture(scope="module")
+def lone_root(tmp_path_factory):
+    """A lake with one usable carriageway: of recording 02, the upper one is excluded."""
+    folder = tmp_path_factory.mktemp("splits") / "lake"
+    put_recording(folder, "02")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changes", "trains"),
+    [
+        ({"split_block_s": 10}, "time-blocks"),
+        ({"split_block_s": 10, "protocol": "csp", "split": "flow-balanced"}, "flow-balanced"),  # asked for
+        ({"split_block_s": 10, "splits": ["flow-balanced"]}, "flow-balanced"),  # time-blocks are not made
+        ({"split_block_s": 60}, "flow-balanced"),  # one block has nothing to evaluate on either
+    ],
+)
+def test_one_subset_trains_on_time_blocks_unless_a_split_is_set(lone_root, changes, trains):
+    settings = Settings(**changes)
+    job = Job("split", hash_values([changes], 16))  # its files carry this name
+    commit = build_one(lone_root, job, settings)
+    assert commit.info["trains"] == trains
+    said = [note for note in commit.info["notes"] if note.startswith("too few subsets for the split flow-balanced")]
+    assert len(said) == (trains == "time-blocks")
+    files = [lone_root / file.path for file in commit.files["split_recipes"]]
+    recipes = pl.read_parquet(files, hive_partitioning=False)
+    assert recipes.filter("trains")["split"].to_list() == [trains]
+    if trains == "time-blocks":
+        balance = pl.read_parquet([lone_root / file.path for file in commit.files["split_balance"]])
+        samples = dict(balance.filter(split=trains).select("part", "samples").iter_rows())
+        assert min(samples.values()) > 0
+
+
+def test_enough_subsets_train_on_the_protocols_split(root):
+    assert build_one(root, JOB, SETTINGS).info["trains"] == "flow-balanced"
