@@ -18,7 +18,6 @@ import vl_convert
 from tracklake.pipeline.lake import connect
 from tracklake.quality_reports.pages.examples import PANELS, draw_example
 from tracklake.quality_reports.pages.subsets import render_pages
-from tracklake.quality_reports.summaries import collect
 
 ENTRIES = 120
 """Entries of one plot: a finding of 2 s at 10 Hz and 5 s before and after."""
@@ -38,9 +37,8 @@ def main() -> None:
         print(f"{name}: {1000 * cost:.1f} ms per plot")
     if options.lake:
         with connect(options.lake) as connection:
-            quality = collect(connection, {"lake": "benchmark"})
             begun = time.process_time()
-            pages = [page for _, page in render_pages(connection, quality)]
+            pages = [page for _, page in render_pages(connection, {"lake": "benchmark"})]
             seconds = (time.process_time() - begun) / len(pages)
         plots = sum(page.count("Position, speed and acceleration over time") for page in pages) / len(pages)
         print(f"pages: {seconds:.2f} s each, with {plots:.1f} such plots")

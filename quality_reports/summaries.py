@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from importlib.resources import files
 from pathlib import PurePath
-from typing import Any, Protocol, SupportsFloat, TypeAlias, TypeVar, cast
+from typing import Any, Protocol, SupportsFloat, TypeAlias, TypedDict, TypeVar, cast
 
 import polars as pl
 
@@ -71,6 +71,22 @@ UNCHECKED: Row = {
     **dict.fromkeys(("runs", "vehicles", "vehicle_share", "entries", "entry_share", "worst")),
 }
 """Findings of a rule in a lake without subsets."""
+
+
+class SubsetFigures(TypedDict):
+    """Numbers of the overview that subsets' pages show as well."""
+
+    subsets: list[SubsetFacts]
+    rules: list[RuleFindings]
+    per_second: list[SpeedsPerSecond]
+    subset_scores: list[SubsetScores]
+    starts: list[SubsetStarts]
+    positions: list[StartPosition]
+    samples: list[SubsetSamples]
+    members: list[SplitMember]
+    left_out: list[LeftOut]
+    completeness: list[Completeness]
+    provenance: Row
 
 
 class Result(Protocol):
@@ -216,6 +232,25 @@ def collect(
         },
         "model_scores": [cast("ModelScores", plain_row(each)) for each in scores or ()],
         "provenance": cast("Provenance", {**plain_row(provenance), "source_files": source_files}),
+    }
+
+
+def collect_subsets(
+    connection: Connection, provenance: Mapping[str, Any], *, rules: Sequence[Rule] = RULES
+) -> SubsetFigures:
+    """Gather the numbers of the overview that subsets' pages show as well; the arguments are those of `collect`."""
+    return {
+        "subsets": _query_rows(connection, "subsets", SubsetFacts),
+        "rules": _collect_rules(connection, rules, provenance.get("thresholds") or {}),
+        "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
+        "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
+        "starts": _query_rows(connection, "starts", SubsetStarts),
+        "positions": _query_rows(connection, "start_positions", StartPosition),
+        "samples": _query_rows(connection, "samples", SubsetSamples),
+        "members": _query_rows(connection, "split_members", SplitMember, {"parts": list(PARTS)}),
+        "left_out": _query_rows(connection, "left_out", LeftOut),
+        "completeness": _query_rows(connection, "completeness", Completeness),
+        "provenance": plain_row(provenance),
     }
 
 

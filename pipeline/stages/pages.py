@@ -52,12 +52,11 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
 def build(reader: LakeReader, _settings: Settings) -> StageResult:
     """Query what the lake holds of one recording and write its subsets' pages into reports/subsets/."""
     from tracklake.quality_reports.pages.subsets import render_pages
-    from tracklake.quality_reports.summaries import collect
 
     dataset, pages = reader.job.inputs["dataset"], reader.job.built_from["pages"]
     names = {(dataset, subset): name for subset, name in pages.items()}
     with connect(reader.root, recording=reader.job.tail) as connection:
-        rendered = render_pages(connection, collect(connection, describe_origin(reader.root)), names=names)
+        rendered = render_pages(connection, describe_origin(reader.root), names=names)
         files = [write_report_file(reader.root, f"{FOLDER}/{name}", content) for name, content in rendered]
     return StageResult(files={REPORTS: files}, info={"pages": [(*key, name) for key, name in names.items()]})
 

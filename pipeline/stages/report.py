@@ -16,7 +16,6 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
-from tracklake.quality_reports.pages.splits import SPLITS_PAGE
 from tracklake.quality_reports.rules.registry import RULES, resolve
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.files import remove_unfinished
@@ -71,8 +70,8 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
 
 
 def build(reader: LakeReader, settings: Settings) -> StageResult:
-    """Query the lake and write reports/index.html and reports/quality.json; the subsets' pages are there by then."""
-    from tracklake.quality_reports.pages.report import build_report
+    """Query the lake and write the overview, the pages beside it and quality.json; the subsets' pages are there."""
+    from tracklake.quality_reports.pages.report import OTHER_PAGES, build_report
 
     root, manifest, built_from = reader.root, reader.manifest, reader.job.built_from
     recorded = scan(root, manifest, SUBSETS).filter(pl.col("origin") == "recorded").select("dataset").collect()
@@ -95,10 +94,9 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
         scores = collect_scores(root, manifest, notes.append)
         report = build_report(connection, provenance, scores=scores, pages=find_pages(root, made))
     files = [write_report_file(root, PAGE, report.html), write_report_file(root, DOCUMENT, report.json)]
-    if report.splits_html is not None:
-        files.append(write_report_file(root, SPLITS_PAGE, report.splits_html))
-    else:
-        (root / REPORTS / SPLITS_PAGE).unlink(missing_ok=True)
+    files += [write_report_file(root, name, content) for name, content in report.others.items()]
+    for name in {*OTHER_PAGES} - report.others.keys():
+        (root / REPORTS / name).unlink(missing_ok=True)
     # Pages of subsets that are no longer in the lake, which the overview does not link to.
     live = {root / file.path for commit in made for file in commit.files[REPORTS]}
     remove_files(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])

@@ -18,7 +18,7 @@ DASH = "\N{EN DASH}"
 
 @cache
 def make_environment() -> jinja2.Environment:
-    """Make the templates' environment once: text is escaped, a missing name is an error, `style` is the style sheet."""
+    """Make the templates' environment once: text is escaped, a missing name is an error, style and script are there."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("tracklake.quality_reports", "templates"),
         autoescape=True,
@@ -36,8 +36,9 @@ def make_environment() -> jinja2.Environment:
         labelled=label_sums,
         unit=_unit,
     )
-    style = (files("tracklake.quality_reports") / "templates" / "report.css").read_text(encoding="utf-8")
-    environment.globals["style"] = Markup(style)
+    templates = files("tracklake.quality_reports") / "templates"
+    for name, file in (("style", "report.css"), ("script", "report.js")):
+        environment.globals[name] = Markup((templates / file).read_text(encoding="utf-8"))
     return environment
 
 

@@ -1,4 +1,4 @@
-"""Quality report: `index.html`, self-contained, and the same numbers as `quality.json`."""
+"""Quality report: `index.html`, the pages beside it, and the same numbers as `quality.json`."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,14 +10,19 @@ from markupsafe import Markup
 
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
 from tracklake.quality_reports.pages.assessments import tabulate_assessments
+from tracklake.quality_reports.pages.files import FILES_PAGE, REJECTS_PAGE, render_files
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
 from tracklake.quality_reports.pages.rendering import describe_origins, flatten, make_environment
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
-from tracklake.quality_reports.plots import charts as plots
+from tracklake.quality_reports.plots import charts
+from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, collect
 from tracklake.schemas.quality import Provenance, Quality
 from tracklake.schemas.references import EDIE, HAMALAINEN, Reference, find_references
+
+OTHER_PAGES = (SPLITS_PAGE, FILES_PAGE, REJECTS_PAGE)
+"""File names of the pages that the overview links to, beside those of the subsets."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +32,12 @@ class Report:
     Args:
         html: page of the overview; it fetches nothing.
         quality: numbers of the page.
-        splits_html: page of the splits; None where there are none.
+        others: pages that it links to, by file name of OTHER_PAGES.
     """
 
     html: str
     quality: Quality
-    splits_html: str | None = None
+    others: Mapping[str, str]
 
     @property
     def json(self) -> str:
@@ -61,7 +66,9 @@ def build_report(
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     quality = collect(connection, provenance, rules=rules, scores=scores)
-    return Report(html=render(quality, pages), quality=quality, splits_html=render_splits(quality))
+    others = {**render_files(quality), SPLITS_PAGE: render_splits(quality)}
+    shown = {name: page for name, page in others.items() if page is not None}
+    return Report(html=render(quality, pages), quality=quality, others=shown)
 
 
 def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
@@ -86,8 +93,11 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
             counted_errors=count_errors(quality),
             compared_splits=compare_splits(quality["splits"]),
             splits_page=SPLITS_PAGE,
+            files_page=FILES_PAGE,
+            rejects_page=REJECTS_PAGE if quality["ingestion"]["rejects"] else None,
+            dropping=[row for row in quality["ingestion"]["files"] if row["rows_dropped"]],
             assessed=tabulate_assessments(quality["starts"]["assessed"]),
-            name_estimator=plots.name_estimator,
+            name_estimator=charts.name_estimator,
             pages={key: f"{FOLDER}/{quote(name)}" for key, name in pages.items()},
             horizons=sorted({row["seconds"] for score in quality["model_scores"] for row in score["rows"]}),
         )
@@ -118,11 +128,11 @@ def _draw_plots(quality: Quality) -> dict[str, Any]:
         "start_positions": Markup(plots.draw_start_positions(starts["positions"], starts["subsets"]))
         if starts["positions"] and starts["subsets"]
         else None,
-        "assessments": Markup(plots.draw_assessments(starts["assessed"]["positions"]))
+        "assessments": Markup(charts.draw_assessments(starts["assessed"]["positions"]))
         if starts["assessed"]["positions"]
         else None,
         "splits": {
-            (split, dataset): Markup(plots.draw_split(splits["members"], splits["balance"], split, dataset))
+            (split, dataset): Markup(charts.draw_split(splits["members"], splits["balance"], split, dataset))
             for split, dataset in parts
         },
     }

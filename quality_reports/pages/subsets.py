@@ -8,13 +8,19 @@ from markupsafe import Markup
 from tracklake.quality_reports.pages.examples import find_examples
 from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.rendering import make_environment
-from tracklake.quality_reports.plots import charts as plots
-from tracklake.quality_reports.plots.flow import draw_flow
+from tracklake.quality_reports.plots import distributions as plots
+from tracklake.quality_reports.plots.flow import draw_flow, draw_fundamental
 from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, make_grid
 from tracklake.quality_reports.rules.registry import RULES, Rule
-from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
+from tracklake.quality_reports.summaries import (
+    Connection,
+    Row,
+    SubsetFigures,
+    collect_subsets,
+    query,
+    query_frame,
+)
 from tracklake.schemas.origin import describe_synthetic
-from tracklake.schemas.quality import Quality
 from tracklake.schemas.quality_tracks import SubsetFacts
 
 T = TypeVar("T", bound=Mapping[str, Any])
@@ -29,7 +35,7 @@ MOST_ROWS = 10
 
 def render_pages(
     connection: Connection,
-    quality: Quality,
+    provenance: Mapping[str, Any],
     *,
     rules: Sequence[Rule] = RULES,
     names: Mapping[tuple[str, str], str] | None = None,
@@ -38,58 +44,59 @@ def render_pages(
 
     Args:
         connection: connection to a lake.
-        quality: numbers of these subsets.
+        provenance: facts that the pages show; see `quality_reports.summaries.collect`.
         rules: rules that validation used.
         names: file names by (dataset, subset); None: from the names of these subsets.
     """
     template = make_environment().get_template("subset.html.j2")
-    names = names or name_pages(quality["subsets"])
+    figures = collect_subsets(connection, provenance, rules=rules)
+    names = names or name_pages(figures["subsets"])
     extremes = {rule.name: rule.extreme for rule in rules}
     declared = [
-        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in quality["rules"]
+        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in figures["rules"]
     ]
-    for subset in quality["subsets"]:
-        content = {**_select_figures(quality, subset), **_query_subset(connection, subset, declared)}
+    for subset in figures["subsets"]:
+        content = {**_select_figures(figures, subset), **_query_subset(connection, subset, declared)}
         yield (
             names[subset["dataset"], subset["subset"]],
             template.render(
                 subset=subset,
-                provenance=quality["provenance"],
+                provenance=figures["provenance"],
                 banner=describe_synthetic({subset["subset"]: subset["origin"]}),
                 **content,
             ),
         )
 
 
-def _select_figures(quality: Quality, subset: SubsetFacts) -> Row:
+def _select_figures(figures: SubsetFigures, subset: SubsetFacts) -> Row:
     """Select the figures of a subset from the overview's."""
 
     def of_subset(rows: Sequence[T]) -> list[T]:
         """Select the subset's rows."""
         return [row for row in rows if _get_key(row) == _get_key(subset)]
 
-    positions = of_subset(quality["starts"]["positions"])
-    starts = of_subset(quality["starts"]["subsets"])
+    positions = of_subset(figures["positions"])
+    starts = of_subset(figures["starts"])
     return {
         "rules": [
             {**{key: rule[key] for key in ("name", "severity", "unit", "meaning")}, **row}
-            for rule in quality["rules"]
+            for rule in figures["rules"]
             for row in of_subset(rule["subsets"])
         ],
         "starts": starts[0] if starts else None,
         "start_positions": Markup(plots.draw_start_positions(positions, starts)) if positions and starts else None,
-        "samples": of_subset(quality["samples"]["subsets"]),
-        "parts": of_subset(quality["splits"]["members"]),
-        "subset_scores": next(iter(of_subset(quality["subset_scores"])), None),
-        "per_second": next(iter(of_subset(quality["speeds"]["per_second"])), None),
+        "samples": of_subset(figures["samples"]),
+        "parts": of_subset(figures["members"]),
+        "subset_scores": next(iter(of_subset(figures["subset_scores"])), None),
+        "per_second": next(iter(of_subset(figures["per_second"])), None),
         "left_out": [
             row
-            for row in quality["left_out"]
+            for row in figures["left_out"]
             if row["dataset"] == subset["dataset"] and subset["subset"] in row["subsets"]
         ],
         "completeness": [
             row
-            for row in quality["completeness"]
+            for row in figures["completeness"]
             if row["dataset"] == subset["dataset"] and row["recording"] == subset["recording"]
         ],
     }
@@ -141,7 +148,7 @@ def _draw_plots(connection: Connection, where: Mapping[str, str], extent: Row, s
         "legend": Markup(draw_scale(grid)),
         # Without a section of some length there is neither flow nor density.
         "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
-        "fundamental": Markup(plots.draw_fundamental(intervals)) if _is_measured(intervals) else None,
+        "fundamental": Markup(draw_fundamental(intervals, grid.top_mps)) if _is_measured(intervals) else None,
         "speed_histogram": Markup(plots.draw_speed_histogram(histogram, [])),
     }
 

@@ -1,7 +1,7 @@
 """Axes, ticks and lines as plain SVG: the fast path for plots that a subset's page draws by the dozen.
 
-A plot of a finding takes 7 ms this way and 185 ms by Altair; a page of 0.64 s has 18 of them and would take 3.8 s
-(benchmarks/report_plots.py). Plots that a page draws once are Altair's, in `charts.py`.
+A plot takes 7 ms this way and 85 to 185 ms by Altair (benchmarks/report_plots.py), and every subset has a page. Plots
+that a whole report has once are Altair's, in `charts.py`.
 """
 
 import math
@@ -99,7 +99,7 @@ def draw_frame(x: Scale, y: Scale, x_title: str, y_title: str, *, x_ticks: int, 
         at = f"{x.to_pixels(value):.1f}"
         parts.append(f'<path d="M{at} {top}V{bottom + 4}" stroke="{GRID}" fill="none"/>')
         parts.append(draw_text(at, bottom + 16, format_number(value), anchor="middle"))
-    for value in make_ticks(y.low, y.high, y_ticks):
+    for value in make_ticks(y.low, y.high, y_ticks) if y_ticks else ():
         height = y.to_pixels(value)
         parts.append(f'<path d="M{left - 4} {height:.1f}H{right}" stroke="{GRID}" fill="none"/>')
         parts.append(draw_text(left - 7, f"{height + 4:.1f}", format_number(value), anchor="end"))

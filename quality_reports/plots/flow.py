@@ -1,15 +1,27 @@
-"""Plots of flow, density and speed over time, one row of plots per lane."""
+"""Plots of flow, density and speed: over time, and flow against density."""
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import polars as pl
 
 from tracklake.quality_reports.plots.axes import Scale, draw_frame, draw_line, draw_path, wrap_svg
-from tracklake.quality_reports.plots.charts import FLOW, Row, name_lane
-from tracklake.schemas.chart_theme import BLUE, INK
+from tracklake.quality_reports.plots.distributions import Row, draw_heading
+from tracklake.quality_reports.plots.rasters import colour_values
+from tracklake.schemas.chart_theme import BLUE, MUTED
+
+FLOW = (
+    ("flow_veh_per_h", "flow (veh/h/lane)"),
+    ("density_veh_per_km", "density (veh/km)"),
+    ("speed_mps", "speed (m/s)"),
+)
+"""Columns of subset_flow.sql and their axis titles."""
 
 PANEL_WIDTH, PANEL_HEIGHT, LEFT, TOP, BOTTOM, APART = 250, 80, 58, 40, 38, 20
 """Size of a plot, the margins around it, and the space between two, in pixels."""
+MOST_COLUMNS, WIDEST = 4, 420
+"""Most plots of flow against density side by side, and the greatest width of one, in pixels."""
 
 
 def draw_flow(intervals: Sequence[Row]) -> str:
@@ -29,7 +41,7 @@ def draw_flow(intervals: Sequence[Row]) -> str:
         points = data.filter(pl.col("lane").eq_missing(pl.lit(lane))).with_columns(
             follows=(pl.col("interval").diff() == 1).fill_null(value=False)
         )
-        drawn.append(f'<text x="{LEFT - 40}" y="{top - 22}" fill="{INK}" font-weight="bold">{name_lane(lane)}</text>')
+        drawn.append(draw_heading(LEFT - 40, top - 22, name_lane(lane)))
         for number, (column, title) in enumerate(FLOW):
             left = number * (PANEL_WIDTH + LEFT + APART) + LEFT
             x = Scale(0, end_s, left, left + PANEL_WIDTH)
@@ -41,3 +53,38 @@ def draw_flow(intervals: Sequence[Row]) -> str:
             drawn += [draw_path(path, BLUE, 1.4), draw_path(dots, BLUE, 4)]
     size = len(FLOW) * (PANEL_WIDTH + LEFT + APART), len(lanes) * (PANEL_HEIGHT + BOTTOM + TOP)
     return wrap_svg(*size, "Flow, density and speed over time", "".join(drawn))
+
+
+def draw_fundamental(intervals: Sequence[Row], top_mps: float) -> str:
+    """Draw flow against density: a plot per lane, a mark per interval, coloured by speed.
+
+    Args:
+        intervals: rows of subset_flow.sql, at least one of them with a flow.
+        top_mps: upper end of the colour scale.
+    """
+    rows = [row for row in intervals if row["entries"]]
+    lanes: list[int | None] = list(dict.fromkeys(row["lane"] for row in intervals))
+    columns = min(len(lanes), MOST_COLUMNS)
+    width, height = min(WIDEST, len(FLOW) * (PANEL_WIDTH + LEFT + APART) // columns - LEFT - APART), 2 * PANEL_HEIGHT
+    high = [max(row[name] for row in rows) * 1.05 for name in ("density_veh_per_km", "flow_veh_per_h")]
+    drawn = []
+    for number, lane in enumerate(lanes):
+        left = number % columns * (width + LEFT + APART) + LEFT
+        top = TOP + number // columns * (height + BOTTOM + TOP)
+        x, y = Scale(0, high[0], left, left + width), Scale(0, high[1], top + height, top)
+        drawn.append(draw_heading(LEFT - 40 + left - LEFT, top - 22, name_lane(lane)))
+        drawn.append(draw_frame(x, y, "density (veh/km)", "flow (veh/h/lane)", x_ticks=5, y_ticks=5))
+        own = [row for row in rows if row["lane"] == lane]
+        colours = colour_values(np.array([row["speed_mps"] for row in own], np.float64), 0, top_mps)
+        drawn += [
+            f'<circle cx="{x.to_pixels(row["density_veh_per_km"]):.1f}" cy="{y.to_pixels(row["flow_veh_per_h"]):.1f}" '
+            f'r="4" fill="{colour}" stroke="{MUTED}" stroke-width="0.5"/>'
+            for row, colour in zip(own, colours, strict=True)
+        ]
+    size = columns * (width + LEFT + APART), math.ceil(len(lanes) / columns) * (height + BOTTOM + TOP)
+    return wrap_svg(*size, "Flow against density", "".join(drawn))
+
+
+def name_lane(lane: int | None) -> str:
+    """Return a lane's name for plots."""
+    return "no lane" if lane is None else f"lane {lane}"

@@ -35,6 +35,11 @@ def grade_values(values: Floats, least: float, greatest: float) -> Bytes:
     return np.where(np.isnan(share), EMPTY, 1 + np.round(np.nan_to_num(share) * (LEVELS - 1))).astype(np.uint8)
 
 
+def colour_values(values: Floats, least: float, greatest: float) -> list[str]:
+    """Return the colours of known values as `#rrggbb`, on the scale of `grade_values`."""
+    return [f"#{bytes(colour[:3]).hex()}" for colour in make_palette()[grade_values(values, least, greatest)]]
+
+
 def encode_png(indices: Bytes) -> bytes:
     """Encode palette entries (H, W) as a PNG, the first row uppermost; the same entries give the same bytes.
 

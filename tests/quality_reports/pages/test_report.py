@@ -203,8 +203,18 @@ def test_provenance_lists_every_source_file(report):
         "pe_tracks.csv",
         "peachtree.csv",
     ]
-    assert "0123456789abcdef" * 4 in report.html
     assert "settings.seed" in report.html
+
+
+def test_hashes_and_rejected_rows_are_on_pages_of_their_own(report, open_lake):
+    sha256, reject = "0123456789abcdef" * 4, "1,2\\x00"
+    assert sha256 in report.others["files.html"]
+    assert "too few fields: 2" in report.others["files.html"]
+    assert report.others["rejects.html"].count(reject) == 10
+    for hidden in (sha256, reject):
+        assert hidden not in report.html
+    assert 'href="rejects.html"' in report.html
+    assert build_report(open_lake(), {}).others.keys() == {"files.html"}, "without rejected rows and splits"
 
 
 def test_thresholds_of_the_provenance_are_the_report_s(open_lake):

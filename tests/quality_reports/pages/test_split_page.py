@@ -74,7 +74,7 @@ def test_side_by_side_stands_evaluation_beside_training(open_lake, tables):
 
 
 def test_the_page_says_why_one_flatters_and_the_other_does_not(open_lake, tables):
-    html = build_report(open_lake(**tables), {}).splits_html
+    html = build_report(open_lake(**tables), {}).others[SPLITS_PAGE]
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", html))
     assert "csp-2018 of highd: in 75.00 % of the evaluation\u2019s frames training vehicles drive as well" in text
     assert "and 50.00 % of its moments give training samples, too; 75.00 % of its neighbors are cut off." in text
@@ -89,14 +89,14 @@ def test_the_page_says_why_one_flatters_and_the_other_does_not(open_lake, tables
 
 def test_a_recipe_without_parameters_says_so(open_lake, tables):
     bare = [{**row, "parameters": '{"name": "x"}'} for row in tables["split_recipes"]]
-    html = build_report(open_lake(**{**tables, "split_recipes": bare}), {}).splits_html
+    html = build_report(open_lake(**{**tables, "split_recipes": bare}), {}).others[SPLITS_PAGE]
     assert html.count("Recipe <code>abc</code>, without parameters</p>") == 2
 
 
 def test_the_overview_leads_there_and_shows_the_split_that_trains(open_lake, tables):
     report = build_report(open_lake(**tables), {})
     assert f'<a href="{SPLITS_PAGE}">' in report.html
-    assert '<a href="index.html#splits">' in report.splits_html
+    assert '<a href="index.html#splits">' in report.others[SPLITS_PAGE]
     section = report.html[report.html.index('<section id="splits">') :]
     assert "<h3>flow-balanced, highd</h3>" in section
     assert "<h3>csp-2018, highd</h3>" not in section
@@ -104,13 +104,13 @@ def test_the_overview_leads_there_and_shows_the_split_that_trains(open_lake, tab
 
 def test_no_splits_have_no_page(open_lake, small_lake):
     report = build_report(open_lake(**{**small_lake, "splits": [], "split_balance": []}), {})
-    assert report.splits_html is None
+    assert report.others.get(SPLITS_PAGE) is None
     assert SPLITS_PAGE not in report.html
 
 
 def test_a_split_of_one_part_says_so(open_lake, tables):
     alone = {**tables, "split_leakage": [], "split_context": [], "split_shifts": [], "split_left_out": []}
-    html = build_report(open_lake(**alone), {}).splits_html
+    html = build_report(open_lake(**alone), {}).others[SPLITS_PAGE]
     assert "No split of this lake has both a training and an evaluation part." in html
     assert html.count("It has one part only.") == 2
     assert html.count("<svg") == 2

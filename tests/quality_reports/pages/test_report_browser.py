@@ -1,0 +1,136 @@
+"""The report's pages in a headless browser: they load without errors at every width, fold, sort and filter."""
+
+from pathlib import Path
+
+import pytest
+from browser import Browser
+from page_elements import SCRIPT
+
+from tracklake.quality_reports.pages.rendering import DASH
+from tracklake.quality_reports.pages.report import build_report
+
+RECORDINGS = 60
+SCREEN = 800
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """One browser for all checks."""
+    opened = Browser(tmp_path_factory.mktemp("browser"))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="module")
+def large(open_lake, small_lake, tmp_path_factory) -> Path:
+    """The folder of a report on 60 recordings of two carriageways; vehicles grow from 2 with the recording's number."""
+    tables = {}
+    for name, rows in small_lake.items():
+        of_highd = [row for row in rows if row.get("subset", row.get("recording", "01"))[:2] == "01"]
+        tables[name] = [rename(row, number) for number in range(1, RECORDINGS + 1) for row in of_highd]
+        if "subset" not in rows[0] and "recording" not in rows[0]:
+            tables[name] = rows
+    for row in tables["subsets"]:
+        row["vehicles"] += int(row["recording"])
+    tables["ingest_log"] = [
+        {**small_lake["ingest_log"][0], "file": f"{number:02d}_tracks.csv", "rows_dropped": number % 2}
+        for number in range(3 * RECORDINGS)
+    ]
+    folder = tmp_path_factory.mktemp("report")
+    report = build_report(open_lake(**tables), {"lake": "large"})
+    for name, page in {"index.html": report.html, **report.others}.items():
+        (folder / name).write_text(page, encoding="utf-8")
+    return folder
+
+
+def rename(row: dict, number: int) -> dict:
+    """A row of recording 01 as one of another recording."""
+    return {
+        name: f"{number:02d}{value[2:]}" if name in ("subset", "recording") else value for name, value in row.items()
+    }
+
+
+@pytest.mark.parametrize(("width", "dark"), [(400, True), (1280, False), (1920, True)])
+def test_an_overview_of_120_subsets_takes_ten_screens_at_most(browser, large, width, dark):
+    browser.open(large / "index.html", width=width, height=SCREEN, dark=dark)
+    assert browser.run("document.documentElement.scrollHeight") <= 10 * SCREEN
+    assert browser.run("document.documentElement.scrollWidth") <= width, "the page does not scroll sideways"
+    assert browser.run("getComputedStyle(document.body).backgroundColor") == (
+        "rgb(20, 23, 26)" if dark else "rgb(255, 255, 255)"
+    )
+    assert browser.errors == []
+
+
+def test_a_section_unfolds_where_the_address_leads(browser, large):
+    browser.open(large / "index.html")
+    opened = "document.querySelector('#speeds > details').open"
+    assert browser.run(opened) is False
+    browser.run("document.querySelector('nav a[href=\"#speeds\"]').click()")
+    assert browser.run(f"new Promise(done => setTimeout(() => done({opened}), 50))") is True
+    contents = "document.querySelector('nav').getBoundingClientRect().top"
+    assert browser.run(f"scrollTo(0, 500), {contents}") == 0, "the contents stay in view"
+    everything = "[...document.querySelectorAll('details')].every(each => each.open)"
+    browser.run("[...document.querySelectorAll('nav button')][0].click()")
+    assert browser.run(everything) is True
+    browser.run("[...document.querySelectorAll('nav button')][0].click()")
+    assert browser.run(everything) is False
+    browser.run("dispatchEvent(new Event('beforeprint'))")
+    assert browser.run(everything) is True, "paper shows everything"
+    assert browser.errors == []
+
+
+def test_tables_are_sorted_and_filtered(browser, large):
+    browser.open(large / "index.html")
+    rows = "[...document.querySelector('#overview table').tBodies[0].rows]"
+    names = f"{rows}.filter(row => !row.hidden).map(row => row.cells[0].textContent.trim())"
+    heads = "[...document.querySelector('#overview table').tHead.rows[0].cells]"
+    vehicles = f"{heads}.find(head => head.textContent.trim() === 'Vehicles')"
+    assert browser.run(f"{names}.length") == 2 * RECORDINGS
+    browser.run(f"{vehicles}.querySelector('button').click()")
+    # Recording n has n + 2 vehicles on the lower and n + 1 on the upper carriageway.
+    assert browser.run(names)[:3] == ["60-lower", "59-lower", "60-upper"]
+    assert browser.run(f"{vehicles}.getAttribute('aria-sort')") == "descending"
+    browser.run(f"{vehicles}.querySelector('button').click()")
+    assert browser.run(names)[:2] == ["01-upper", "01-lower"]
+    browser.run(f"{heads}[0].querySelector('button').click()")
+    assert browser.run(names)[-1] == "60-upper", "names are sorted as names, and not as numbers"
+    browser.run(
+        "{const input = document.querySelector('#overview .filter input'); input.value = '0 upper';"
+        "input.dispatchEvent(new Event('input'))}"
+    )
+    assert {name[3:] for name in browser.run(names)} == {"upper"}
+    assert browser.errors == []
+
+
+def test_sums_stay_first_and_published_rows_beneath_theirs(browser, tmp_path):
+    page = build_report_page(
+        [
+            ("sum", "all", "9"),
+            ("", "b", "1,200"),
+            ("follows", "published", "7"),
+            ("", "a", DASH),
+            ("", "c", "\u22123.5"),
+        ]
+    )
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    browser.open(tmp_path / "page.html")
+    names = "[...document.querySelectorAll('tbody th')].map(cell => cell.textContent)"
+    button = "document.querySelectorAll('thead button')[1].click()"
+    browser.run(button)
+    assert browser.run(names) == ["all", "b", "published", "c", "a"]
+    browser.run(button)
+    assert browser.run(names) == ["all", "c", "b", "published", "a"], "what is unknown stays last"
+    assert browser.errors == []
+
+
+def build_report_page(rows: list[tuple[str, str, str]]) -> str:
+    """A page of one table, with the script that every page has."""
+    body = "".join(f'<tr class="{kind}"><th>{name}</th><td class="n">{value}</td></tr>' for kind, name, value in rows)
+    table = f'<div class="box"><table><thead><tr><th>Name</th><th class="n">Value</th></tr></thead><tbody>{body}'
+    return f'<meta charset="utf-8">{table}</tbody></table></div><script>{SCRIPT.read_text(encoding="utf-8")}</script>'
+
+
+def test_without_a_script_everything_is_shown(browser, large):
+    browser.open(large / "index.html", script=False)
+    assert browser.run("[...document.querySelectorAll('details')].every(each => each.open)") is True
+    assert browser.run("document.querySelectorAll('thead button').length") == 0
