@@ -6,14 +6,21 @@ from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from tracklake.schemas.text import make_visible
+
 
 class TracklakeError(Exception):
     """Something the user can mend: the message says what, where, what was expected, what was found, and what to do.
 
     Commands print the message and exit with `exit_code`. Every other exception is a bug and keeps its traceback.
+    Control characters in the message, which files may bring in, are escaped.
     """
 
     exit_code = 1
+
+    def __init__(self, *arguments: object) -> None:
+        """Make the texts among the arguments visible."""
+        super().__init__(*(make_visible(each, keep="\n") if isinstance(each, str) else each for each in arguments))
 
 
 class UsageError(TracklakeError):

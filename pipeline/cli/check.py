@@ -1,6 +1,5 @@
 """`tracklake check`: every file of the lake compared with its checksum."""
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from tracklake.pipeline.lake import (
     open_for_writing,
 )
 from tracklake.pipeline.lake.live_folders import find_false_copies
+from tracklake.schemas.text import quote_shell
 
 
 def check(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOption = False) -> None:
@@ -70,5 +70,5 @@ def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), c
 
 def _advise(root: Path, manifest: Manifest) -> str:
     """Return the command that makes damaged files again."""
-    source = shlex.quote(manifest.ingested_from[-1]) if manifest.ingested_from else "SOURCE"
-    return f"They are made again by `tracklake run {source} --lake {shlex.quote(str(root))}`."
+    source = quote_shell(manifest.ingested_from[-1]) if manifest.ingested_from else "SOURCE"
+    return f"They are made again by `tracklake run {source} --lake {quote_shell(root)}`."

@@ -16,6 +16,7 @@ from pydantic_settings import SettingsError
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
+from tracklake.schemas.text import make_visible
 
 DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
 """Exit codes: done, failed, wrong usage, and done but for refused recordings."""
@@ -55,14 +56,14 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
         message = "interrupted; what was committed stays; run the same command again"
         raise report_failure(terminal, message) from None
     except Exception as bug:  # noqa: BLE001  (the outermost: nothing is hidden, the traceback is shown)
-        terminal.err.print(describe_bug(bug), markup=False)
+        terminal.print_bug(describe_bug(bug))
         terminal.print_json({"error": f"{type(bug).__name__}: {bug}", "bug": True})
         raise typer.Exit(FAILED) from None
 
 
 def _show_traceback_if_debugging(error: BaseException) -> None:
     if os.environ.get(DEBUG, "0") not in ("", "0"):
-        sys.stderr.write("".join(traceback.format_exception(error)))
+        sys.stderr.write(make_visible("".join(traceback.format_exception(error)), keep="\n"))
 
 
 def report_failure(terminal: Terminal, message: str, code: int = FAILED) -> typer.Exit:

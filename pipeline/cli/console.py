@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from tracklake.pipeline.orchestration.progress import Silent, reporting_to
+from tracklake.schemas.text import make_visible, quote_shell
 
 
 class Terminal:
@@ -34,7 +35,7 @@ class Terminal:
     def print_line(self, text: str, *, style: str = "") -> None:
         """Print a line for people."""
         if self.verbose:
-            self.out.print(escape(text), style=style or None)
+            self.out.print(escape(make_visible(text, keep="\n")), style=style or None)
 
     def print_origin(self, synthetic: str | None) -> None:
         """Print what of the data is synthetic, if anything, and add it to the record for programs.
@@ -49,7 +50,11 @@ class Terminal:
     def print_problem(self, text: str, *, label: str = "error") -> None:
         """Print an error or refusal, always, on stderr."""
         colour = "red" if label == "error" else "yellow"
-        self.err.print(f"[bold {colour}]{label}:[/] {escape(text)}")
+        self.err.print(f"[bold {colour}]{label}:[/] {escape(make_visible(text, keep=chr(10)))}")
+
+    def print_bug(self, text: str) -> None:
+        """Print the traceback of a bug on stderr."""
+        self.err.print(make_visible(text, keep="\n"), markup=False)
 
     def print_json(self, record: dict[str, Any]) -> None:
         """Print the result for programs, with --json."""
@@ -102,13 +107,13 @@ class _Bars:
             self._bars[stage] = self._progress.add_task(stage, total=total, title="")
 
     def advance(self, stage: str, title: str) -> None:
-        self._progress.update(self._bars[stage], advance=1, title=escape(title))
+        self._progress.update(self._bars[stage], advance=1, title=escape(make_visible(title)))
 
 
 def find_command() -> str:
-    """Return how a user calls the command again: by its name if the shell finds it, else by the path used now."""
+    """Return how a user calls the command again: by its name if the shell finds it, else by its path, quoted."""
     found, called = shutil.which("tracklake"), Path(sys.argv[0])
     if called.name != "tracklake" or (found and Path(found).resolve() == called.resolve()):
         return "tracklake"
     near = os.path.relpath(called)
-    return str(called.resolve()) if near.startswith("..") else near
+    return quote_shell(called.resolve() if near.startswith("..") else near)

@@ -1,7 +1,6 @@
 """The flow that the pipeline's commands share: run what is missing or stale, then report what was done."""
 
 import json
-import shlex
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -26,6 +25,7 @@ from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE
 from tracklake.schemas.columns import DATASETS
 from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.text import quote_shell
 
 SURVEY_S = 0.3
 """Time to wait for the survey of a source before Prefect is imported beside it, in seconds."""
@@ -103,7 +103,7 @@ def _explain_no_prune(lake: Path) -> str:
     """Explain, after the message about a source without usable files, that --prune removed nothing."""
     return (
         "\n--prune removed nothing: what holds no raw files may be a mistyped folder, or a disk that is not there. To "
-        f"remove a recording by its name: `tracklake remove RECORDING --lake {shlex.quote(str(lake))}`."
+        f"remove a recording by its name: `tracklake remove RECORDING --lake {quote_shell(lake)}`."
     )
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import sys
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, BinaryIO, cast
 
@@ -18,6 +19,7 @@ from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import FileAccessError, TracklakeError
 from tracklake.schemas.files import write_output
+from tracklake.schemas.text import make_visible
 
 if TYPE_CHECKING:
     from io import IOBase
@@ -80,6 +82,11 @@ def write_result(relation: LakeResult, form: str, out: Path | None, terminal: Te
     if out is not None:
         write_output(out, lambda stream: _write(frame, form, stream))
         terminal.print_line(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+        return
+    if sys.stdout.isatty():
+        text = BytesIO()
+        _write(frame, form, text)
+        sys.stdout.write(make_visible(text.getvalue().decode(), keep="\n"))
         return
     try:
         _write(frame, form, sys.stdout.buffer)

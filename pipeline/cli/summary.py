@@ -9,6 +9,7 @@ from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
+from tracklake.schemas.text import quote_shell
 
 
 def show_result(terminal: Terminal, result: RunResult) -> None:
@@ -48,7 +49,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     for name, value in lines.items():
         terminal.print_line(f"{name:<{width}}{value}")
     terminal.print_line(f"{'report':<{width}}{report.resolve()}", style="bold green")
-    lake_option = "" if lake == Path("lake") else f" --lake {lake}"
+    lake_option = "" if lake == Path("lake") else f" --lake {quote_shell(lake)}"
     protocol = quality["provenance"]["protocol"]["name"]
     protocol_option = "" if protocol == "csp" else f" --protocol {protocol}"
     terminal.print_line("\nTry next:")

@@ -5,6 +5,7 @@ from itertools import zip_longest
 from textwrap import wrap
 
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.schemas.text import make_visible
 
 GAP = 2
 """Space between two columns, in characters; 1 where the terminal is too narrow."""
@@ -38,7 +39,8 @@ def print_table(
     if not terminal.verbose:
         return
     aligned = right if right is not None else [False, *[True] * (len(headings) - 1)]
-    body = [[*row, *[""] * (len(headings) - len(row))] for row in rows]
+    headings = [make_visible(heading) for heading in headings]
+    body = [[*(make_visible(cell, keep="\n") for cell in row), *[""] * (len(headings) - len(row))] for row in rows]
     head, gap = [list(headings)], GAP
     widths = _measure([*head, *body])
     if fold and sum(widths) + gap * len(widths) > terminal.out.width:

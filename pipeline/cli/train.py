@@ -1,7 +1,6 @@
 """`tracklake train`: a model trained on the lake's split, or a training resumed where it was interrupted."""
 
 import re
-import shlex
 from typing import Annotated, Any
 
 import typer
@@ -23,6 +22,7 @@ from tracklake.pipeline.lake.files import MODELS as RUNS
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.errors import explain_file_errors
 from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.text import quote_shell
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Model
 from tracklake.training.runs.config import RECIPE_SETTINGS, TrainConfig
@@ -105,11 +105,12 @@ def train(
                     model, tensors, out, config, show, resume=resume, without_evaluation=no_evaluation
                 )
         except TrainingInterruptedError as stopped:
-            again = [find_command(), "train", model, "--resume", *(["--name", name] if name is not None else [])]
+            again = ["train", model, "--resume", *(["--name", name] if name is not None else [])]
             again += ["--lake", str(lake)] if lake is not None else []
             again += ["--protocol", protocol] if protocol is not None else []
             again += ["--no-evaluation"] if no_evaluation else []
-            raise report_failure(terminal, f"{stopped}\nTo go on: {shlex.join(again)}") from None
+            command_again = f"{find_command()} {' '.join(map(quote_shell, again))}"
+            raise report_failure(terminal, f"{stopped}\nTo go on: {command_again}") from None
         if metrics["evaluation"] is not None:
             _show_scores(terminal, metrics["evaluation"])
         else:

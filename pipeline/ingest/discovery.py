@@ -22,6 +22,7 @@ from tracklake.pipeline.sources.csv import (
 )
 from tracklake.pipeline.sources.source import Unit
 from tracklake.schemas.files import write_file
+from tracklake.schemas.text import make_visible
 
 TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
@@ -67,7 +68,7 @@ def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawF
     candidates = _list_candidates(source)
     search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest)
     for path in candidates:
-        search.sort_file(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+        search.sort_file(_open_raw(path, source))
     search.hash_files()
     units: list[tuple[Source, Unit]] = []
     refusals = search.refusals
@@ -92,7 +93,7 @@ def recognise(source: Path, dataset: str) -> list[RawFile]:
     """
     search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
     for path in _list_candidates(source):
-        search.sort_file(RawFile(path, path.name if source.is_file() else path.relative_to(source).as_posix()))
+        search.sort_file(_open_raw(path, source))
     return search.found
 
 
@@ -204,6 +205,11 @@ def _list_candidates(source: Path) -> list[Path]:
             found += [Path(folder, name) for name in names if not name.startswith(".")]
         visited.add(real)
     return sorted(path for path in found if path.is_file())
+
+
+def _open_raw(path: Path, source: Path) -> RawFile:
+    """Name a file relative to SOURCE; control characters and bytes that are no UTF-8 are escaped in the name."""
+    return RawFile(path, make_visible(path.name if source.is_file() else path.relative_to(source).as_posix()))
 
 
 def _describe_formats(sources: list[Source]) -> str:

@@ -248,8 +248,8 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
 def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
     folder = locate_spill(root, file)
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
-    rejects = pl.read_parquet(folder / REJECTS_FILE) if alone else None
-    return Part(file, pl.scan_ipc(folder / recording / "*.arrow"), rejects)
+    rejects = pl.read_parquet(folder / REJECTS_FILE, glob=False) if alone else None
+    return Part(file, pl.scan_ipc(sorted((folder / recording).glob("*.arrow")), glob=False), rejects)
 
 
 def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
@@ -273,7 +273,7 @@ def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
 
 def _build_unassigned(root: Path, job: Job, file: RawFile) -> tuple[Files, dict[str, Any]]:
     dataset = job.inputs["dataset"]
-    lines = pl.read_parquet(locate_spill(root, file) / REJECTS_FILE)
+    lines = pl.read_parquet(locate_spill(root, file) / REJECTS_FILE, glob=False)
     log = {
         "dataset": dataset,
         "recording": None,

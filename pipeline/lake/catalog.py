@@ -15,6 +15,7 @@ from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 from tracklake.schemas.files import write_file
+from tracklake.schemas.text import quote_shell
 
 if TYPE_CHECKING:
     import duckdb
@@ -136,7 +137,7 @@ def create_views(
             reason = str(failed).splitlines()[0]
             raise LakeError(
                 f"{root}: the table `{table.name}` cannot be read: {reason}\nIf its files were removed or damaged, "
-                f"`tracklake run SOURCE --lake {root}` on the raw files makes them again."
+                f"`tracklake run SOURCE --lake {quote_shell(root)}` on the raw files makes them again."
             ) from failed
         connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
     for macro in MACROS:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from tracklake.pipeline.lake.errors import DamagedFileError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest
 from tracklake.schemas.hashing import hash_chunks
+from tracklake.schemas.text import quote_shell
 
 
 class DamagedFile(NamedTuple):
@@ -58,9 +59,10 @@ def verify_files(root: Path, files: Iterable[LakeFile]) -> None:
     for file in files:
         reason = find_damage(root, file)
         if reason is not None:
+            lake = quote_shell(root)
             raise DamagedFileError(
-                f"{root / file.path}: damaged ({reason}). `tracklake check --lake {root}` finds all such files; then "
-                f"`tracklake run SOURCE --lake {root}` on the raw files makes them again."
+                f"{root / file.path}: damaged ({reason}). `tracklake check --lake {lake}` finds all such files; then "
+                f"`tracklake run SOURCE --lake {lake}` on the raw files makes them again."
             )
 
 

@@ -1,7 +1,6 @@
 """The manifest: the live files of every table, and what each was built from."""
 
 import json
-import shlex
 import uuid
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
@@ -11,6 +10,7 @@ from typing import Any
 from tracklake.pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
 from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.files import write_file
+from tracklake.schemas.text import quote_shell
 
 MANIFEST = "manifest.json"
 """Name of the manifest's file in the lake."""
@@ -190,7 +190,7 @@ def read_document(root: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, NotADirectoryError):
         raise LakeMissingError(
-            f"{root}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake {root}`, "
+            f"{root}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake {quote_shell(root)}`, "
             "or name another with --lake or TRACKLAKE_LAKE."
         ) from None
     except OSError as failed:
@@ -217,8 +217,8 @@ def _write_rebuild_commands(root: Path, document: dict[str, Any]) -> str:
     """Return the commands that rebuild a lake from the SOURCEs it was made from, the last one first."""
     there = [Path(name) for name in reversed(read_sources(document)) if Path(name).exists()]
     outer = [path for path in there if not any(path != other and path.is_relative_to(other) for other in there)]
-    first, *others = (shlex.quote(str(path)) for path in outer or [Path("SOURCE")])
-    lake = shlex.quote(str(root))
+    first, *others = (quote_shell(path) for path in outer or [Path("SOURCE")])
+    lake = quote_shell(root)
     commands = [f"`tracklake run {first} --lake {lake} --rebuild`"]
     return ", then ".join(commands + [f"`tracklake run {source} --lake {lake}`" for source in others])
 

@@ -23,6 +23,7 @@ from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage
 from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.schemas.errors import UsageError
 
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
 """Every step of `tracklake run`, in order."""
@@ -73,11 +74,18 @@ class RunRequest:
         return Settings(**self.settings)
 
     def check(self) -> None:
-        """Refuse settings that would only fail in a later stage.
+        """Refuse paths and settings that would only fail in a later stage.
 
         Raises:
+            UsageError: the path of the lake or the source is no UTF-8 text.
             ThresholdError: no rule has a threshold of that name.
         """
+        for name, path in (("lake", self.root), ("SOURCE", self.origin)):
+            full = str(path.resolve())
+            if any(0xD800 <= ord(character) <= 0xDFFF for character in full):
+                raise UsageError(
+                    f"{name} {full}: the path is no UTF-8 text, which DuckDB and Prefect need. Rename the folder."
+                )
         resolve(RULES, self.get_settings().thresholds)
 
     def list_stages(self) -> list[Stage]:

@@ -1,6 +1,5 @@
 """Templates of the report's pages, and the formats of single values."""
 
-import unicodedata
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -11,6 +10,7 @@ from markupsafe import Markup
 
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.quality import Quality
+from tracklake.schemas.text import make_visible
 
 DASH = "\N{EN DASH}"
 """Text of a number that is unknown or was not computed."""
@@ -28,7 +28,7 @@ def make_environment() -> jinja2.Environment:
     )
     environment.filters.update(
         cell=format_cell,
-        visible=visible,
+        visible=make_visible,
         integer=_integer,
         percent=_percent,
         fixed=_fixed,
@@ -66,8 +66,8 @@ def format_cell(value: object, kind: str = "text") -> str:
     if isinstance(value, int | float) and kind != "text":
         return _format_number(value, kind)
     if isinstance(value, list):
-        return visible(", ".join(str(each) for each in value))
-    return visible(str(value))
+        return make_visible(", ".join(str(each) for each in value))
+    return make_visible(str(value))
 
 
 def _format_number(value: float, kind: str) -> str:
@@ -79,14 +79,6 @@ def _format_number(value: float, kind: str) -> str:
     if kind == "duration":
         return format_duration(value)
     return _fixed(value, int(kind[1:]))
-
-
-def visible(text: str) -> str:
-    """Write control, format and surrogate characters, which are invisible or rearrange a line, as escapes."""
-    return "".join(
-        character if unicodedata.category(character) not in {"Cc", "Cf", "Cs"} else ascii(character)[1:-1]
-        for character in text
-    )
 
 
 def format_duration(seconds: float | None) -> str:

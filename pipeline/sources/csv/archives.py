@@ -12,6 +12,7 @@ from typing import cast
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.schemas.text import make_visible
 
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
 """First bytes of a zip archive, of an empty one, and of one in several volumes."""
@@ -63,7 +64,7 @@ def list_members(archive: RawFile, suffixes: Sequence[str]) -> ArchiveContents:
     files, others, unreadable = [], [], dict[str, list[str]]()
     for info in infos:
         inner = _inner_path(info.filename)
-        name = f"{archive.name}/{inner}"
+        name = f"{archive.name}/{make_visible(str(inner))}"
         if inner.suffix.lower() not in suffixes:
             others.append(name)
         elif obstacle := _find_obstacle(info, inner, times[inner], archive.name):

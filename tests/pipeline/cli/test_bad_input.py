@@ -1,12 +1,16 @@
 """What a newcomer does wrong: a message with file, line, expected, got and next step; the right exit code; no lake."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 
 import pytest
+from raw_texts import as_csv, ngsim_row, write
+from small_recordings import write_highd
 
 from tracklake.pipeline.lake import connect
+from tracklake.schemas.text import quote_shell
 
 pytestmark = pytest.mark.usefixtures("plain_flows")
 
@@ -157,3 +161,42 @@ def test_settings_come_from_flags_then_environment_then_file(command, tmp_path):
     wrong = elsewhere("sql", "SELECT 1")
     assert wrong.code == USAGE
     assert "setting lakes" in wrong.err
+
+
+HOSTILE_FOLDER = 'it\'s [a] "b" {c} *?\nnew'
+"""Name of a folder with all that shells, globs and SQL give a meaning to."""
+
+
+@pytest.mark.usefixtures("empty_charts")
+def test_hostile_names_of_files_and_folders(command, tmp_path):
+    raw, place = tmp_path / "raw", tmp_path / HOSTILE_FOLDER
+    write_highd(raw / "a[1]", "01")
+    rows = [ngsim_row(1, frame) for frame in range(1, 9)]
+    data = as_csv(rows) + b"1,\x1b]0;owned\x07,\xc2\x9b31m\n"
+    write(raw / os.fsdecode(b"a\xff\x1b[31m\n b.csv"), data)
+    write(raw / "bad\x1b[2J\u202e.csv", b"x\x1b[31m,y\n1,2\n")
+    place.mkdir()
+    done = command.here("run", raw, "--lake", place / "lake")
+    assert done.code == REFUSED, done.err
+    query = command.here("sql", "SELECT file, text FROM rejects", "--lake", place / "lake")
+    assert "a\\udcff\\x1b[31m\\n b.csv  1,\\x1b]0;owned\\x07" in query.out
+    for text in (done.out, done.err, query.out):
+        assert not set(text) & set("\x1b\x07\x9b\u202e\udcff"), text
+    assert "refused: bad\\x1b[2J\\u202e.csv, line 1" in done.err
+    assert f"--lake {quote_shell(place / 'lake')}\n" in done.out, "the command to try next can be copied"
+    page = (place / "lake/reports/index.html").read_text()
+    assert "a\\udcff\\x1b[31m\\n b.csv" in page
+    assert command.here("run", raw, "--lake", place / "lake").code == REFUSED, "again, with nothing to do"
+    with connect(place / "lake") as connection:
+        counts = "SELECT count(*) FROM tracks WHERE dataset = 'ngsim'"
+        assert connection.sql(counts).fetchall() == [(8,)]
+
+
+def test_a_folder_whose_name_is_no_text_is_refused(command, tmp_path):
+    odd = tmp_path / os.fsdecode(b"odd\xff")
+    write_highd(odd, "01")
+    for source, lake in ((odd, tmp_path / "lake"), (tmp_path, odd / "lake")):
+        done = command.here("ingest", source, "--lake", lake)
+        assert done.code == USAGE
+        assert "odd\\udcff" in done.err
+        assert "the path is no UTF-8 text" in done.err

@@ -57,3 +57,10 @@ def test_a_quiet_terminal_prints_no_table(terminal):
 def test_long_texts_are_cut_and_missing_numbers_dashes():
     assert [cut_text("abcdef", 6), cut_text("abcdefg", 6)] == ["abcdef", "abcde…"]
     assert [format_number(None), format_number(0.125), format_number(0.5, 1, 100)] == ["-", "0.12", "50.0"]
+
+
+def test_escape_sequences_are_shown_and_counted_as_what_is_shown(terminal):
+    print_table(terminal, ["a\x1b[31m", "b"], [["x\x9b\u202ey", "1"]])
+    assert read(terminal) == ["a\\x1b[31m     b", "x\\x9b\\u202ey  1"]
+    terminal.print_problem("\x1b]0;owned\x07 [bold]", label="refused")
+    assert read(terminal)[-1] == "x\\x9b\\u202ey  1"

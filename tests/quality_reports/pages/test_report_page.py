@@ -9,11 +9,12 @@ import duckdb
 import pytest
 from page_elements import HOSTILE, parse, spoil_texts
 
-from tracklake.quality_reports.pages.rendering import DASH, flatten, format_cell, format_duration, visible
+from tracklake.quality_reports.pages.rendering import DASH, flatten, format_cell, format_duration
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.plots import charts as plots
 from tracklake.quality_reports.summaries import plain, read_statement
 from tracklake.schemas.references import REFERENCES
+from tracklake.schemas.text import make_visible
 
 
 def test_no_name_injects_markup(open_lake, small_lake):
@@ -110,7 +111,7 @@ def test_durations():
 
 
 def test_characters_that_are_not_seen_are_shown():
-    assert visible("a\x00b\tc\u202ed\u200be é") == "a\\x00b\\tc\\u202ed\\u200be é"
+    assert make_visible("a\x00b\tc\u202ed\u200be é") == "a\\x00b\\tc\\u202ed\\u200be é"
 
 
 def test_settings_are_flattened():

@@ -1,0 +1,34 @@
+"""Texts from files, shown safely: control characters as escapes, paths quoted for a shell."""
+
+import os
+import shlex
+import unicodedata
+from pathlib import Path
+
+INVISIBLE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Unicode categories that terminals obey or that rearrange a line: controls, formats such as the overrides of writing
+direction, surrogates (bytes of file names that are no UTF-8), line and paragraph separators."""
+
+
+def make_visible(text: str, *, keep: str = "") -> str:
+    r"""Write invisible characters as escapes, `\x1b` for instance.
+
+    Args:
+        text: any text.
+        keep: characters left as they are, such as line ends.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        ascii(character)[1:-1] if unicodedata.category(character) in INVISIBLE and character not in keep else character
+        for character in text
+    )
+
+
+def quote_shell(argument: str | Path) -> str:
+    r"""Quote an argument for a POSIX shell; with invisible characters in bash's `$'...'`, byte by byte."""
+    text = str(argument)
+    if make_visible(text) == text:
+        return shlex.quote(text)
+    plain = (chr(byte) if 32 <= byte < 127 and byte not in b"\\'" else f"\\x{byte:02x}" for byte in os.fsencode(text))
+    return f"$'{''.join(plain)}'"
