@@ -1,6 +1,7 @@
 """The files of a lake: their paths, and how they are written whole or not at all."""
 
 import json
+import os
 import re
 import shutil
 import uuid
@@ -271,8 +272,13 @@ def remove_orphans(root: Path, manifest: Manifest) -> int:
 def find_orphans(root: Path, manifest: Manifest) -> list[Path]:
     """Return the files in the folders of contents that are neither live nor kept for readers."""
     known = manifest.live_paths() | {item.path for item in manifest.retired}
-    found = (file for name in (STORE, TENSORS) for file in (root / name).rglob("*") if file.is_file())
-    return [file for file in found if file.relative_to(root).as_posix() not in known]
+    return [root / path for path in sorted(list_files(root, (STORE, TENSORS)) - known)]
+
+
+def list_files(root: Path, folders: Iterable[str]) -> set[str]:
+    """Return the paths, relative to the lake, of all files in some of its folders."""
+    found = (walked for name in folders for walked in os.walk(f"{root}/{name}"))
+    return {f"{folder}/{file}".removeprefix(f"{root}/") for folder, _, files in found for file in files}
 
 
 def remove_files(root: Path, files: Iterable[Path]) -> None:

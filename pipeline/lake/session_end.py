@@ -39,7 +39,8 @@ def has_ended(root: Path, manifest: Manifest) -> bool:
             return False
     except (OSError, ValueError):
         return False
-    leftovers = (root / STAGING).exists() or list_unfinished(root) or list_unfinished(root / REPORTS)
+    left = any((root / name).exists() for name in (STAGING, f"{CATALOG}.wal"))
+    leftovers = left or list_unfinished(root) or list_unfinished(root / REPORTS)
     return not leftovers and not find_orphans(root, manifest) and is_shown(root, manifest)
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from small_lake import DEADLY, check_folder, commit_round, find_files, put_round, write_round
+from small_lake import DEADLY, check_folder, find_files, make_status, put, put_round, write_round
 
-from tracklake.pipeline.lake import Manifest, catalog, is_settled, load, open_for_writing
+from tracklake.pipeline.lake import Manifest, Writer, catalog, is_settled, load, open_for_writing
 from tracklake.schemas.files import list_unfinished
 
-KEYS = ("validate/highd/01-upper", "validate/highd/01-lower")
+ANOTHER = {"dataset": "highd", "subset": "02-upper"}
 
 
 class Died(BaseException):
@@ -48,23 +48,29 @@ def die_at(step: int, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return done
 
 
+def commit_upper(writer: Writer, number: int) -> None:
+    """Two tables and a folder of one subset: every kind of step, and few of them."""
+    writer.commit(put_round(writer.root, "01-upper", number))
+
+
 def run_first(root: Path) -> None:
-    write_round(root, 1)
+    with open_for_writing(root) as writer:
+        commit_upper(writer, 1)
 
 
 def change(root: Path) -> None:
     with open_for_writing(root) as writer:
-        writer.commit(put_round(root, "01-upper", 7))
+        commit_upper(writer, 7)
 
 
 def prune(root: Path) -> None:
     with open_for_writing(root) as writer:
-        writer.remove({KEYS[0]})
+        writer.remove({"validate/highd/01-upper"})
 
 
 def rebuild(root: Path) -> None:
     with open_for_writing(root, rebuild=True) as writer:
-        commit_round(writer, 4)
+        commit_upper(writer, 4)
 
 
 def change_nothing(root: Path) -> None:
@@ -90,7 +96,10 @@ def test_a_death_at_any_step_is_noticed_and_mended(tmp_path: Path, work: Callabl
     before, root = tmp_path / "before", tmp_path / "lake"
     if work is not run_first:
         for number in (2, 3, 4):  # so that there is something to delete, too
-            write_round(before, number)
+            with open_for_writing(before) as writer:
+                commit_upper(writer, number)
+                if number == 2:
+                    writer.commit(put(before, "validate/highd/02", 1, make_status("02-upper", 1), **ANOTHER))
     step, settled = 0, []
     while True:
         shutil.rmtree(root, ignore_errors=True)
@@ -159,6 +168,7 @@ def test_a_catalog_that_is_spoilt_is_made_again(tmp_path: Path):
 
 LEFTOVERS = (
     ".lock",
+    "catalog.duckdb.wal",
     ".staging/spilled/x.arrow",
     f".manifest.json.{'a' * 32}.tmp",
     f"reports/.index.html.{'b' * 32}.tmp",
