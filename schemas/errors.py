@@ -8,6 +8,9 @@ from pathlib import Path
 
 from tracklake.schemas.text import make_visible
 
+UNREADABLE = (ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
+"""Errors that readers of files raise on content that is damaged or of another kind."""
+
 
 class TracklakeError(Exception):
     """Something the user can mend: the message says what, where, what was expected, what was found, and what to do.

@@ -4,7 +4,9 @@ A key is `Annotated[type, meaning]`, or `Annotated[type, meaning, unit]` where t
 `UNITS`). docs/quality_json.md is derived from these classes.
 """
 
-from typing import Annotated, Final, TypedDict
+from typing import Annotated, Final
+
+from typing_extensions import TypedDict
 
 from tracklake.schemas.quality_tracks import (
     Dataset,

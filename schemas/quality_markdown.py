@@ -3,7 +3,9 @@
 import sys
 import types
 from collections.abc import Iterator
-from typing import Annotated, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, get_args, get_origin, get_type_hints
+
+from typing_extensions import is_typeddict
 
 from tracklake.schemas.markdown import format_table
 from tracklake.schemas.quality import QUALITY_SCHEMA, UNITS, Quality

@@ -1,6 +1,8 @@
 """Parts of `quality.json` about subsets, findings, speeds and track starts; see `schemas.quality` for the document."""
 
-from typing import Annotated, TypedDict
+from typing import Annotated
+
+from typing_extensions import TypedDict
 
 Dataset = Annotated[str, "ngsim or highd"]
 Subset = Annotated[str, "one carriageway (arterials: one direction) of one recording"]

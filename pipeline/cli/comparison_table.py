@@ -11,7 +11,7 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import cut_text, print_table
 from tracklake.pipeline.lake import Manifest, connect, load, scan
 from tracklake.pipeline.lake.files import REPORTS
-from tracklake.pipeline.stages.report import DOCUMENT, PAGE
+from tracklake.pipeline.stages.report import DOCUMENT, PAGE, make_report_error
 from tracklake.pipeline.stages.score import collect_scores
 from tracklake.quality_reports.pages.comparison import (
     describe_sides,
@@ -21,6 +21,8 @@ from tracklake.quality_reports.pages.comparison import (
 )
 from tracklake.quality_reports.pages.lake_differences import COUNTED, Side, compare
 from tracklake.schemas import SUBSETS
+from tracklake.schemas.documents import read_json
+from tracklake.schemas.errors import UNREADABLE
 from tracklake.schemas.files import write_file
 from tracklake.schemas.origin import describe_synthetic
 
@@ -131,9 +133,13 @@ def _list_made_with(manifest: Manifest) -> dict[str, Any]:
 
 def _read_provenance(root: Path) -> dict[str, Any]:
     """Read the settings and versions that the report was written with."""
-    provenance = json.loads((root / REPORTS / DOCUMENT).read_text(encoding="utf-8"))["provenance"]
-    settings = {name: provenance["settings"].get(name) for name in SETTINGS_IN_DIGESTS}
-    return settings | {name: provenance[name] for name in LIBRARIES}
+    file = root / REPORTS / DOCUMENT
+    try:
+        provenance = read_json(file)["provenance"]
+        settings = {name: provenance["settings"].get(name) for name in SETTINGS_IN_DIGESTS}
+        return settings | {name: provenance[name] for name in LIBRARIES}
+    except UNREADABLE as broken:
+        raise make_report_error(file, repr(broken)) from broken
 
 
 def show_comparison(terminal: Terminal, compared: dict[str, Any]) -> None:

@@ -1,6 +1,5 @@
 """The flow that the pipeline's commands share: run what is missing or stale, then report what was done."""
 
-import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -22,7 +21,7 @@ from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import SourceError
-from tracklake.pipeline.stages.report import DOCUMENT, PAGE
+from tracklake.pipeline.stages.report import DOCUMENT, PAGE, read_quality
 from tracklake.schemas.columns import DATASETS
 from tracklake.schemas.errors import explain_file_errors
 from tracklake.schemas.text import quote_shell
@@ -131,7 +130,7 @@ def report_result(
     record: dict[str, Any] = {"lake": settings.lake, **asdict(result)}
     usable = bool(load(settings.lake).of_stage("ingest"))
     if usable and headline and (reports / DOCUMENT).exists():
-        quality = json.loads((reports / DOCUMENT).read_text(encoding="utf-8"))
+        quality = read_quality(settings.lake)
         show_headline(terminal, quality, reports / PAGE, settings.lake)
         record |= {"report": (reports / PAGE).resolve(), **{key: quality[key] for key in ("headline", "model_scores")}}
     elif not usable and not result.refused:

@@ -21,6 +21,7 @@ from tracklake.pipeline.sources.csv import (
     read_head,
 )
 from tracklake.pipeline.sources.source import Unit
+from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import write_file
 from tracklake.schemas.text import make_visible
 
@@ -244,6 +245,11 @@ def _explain_nothing(source: Path, candidates: list[Path], sources: list[Source]
     )
 
 
+def _is_digest(known: object) -> bool:
+    """Return whether a value is the size, the modification time and the hash of a file."""
+    return isinstance(known, list) and [type(value) for value in known] == [int, int, str]
+
+
 _HASHES_OF_PROCESS: dict[str, list[object]] = {}
 """Hashes computed in this process: a lake that does not exist yet cannot keep them, and no file is read twice."""
 
@@ -258,11 +264,11 @@ class Digests:
         self._path = root / HASHES
         self._known: dict[str, list[object]] = {}
         try:
-            remembered = json.loads(self._path.read_text(encoding="utf-8"))
+            remembered = read_json(self._path)
         except (FileNotFoundError, NotADirectoryError, ValueError):
             remembered = None  # nothing remembered, or not as it was written: everything is hashed again
         if isinstance(remembered, dict):
-            self._known = {path: known for path, known in remembered.items() if isinstance(known, list)}
+            self._known = {path: known for path, known in remembered.items() if _is_digest(known)}
         self._changed = False
 
     def __call__(self, file: RawFile) -> str:

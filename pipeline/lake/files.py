@@ -16,6 +16,7 @@ from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.errors import DamagedFileError, LakeMissingError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.schemas import TABLES, Table
+from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import sync
 
 STORE = ".files"
@@ -172,7 +173,7 @@ def _is_whole(root: Path, folder: Path) -> bool:
     Its deletion may have been killed half way.
     """
     try:
-        sizes = json.loads((folder / LISTING).read_text(encoding="utf-8"))
+        sizes = read_json(folder / LISTING)
     except (OSError, ValueError):
         return False
     found = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _list_files(folder)}

@@ -9,6 +9,7 @@ from typing import Any
 
 from tracklake.pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
 from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas.documents import parse_json
 from tracklake.schemas.files import write_file
 from tracklake.schemas.text import quote_shell
 
@@ -200,7 +201,7 @@ def read_document(root: Path) -> dict[str, Any]:
     except UnicodeDecodeError as broken:
         raise make_foreign_error(path, broken) from broken
     try:
-        document: dict[str, Any] = json.loads(text)
+        document: dict[str, Any] = parse_json(text)
         document["schema_version"]
     except (ValueError, KeyError, TypeError) as broken:
         raise make_foreign_error(path, broken) from broken

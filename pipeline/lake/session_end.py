@@ -8,6 +8,7 @@ from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.files import REPORTS, STAGING, find_orphans
 from tracklake.pipeline.lake.live_folders import is_shown
 from tracklake.pipeline.lake.manifest import MANIFEST, Manifest
+from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import list_unfinished, write_file
 
 SESSION = ".session"
@@ -35,7 +36,7 @@ def has_ended(root: Path, manifest: Manifest) -> bool:
     The catalog is then the one made of this manifest, the live folders show what is live, and nothing is left lying.
     """
     try:
-        if json.loads((root / SESSION).read_text(encoding="utf-8")) != _describe_state(root):
+        if read_json(root / SESSION) != _describe_state(root):
             return False
     except (OSError, ValueError):
         return False

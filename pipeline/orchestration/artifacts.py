@@ -1,6 +1,5 @@
 """What Prefect's UI shows of a flow run: its name, the report's figures and address, its refusals and notes."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from prefect.context import FlowRunContext
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult
-from tracklake.pipeline.stages.report import DOCUMENT, PAGE
+from tracklake.pipeline.stages.report import PAGE, read_quality
 
 OUR_FAULTS = (400, 422)
 """HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
@@ -66,7 +65,7 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
     Raises:
         OSError: the lake has no report.
     """
-    quality = json.loads((root / REPORTS / DOCUMENT).read_text(encoding="utf-8"))
+    quality = read_quality(root)
     make_key = partial(_make_key, root=root, lake_id=load(root).lake_id)
     tables = [
         FigureTable(make_key("findings"), "Per rule: what breaks it in the whole lake.", _list_findings(quality)),

@@ -1,13 +1,15 @@
 """Report: the lake's quality as one page for people and one document for programs."""
 
 import platform
+import shlex
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import polars as pl
+from pydantic import TypeAdapter, ValidationError
 
-from tracklake.pipeline.lake import Manifest, connect, scan
+from tracklake.pipeline.lake import LakeError, Manifest, connect, scan
 from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
@@ -18,8 +20,10 @@ from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.rules.registry import RULES, resolve
 from tracklake.schemas import SUBSETS
+from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import remove_unfinished
 from tracklake.schemas.hashing import hash_chunks
+from tracklake.schemas.quality import Quality
 
 PAGE = "index.html"
 """Name of the report's page for people."""
@@ -103,6 +107,30 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     for folder in (root / REPORTS, root / REPORTS / FOLDER):
         remove_unfinished(folder)
     return StageResult(files={REPORTS: files}, notes=notes)
+
+
+def read_quality(root: Path) -> dict[str, Any]:
+    """Read a lake's reports/quality.json.
+
+    Raises:
+        LakeError: it is damaged, or has other keys than those of `schemas.quality`.
+    """
+    file = root / REPORTS / DOCUMENT
+    try:
+        quality = read_json(file)
+        TypeAdapter(Quality).validate_python(quality)
+    except ValidationError as wrong:
+        first = wrong.errors()[0]
+        raise make_report_error(file, f"`{'.'.join(map(str, first['loc']))}`: {first['msg']}") from None
+    except (OSError, ValueError) as broken:
+        raise make_report_error(file, str(broken)) from broken
+    return dict(quality)
+
+
+def make_report_error(file: Path, reason: str) -> LakeError:
+    """Return the error of a quality.json that others wrote or damaged."""
+    again = f"delete it and run `tracklake report --lake {shlex.quote(str(file.parents[1]))}`"
+    return LakeError(f"{file}: not the figures of a report of this version ({reason}); {again}")
 
 
 STAGE = Stage(

@@ -1,6 +1,5 @@
 """Score: the error of the simplest model on the evaluation part, the baseline for all others."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.pipeline.stages.tensors import tensor_folder
-from tracklake.schemas.tensors import INDEX_FILE
+from tracklake.schemas.documents import read_json
 
 BASELINE = "constant-velocity"
 """Name of the model that is scored, and of its run."""
@@ -59,12 +58,13 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
     Returns:
         {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
     """
+    from tracklake.training.data.checks import read_index
     from tracklake.training.runs.run_folder import StaleRunError, read_config
 
     commit = manifest.commits.get(TENSORS)
     if commit is None or commit.info["path"] is None:
         return []
-    index = json.loads((root / commit.info["path"] / INDEX_FILE).read_text(encoding="utf-8"))
+    index = read_index(root / commit.info["path"])
     scores = []
     for path in finished_runs(root):
         try:
@@ -86,7 +86,7 @@ def _read_score(path: Path) -> dict[str, Any] | None:
     from tracklake.training.runs.run_folder import AGAIN, StaleRunError
 
     try:
-        evaluation = json.loads(path.read_text(encoding="utf-8"))["evaluation"]
+        evaluation = read_json(path)["evaluation"]
         if evaluation is None:
             return None
         rows = [{name: horizon[name] for name in ("seconds", "rmse_m", "n")} for horizon in evaluation["horizons"]]

@@ -1,11 +1,15 @@
 """docs/quality_json.md is derived from the declared types, and lists exactly the keys of the sample lake's document."""
 
 import json
+import random
 import re
 from pathlib import Path
 
 import pytest
+from mutations import mutate
 
+from tracklake.pipeline.lake import LakeError
+from tracklake.pipeline.stages.report import read_quality
 from tracklake.schemas.quality import QUALITY_SCHEMA, Quality
 from tracklake.schemas.quality_markdown import SECTIONS, write_quality_page
 
@@ -125,3 +129,36 @@ def test_few_lists_are_empty_everywhere(found):
 def test_the_version_is_the_documents(found):
     assert found["schema"] == [QUALITY_SCHEMA]
     assert f"`{QUALITY_SCHEMA}`" in PAGE
+
+
+def test_a_changed_document_is_refused_with_its_name_or_read(tmp_path, report):
+    file, draw, refusals = tmp_path / "reports" / "quality.json", random.Random(0), []
+    file.parent.mkdir()
+    file.write_text(report.json)
+    whole = read_quality(tmp_path)
+    assert whole == json.loads(report.json)
+    for _ in range(60):
+        file.write_text(json.dumps(mutate(whole, draw)))
+        try:
+            read_quality(tmp_path)
+        except LakeError as refused:
+            refusals.append(str(refused))
+    assert len(refusals) > 20
+    again = f"delete it and run `tracklake report --lake {tmp_path}`"
+    assert all(message.startswith(f"{file}: ") and message.endswith(again) for message in refusals)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{}", "`schema`: Field required"),
+        ("[" * 100_000, "nested in more than 50 levels"),
+        ("[]", "Input should be a valid dictionary"),
+        ("\0", "Expecting value"),
+    ],
+)
+def test_what_is_no_such_document_is_refused(tmp_path, text, says):
+    (tmp_path / "reports").mkdir()
+    (tmp_path / "reports" / "quality.json").write_text(text)
+    with pytest.raises(LakeError, match=re.escape(says)):
+        read_quality(tmp_path)

@@ -3,7 +3,6 @@
 Whatever is absent, unreadable, cut short or not as declared raises TensorError.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, conlist
 
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.documents import read_json
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import (
@@ -58,7 +58,7 @@ def read_index(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise TensorError(f"{path}: no tensors here (no {INDEX_FILE}); run `tracklake tensors`")
     try:
-        index = json.loads(file.read_text(encoding="utf-8"))
+        index = read_json(file)
     except ValueError as broken:
         raise TensorError.at(file, f"not readable as JSON ({broken})") from broken
     if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
@@ -129,7 +129,7 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
         dtype, shape = np.dtype(array.stored_as(index["storage"])), array.sizes(index["sizes"])
         try:
             mapped = np.lib.format.open_memmap(file, mode="r")
-        except (OSError, ValueError) as broken:
+        except Exception as broken:
             raise TensorError.at(file, f"cannot be read ({broken})") from broken
         if (mapped.dtype, mapped.shape) != (dtype, shape):
             raise TensorError.at(file, f"expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}")

@@ -26,7 +26,6 @@ BATCH_SIZE = 256
 """Number of samples predicted at once; the errors do not depend on it. With 2,048, the largest network's values leave
 the cache, and it takes nearly twice as long."""
 
-
 LATENCY_MOMENTS = 20
 """Number of moments that the median time is taken of."""
 
@@ -100,11 +99,7 @@ def evaluate(
 
     Raises:
         TensorError: the tensors are missing or damaged.
-        StaleRunError: the run was trained for another protocol, or on subsets that are in this part now; or it is
-            unfinished or damaged.
-        UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
-        MissingExtraError: torch is needed and missing.
-        TracklakeError: see `measure_errors`.
+        TracklakeError: see `open_forecaster` and `measure_errors`.
     """
     folder = TensorFolder.open(tensors)
     own = open_forecaster(name, folder, models, frozenset({part}))

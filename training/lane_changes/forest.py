@@ -15,7 +15,8 @@ from sklearn.exceptions import InconsistentVersionWarning
 
 from tracklake.schemas.arrays import Bytes, Floats, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.documents import parse_json
+from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import write_file
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene
@@ -104,7 +105,7 @@ class LaneForest:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", InconsistentVersionWarning)  # trees of another scikit-learn
                 content = skops.io.loads(file.read_bytes(), trusted=list(TRUSTED))
-            header, classifier = json.loads(content["header"]), content["classifier"]
+            header, classifier = parse_json(content["header"]), content["classifier"]
         except Exception as broken:
             raise ForestError(f"{file}: not a lane forest that can be read here ({broken}){AGAIN}") from broken
         try:
@@ -112,7 +113,7 @@ class LaneForest:
             horizons_s = tuple(map(float, header["horizons_s"]))
             forest = cls(classifier, tuple(header["features"]), header["rate_hz"], horizons_s, header["facts"])
             _check_classifier(forest)
-        except (UsageError, ValueError, TypeError, AttributeError) as wrong:
+        except (UsageError, *UNREADABLE) as wrong:
             raise ForestError(f"{file}: {wrong}{AGAIN}") from wrong
         return forest
 
@@ -197,18 +198,17 @@ def _check_header(header: Any) -> None:  # noqa: ANN401  (whatever JSON a file h
         raise ValueError(f"expected version {VERSION} of lane forests, got {version!r}")
     if not isinstance(names, list) or not names or not all(name in FEATURE_NAMES for name in names):
         raise ValueError(f"expected features of {', '.join(FEATURE_NAMES)}, got {names}")
-    if not (isinstance(horizons_s, list) and horizons_s and all(map(_is_positive, [rate_hz, *horizons_s]))):
+    if not (
+        isinstance(horizons_s, list)
+        and horizons_s
+        and all(type(own) in (int, float) and own > 0 for own in (rate_hz, *horizons_s))
+    ):
         raise ValueError(f"expected horizons in s and a rate in Hz, above 0; got {horizons_s!r} and {rate_hz!r}")
     held = facts if isinstance(facts, dict) else {}
     lacking = [name for name, kind in FACTS.items() if not isinstance(held.get(name), kind)]
     if lacking:
         raise ValueError(f"expected facts with {', '.join(FACTS)}, got no {', '.join(lacking)}")
     LaneForestSettings.read(held["settings"])
-
-
-def _is_positive(value: object) -> bool:
-    """Whether a plain value is a number above 0."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0
 
 
 def _check_classifier(forest: LaneForest) -> None:

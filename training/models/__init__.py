@@ -13,6 +13,9 @@ from tracklake.schemas.errors import MissingExtraError, UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.models.prediction import Prediction
 
+MAX_PARAMETER = 2048
+"""Largest number that a model takes as a parameter: hidden units above all, whose squares are weights."""
+
 Reads = Literal["grid", "scene"]
 """Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
@@ -99,10 +102,19 @@ class Model:
         if unknown:
             known = ", ".join(self.parameters) or "none"
             raise UsageError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
+        for name, value in parameters.items():
+            _check_parameter(f"model `{self.name}`: parameter `{name}`", value, type(self.parameters[name]))
         if self.learns:
             require_torch(self.name)
         make: Callable[..., Any] = getattr(import_module(f"tracklake.training.models.{self.module}"), self.builder)
         return make(protocol, **{**self.parameters, **parameters})
+
+
+def _check_parameter(what: str, value: object, kind: type) -> None:
+    """Raise UsageError for a value of another type than the default, or a size that would exhaust the memory."""
+    fits = type(value) is kind or (kind is float and type(value) is int)
+    if not fits or (isinstance(value, int | float) and not 0 <= value <= MAX_PARAMETER):
+        raise UsageError(f"{what}: expected {kind.__name__} from 0 to {MAX_PARAMETER:,}, got {str(value)[:60]}")
 
 
 DEO, BAR_SHALOM, SCHUBERT = (
@@ -119,13 +131,7 @@ _RESIDUAL = {"residual": True}
 _ATTENTION = {"hidden": 128, "dropout": 0.7, "nll_weight": 1.0, "distance_weight": 1.0, **_RESIDUAL}
 
 _MODELS = (
-    Model(
-        "constant-velocity",
-        "continues with the velocity of the last 0.2 s",
-        "",
-        "constant_velocity",
-        "ConstantVelocity",
-    ),
+    Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", "constant_velocity", "ConstantVelocity"),
     Model(
         "kalman-cv",
         "Kalman filter over the history with constant velocity and white-noise acceleration",

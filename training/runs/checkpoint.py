@@ -1,17 +1,19 @@
 """Checkpoints of a training, from which it resumes to the same weights bit for bit, in a hidden folder of its run."""
 
 import fcntl
+import json
 import shutil
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile, ZipFile
 
-from tracklake.schemas.errors import TracklakeError, UsageError
+from pydantic import TypeAdapter
+
+from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import remove_unfinished, write_file
 from tracklake.training.runs.config import TrainConfig
 from tracklake.training.runs.progress import TrainingState
@@ -26,9 +28,8 @@ CHECKPOINT_VERSION = 3
 """Number of the checkpoint's layout; it grows when older checkpoints cannot be resumed exactly."""
 RESTART = "start over with `--anew`"
 
-_FIELDS = {own.name for own in fields(TrainingState)}
 _KEYS = {"version", "run", "network", "optimizer", "random", "device_random", "state"}
-_BROKEN = (AttributeError, BadZipFile, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zlib.error)
+_BROKEN = (*UNREADABLE, BadZipFile, EOFError, zlib.error)
 """Errors of zipfile and torch on files that are damaged or of another kind."""
 
 
@@ -104,14 +105,15 @@ def save_checkpoint(
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
     """Read a checkpoint, and the settings that its training was started with."""
     content = read_torch_file(path, RESTART)
-    if (got := content.get("version")) != CHECKPOINT_VERSION:
+    if type(got := content.get("version")) is not int or got != CHECKPOINT_VERSION:
         raise DamagedFileError(f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {got}; {RESTART}")
-    state, run = content.get("state"), content.get("run")
-    if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != _FIELDS:
+    state = content.get("state")
+    if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != vars(TrainingState()).keys():
         raise DamagedFileError(f"{path}: expected a checkpoint, got a file of {', '.join(sorted(content))}; {RESTART}")
     try:
-        return content, TrainConfig(**run["training"])  # type: ignore[index]  # checked by the expression itself
-    except (LookupError, TypeError, UsageError) as wrong:
+        json.dumps(content["run"])  # or there are tensors in it
+        return content, TrainConfig(**content["run"]["training"])
+    except (*UNREADABLE, UsageError) as wrong:
         raise DamagedFileError(
             f"{path}: expected settings of a training that this version knows ({wrong}); resume with the version that "
             f"started it, or {RESTART}"
@@ -124,14 +126,27 @@ def restore(
     """Restore weights, moments and random state from a checkpoint's content, and return the progress."""
     import torch
 
-    load_weights(network, content["network"], path, RESTART)
     try:
-        optimizer.load_state_dict(content["optimizer"])
+        losses = content["state"]["losses"].tolist()
+        state = TypeAdapter(TrainingState).validate_python(content["state"] | {"losses": losses})
+        if not (len(losses) == state.step > 0 < len(state.phases) and state.logged[0] <= state.step):
+            raise ValueError(f"{state.step} steps with {len(losses)} losses in {len(state.phases)} phases")
+        if state.best_weights is not None:
+            load_weights(network, state.best_weights, path, RESTART)
+        load_weights(network, content["network"], path, RESTART)
+        groups = optimizer.state_dict()["param_groups"]  # all but the last learning rate follows from the settings
+        groups[0]["lr"] = float(content["optimizer"]["param_groups"][0]["lr"])
+        moments, weights = content["optimizer"]["state"], list(network.parameters())
+        for number, held in moments.items():
+            wanted = {"step": torch.tensor(0.0), "exp_avg": weights[number], "exp_avg_sq": weights[number]}
+            if {name: _describe(own) for name, own in held.items()} != {n: _describe(w) for n, w in wanted.items()}:
+                raise ValueError("moments that are not those of the weights")
+        optimizer.load_state_dict({"state": moments, "param_groups": groups})
         torch.set_rng_state(content["random"])
         if device.type == "cuda":
             torch.cuda.set_rng_state(content["device_random"], device)
-        return TrainingState(**(content["state"] | {"losses": content["state"]["losses"].tolist()}))
-    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError) as wrong:
+        return state
+    except UNREADABLE as wrong:
         raise DamagedFileError(f"{path}: not a checkpoint of this training ({wrong}); {RESTART}") from None
 
 
@@ -198,4 +213,10 @@ def load_weights(network: "nn.Module", weights: object, path: Path, advice: str)
 
 
 def _describe(value: Any) -> str:  # noqa: ANN401  (whatever a file held)
-    return f"{tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else f"a {type(value).__name__}"
+    import torch
+
+    if not isinstance(value, torch.Tensor):
+        return f"a {type(value).__name__}"
+    if value.layout != torch.strided or value.is_meta or value.is_nested:
+        return f"a tensor of kind {'meta' if value.is_meta else value.layout}"
+    return f"{tuple(value.shape)} of {value.dtype}"

@@ -22,6 +22,8 @@ RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_
 BUDGETS = ("seconds", "steps", "epochs")
 """Settings that end a training; one of them at most is given."""
 WHOLE_NUMBERS = ("steps", "epochs", "samples_per_epoch", "patience", "batch_size", "seed", "threads", "log_steps")
+MAX_NUMBER, MAX_THREADS = 2**63 - 1, 1024
+"""Largest numbers in general, as torch takes seeds, and of threads."""
 NUMBERS = ("seconds", "learning_rate", "max_gradient_norm", "checkpoint_s")
 
 
@@ -59,12 +61,15 @@ class TrainConfig:
         """Raise UsageError for a value that cannot train anything."""
         for own in fields(self):
             value = getattr(self, own.name)
-            if own.name in WHOLE_NUMBERS and not isinstance(value, int | None):
+            if own.name in WHOLE_NUMBERS and value is not None and type(value) is not int:
                 raise UsageError(f"training: expected a whole number for `{own.name}`, got {value!r}")
             if own.name in NUMBERS and not isinstance(value, int | float | None):
                 raise UsageError(f"training: expected a number for `{own.name}`, got {value!r}")
             if own.name != "seed" and isinstance(value, int | float) and not value > 0:
                 raise UsageError(f"training: expected `{own.name}` above 0, got {value}")
+            most = MAX_THREADS if own.name == "threads" else MAX_NUMBER
+            if isinstance(value, int) and value > most:
+                raise UsageError(f"training: expected `{own.name}` of at most {most:,}, got {value}")
         if not isinstance(self.parameters, Mapping):
             raise UsageError(f"training: expected `parameters` by name, got {self.parameters!r}")
         if self.seed < 0:

@@ -63,12 +63,7 @@ class TrainingState:
     phases: list[tuple[str, int]] = field(default_factory=list)  # loss of each phase so far, and its first step
     course: list[Row] = field(default_factory=list)  # rows of course.csv
     epochs: list[Row] = field(default_factory=list)  # rows of epochs.csv
-    logged: tuple[int, int, float, float] = (
-        0,
-        0,
-        0.0,
-        0.0,
-    )  # step, samples, stepping_s, reading_s at its last row
+    logged: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)  # step, samples, stepping_s, reading_s at its last row
     best_loss: float | None = None  # smallest validation loss of the present phase
     best_epoch: int | None = None  # epoch of that loss
     best_weights: dict[str, Any] | None = None  # at its end

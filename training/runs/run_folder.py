@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.documents import read_json
+from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import name_unfinished
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
@@ -29,7 +30,7 @@ RUN_VERSION = 2
 AGAIN = "train it again"
 TRAINED_BY = ("tracklake", "torch")
 """Distributions whose versions a run records."""
-KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "blocks": list}
+KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "val_subsets": list, "blocks": list}
 """Keys that a run's config must hold, and their types."""
 HASHED_BYTES = 1 << 22
 """Size of the pieces that are hashed, in bytes, so that Ctrl-C does not wait for a whole array."""
@@ -116,7 +117,7 @@ def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]
     try:
         model = find_model(config["model"])
         predictor = model.build(protocol, **config["parameters"])
-    except (UsageError, ValueError, TypeError) as wrong:
+    except (UsageError, *UNREADABLE) as wrong:
         raise StaleRunError(f"{path}: {wrong}; {AGAIN}") from None
     if model.learns:
         require_torch(model.name)
@@ -133,18 +134,21 @@ def read_config(path: Path) -> dict[str, Any]:
     """Read a run's `config.json`; StaleRunError where it is of another version, or damaged."""
     file = path / "config.json"
     try:
-        config = json.loads(file.read_text(encoding="utf-8"))
+        config = read_json(file)
     except ValueError as broken:
         raise StaleRunError(f"{file}: not readable as JSON ({broken}); {AGAIN}") from None
     version = config.get("version") if isinstance(config, dict) else f"a {type(config).__name__}"
     if version != RUN_VERSION:
         raise StaleRunError(f"{file}: expected version {RUN_VERSION}, got {version}; {AGAIN}")
+    config = {"val_subsets": [], **config}
     lacking = sorted(name for name, kind in KINDS.items() if not isinstance(config.get(name), kind))
     if not lacking and not {"name", "digest"} <= config["protocol"].keys():
         lacking = ["the name and digest of a protocol"]
+    if not lacking and not all(isinstance(name, str) for name in config["train_subsets"] + config["val_subsets"]):
+        lacking = ["names of subsets"]
     if lacking:
         raise StaleRunError(f"{file}: expected {', '.join(lacking)} in it; {AGAIN}")
-    return dict(config)
+    return config
 
 
 def refuse_unfinished(path: Path) -> None:
@@ -162,7 +166,7 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     """
     if config["blocks"] == folder.index["blocks"]:
         return
-    seen = sorted({*config["train_subsets"], *config.get("val_subsets", ())} & folder.subsets_of(part))
+    seen = sorted({*config["train_subsets"], *config["val_subsets"]} & folder.subsets_of(part))
     if seen:
         raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "

@@ -160,7 +160,19 @@ def test_digests_are_remembered_until_the_file_changes(tmp_path):
     assert Digests(tmp_path)(file) == hashlib.sha256(b"two").hexdigest()
 
 
-@pytest.mark.parametrize("remembered", [b"", b"\xff\xfe", b"[]", b"{", json.dumps({"x": 1, "/y": [1]}).encode()])
+@pytest.mark.parametrize("cut", [0, 1, 2, "hash"])
+def test_a_hash_that_is_cut_short_is_computed_again(tmp_path, cut):
+    path = write(tmp_path / "a.csv", b"one")
+    stat = path.stat()
+    whole = [stat.st_size, stat.st_mtime_ns, "0" * 64]
+    damaged = [*whole[:2], 7] if cut == "hash" else whole[:cut]
+    write(tmp_path / ".hashes.json", json.dumps({str(path.resolve()): damaged}).encode())
+    assert Digests(tmp_path)(RawFile(path, "a.csv")) == hashlib.sha256(b"one").hexdigest()
+
+
+@pytest.mark.parametrize(
+    "remembered", [b"", b"\xff\xfe", b"[]", b"{", b"[" * 100_000, json.dumps({"x": 1, "/y": [1]}).encode()]
+)
 def test_a_damaged_memory_of_digests_is_forgotten(tmp_path, remembered):
     write(tmp_path / ".hashes.json", remembered)
     path = write(tmp_path / "a.csv", b"one")

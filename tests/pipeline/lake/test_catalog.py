@@ -13,15 +13,7 @@ import polars as pl
 import pytest
 from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
 
-from tracklake.pipeline.lake import (
-    QueryError,
-    connect,
-    load,
-    open_for_writing,
-    query,
-    query_errors,
-    scan,
-)
+from tracklake.pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
 from tracklake.pipeline.lake.errors import DamagedFileError
 from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
