@@ -17,6 +17,10 @@ HEADLINES: Mapping[Headline, str] = {
 """Errors by name that published tables state and that ours show first."""
 
 
+LAST_LANES = {"us-101": 6}
+"""Highest lane by site in the script of convolutional social pooling, where lanes with higher numbers count as it."""
+
+
 @dataclass(frozen=True)
 class Protocol:
     """Recipe of prediction origins, predicted futures and metrics.
@@ -34,6 +38,7 @@ class Protocol:
         train_share: of the split: how much of it trains; csp-2018 has shares of its own.
         scored_s: seconds ahead at which errors are stated; of those beyond the horizon there are none.
         headline: which error, of HEADLINES.
+        fold_lanes: whether lanes beyond LAST_LANES count as the last one, for maneuvers and neighbors.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Protocol:
     train_share: float = 0.8
     scored_s: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     headline: Headline = "rmse"
+    fold_lanes: bool = False
 
     @property
     def history_ticks(self) -> int:
@@ -72,13 +78,18 @@ class Protocol:
     @property
     def digest(self) -> str:
         """First 12 hex digits of the sha256 of every parameter."""
-        return _digest(asdict(self))
+        return _digest(self._parameters)
 
     @property
     def sampling_digest(self) -> str:
         """First 12 hex digits of the sha256 of the parameters that samples depend on."""
         others = ("train_share", "scored_s", "headline")
-        return _digest({name: value for name, value in asdict(self).items() if name not in others} | {"split": ""})
+        return _digest({name: value for name, value in self._parameters.items() if name not in others} | {"split": ""})
+
+    @property
+    def _parameters(self) -> dict[str, object]:
+        """Parameters that are hashed; lanes that are not folded are no parameter, as before there was one."""
+        return {name: value for name, value in asdict(self).items() if name != "fold_lanes" or value}
 
 
 def _digest(values: dict[str, object]) -> str:
@@ -86,13 +97,13 @@ def _digest(values: dict[str, object]) -> str:
     return hash_values(values, 12)
 
 
-CSP = Protocol(name="csp")
+CSP = Protocol(name="csp", fold_lanes=True)
 
 PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
         CSP,
-        Protocol(name="csp-2018", split="csp-2018"),
+        Protocol(name="csp-2018", split="csp-2018", fold_lanes=True),
         Protocol(name="highd-flow-balanced"),
         Protocol(name="mha-2020", horizon_s=3.0, scored_s=(1.0, 2.0, 3.0), headline="rmse-by-axis"),
         Protocol(

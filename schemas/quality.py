@@ -64,6 +64,7 @@ class SubsetSamples(TypedDict):
     brake: Annotated[int, "samples that brake"]
     mean_neighbors: Annotated[float | None, "neighbors per sample"]
     collisions: Annotated[int | None, "neighbors moved to the nearest free cell, theirs being taken by a nearer one"]
+    all_collisions: Annotated[int | None, "the same in the grids of all entries at 10 Hz, as published counts are"]
     crowded_out: Annotated[int | None, "neighbors dropped because no cell was free"]
 
 

@@ -30,7 +30,7 @@ SAMPLES = Table(
             "the source's frame on the tick; null where none falls on it",
             nullable=True,
         ),
-        "lane": column(pl.Int16, "lane at the tick"),
+        "lane": column(pl.Int16, "lane at the tick; in protocols that fold lanes (csp), at most 6 on US-101"),
         "lateral_maneuver": column(
             pl.Enum(LATERAL_MANEUVERS),
             "left or right where the lane changes from 4 s before to now or from now to 4 s after, else keep",
@@ -78,6 +78,13 @@ SAMPLE_COUNTS = Table(
             pl.Int64,
             "of those within the grids' reach, how many found their cell taken by a nearer one; they moved to the "
             "nearest free cell of the lane",
+            ge=0,
+        ),
+        "all_collisions": column(
+            pl.Int64,
+            "the same in the grids of all entries at 10 Hz, samples or not, as published counts are; null without "
+            "lanes or with a slower camera",
+            nullable=True,
             ge=0,
         ),
         "crowded_out": column(pl.Int64, "collisions without a free cell, which are dropped", ge=0),

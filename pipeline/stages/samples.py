@@ -15,16 +15,19 @@ from tracklake.schemas import (
     TRACKS,
     VEHICLE_STARTS,
 )
+from tracklake.schemas.protocols import LAST_LANES
 
 
 def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Draw the samples of a subset."""
+    protocol = settings.get_protocol()
     drawn = draw_samples(
         reader.table(TRACKS, *TRACK_COLUMNS),
         reader.table(VEHICLE_STARTS),
         reader.table(MISSING_STARTS),
         reader.table(FINDINGS),
-        protocol=settings.get_protocol(),
+        protocol=protocol,
+        last_lane=LAST_LANES.get(reader.facts["site"]) if protocol.fold_lanes else None,
         excluded=reader.table(SUBSET_STATUS)["excluded"][0],
         **reader.partition,
         **reader.clock,
@@ -50,6 +53,6 @@ STAGE = Stage(
     scope="freeway recording",
     after=(INGEST, "validate", "repair"),
     settings=(lambda settings: {"protocol": settings.get_protocol().sampling_digest},),
-    version=2,
+    version=3,
     build=build,
 )

@@ -23,10 +23,10 @@ SELECT
     coalesce(lane_change_left, 0) AS lane_change_left, coalesce(lane_change_right, 0) AS lane_change_right,
     coalesce(brake, 0) AS brake,
     coalesce(pairs, 0) / nullif(samples, 0) AS mean_neighbors,
-    collisions, crowded_out
+    collisions, all_collisions, crowded_out
 FROM kept
 FULL JOIN dropped USING (protocol, dataset, subset)
 LEFT JOIN around USING (protocol, dataset, subset)
-LEFT JOIN (SELECT protocol, dataset, subset, collisions, crowded_out FROM sample_counts)
+LEFT JOIN (SELECT protocol, dataset, subset, collisions, all_collisions, crowded_out FROM sample_counts)
     USING (protocol, dataset, subset)
 ORDER BY protocol, dataset, subset

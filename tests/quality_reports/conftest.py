@@ -205,7 +205,16 @@ def small_lake() -> dict[str, list[dict]]:
             at(*lower, protocol="csp", reason="future", entries=1),
         ],
         "sample_counts": [
-            at(*lower, protocol="csp", entries_on_clock=8, samples=3, neighbors=1, collisions=2, crowded_out=1),
+            at(
+                *lower,
+                protocol="csp",
+                entries_on_clock=8,
+                samples=3,
+                neighbors=1,
+                collisions=2,
+                all_collisions=5,
+                crowded_out=1,
+            ),
         ],
         "neighbors": [
             at(*lower, protocol="csp", vehicle_id=1, tick=16, cell=19, neighbor_id=2, dx_m=4.0),

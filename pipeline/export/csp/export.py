@@ -32,15 +32,13 @@ from tracklake.pipeline.transforms.csp.subset import (
 )
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.protocols import LAST_LANES
 
 FILES = ("TrainSet.mat", "ValSet.mat", "TestSet.mat")
 """Names of the files, in the order of `schemas.columns.PARTS`."""
 
 LARGEST_BYTES = 2**31 - 1
 """Largest size of a variable in a .mat file of version 5, in bytes; SciPy writes no other version."""
-
-LAST_LANES = {"us-101": 6}
-"""Highest lane by site; lanes with higher numbers count as this one."""
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 """Columns of tracks that the export reads."""

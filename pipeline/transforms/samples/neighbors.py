@@ -134,6 +134,23 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighbo
     )
 
 
+def count_collisions(clock: pl.DataFrame) -> int:
+    """Count the vehicles whose cell is taken by a nearer one, in the grids of all entries.
+
+    Args:
+        clock: vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order.
+    """
+    if clock.is_empty():
+        return 0
+    line = _build_line(clock)
+
+    def count_chunk(start: int) -> int:
+        origins = np.arange(start, min(start + CHUNK_ROWS, clock.height), dtype=np.int32)
+        return int(_find_repeats(_find_pairs(line, origins)).sum())
+
+    return sum(map_in_threads(count_chunk, range(0, clock.height, CHUNK_ROWS)))
+
+
 def _build_line(clock: pl.DataFrame) -> _Line:
     """Sort the entries by (tick, lane, x) and find which others each can reach."""
     x_m, lane, tick = clock["x_m"].to_numpy(), clock["lane"].to_numpy(), clock["tick"].to_numpy()
@@ -232,10 +249,15 @@ def _find_pairs(line: _Line, at: NDArray[np.int32]) -> _Pairs:
     return _Pairs(run // 4, columns[run % 4], row.astype(np.int8), other, dx)
 
 
+def _find_repeats(pairs: _Pairs) -> Flags:
+    """Find the pairs, from the second on, whose neighbor shares the cell of the pair before."""
+    repeats: Flags = (np.diff(pairs.row) == 0) & (np.diff(pairs.column) == 0) & (np.diff(pairs.origin) == 0)
+    return repeats
+
+
 def _find_contested(pairs: _Pairs) -> Integers:
     """Find the pairs of columns in which two neighbors share a cell; they are adjacent, since dx rises in a column."""
-    column = pairs.origin * COLUMNS + pairs.column
-    twice = (column[1:] == column[:-1]) & (pairs.row[1:] == pairs.row[:-1])
+    column, twice = pairs.origin * COLUMNS + pairs.column, _find_repeats(pairs)
     if not twice.any():
         return np.empty(0, np.int64)
     crowded = np.zeros(int(column[-1]) + 1, np.bool_)

@@ -10,7 +10,7 @@ import polars as pl
 from tracklake.pipeline.transforms.resample import cut_runs, find_stride, join_key, put_on_clock
 from tracklake.pipeline.transforms.samples.maneuvers import label_maneuvers
 from tracklake.pipeline.transforms.samples.nearest import find_nearest
-from tracklake.pipeline.transforms.samples.neighbors import Neighborhood, find_neighbors
+from tracklake.pipeline.transforms.samples.neighbors import Neighborhood, count_collisions, find_neighbors
 from tracklake.pipeline.transforms.samples.threads import map_in_threads
 from tracklake.pipeline.transforms.starts.late_starts import find_would_be_neighbors
 from tracklake.schemas.arrays import Flags, bound_runs
@@ -34,6 +34,9 @@ TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 SAMPLE_COLUMNS = ("vehicle_id", "tick", "frame", "lane", "lateral_maneuver", "longitudinal_maneuver")
 
 NO_NEIGHBORS = Neighborhood(NEIGHBORS.empty(), collisions=0, crowded_out=0)
+
+PUBLISHED_HZ = 10
+"""Rate of the entries over which published collisions in the grid are counted, in Hz."""
 
 PIECE_ROWS = 1 << 16
 """Entries tested and labelled at once; their arrays stay in the processor's cache."""
@@ -68,6 +71,7 @@ def draw_samples(
     first_frame: int,
     frame_rate_hz: float,
     excluded: bool,
+    last_lane: int | None = None,
 ) -> SampleTables:
     """Keep or drop every entry on the protocol's clock, label the samples and find their neighbors (DESIGN section 7).
 
@@ -82,17 +86,21 @@ def draw_samples(
         first_frame: first frame of the recording, at tick 0.
         frame_rate_hz: frame rate of the source.
         excluded: whether validation excludes the subset.
+        last_lane: highest lane; for maneuvers and neighbors, higher ones count as it. None = no limit.
     """
     rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     clock = put_on_clock(tracks.select(TRACK_COLUMNS), **rates)
     names = {"protocol": protocol.name, "dataset": dataset, "subset": subset}
     whole_subset = "excluded_subset" if excluded else "no_lane" if tracks["lane"].null_count() else None
+    lane = pl.col("lane") if last_lane is None else pl.col("lane").clip(upper_bound=last_lane)
+    all_collisions = _count_all_collisions(tracks.with_columns(lane), first_frame, frame_rate_hz)
     if whole_subset or clock.is_empty():
         drops = {whole_subset: clock.height} if whole_subset else {}
-        return _build_tables(clock.height, SAMPLES.empty(), drops, NO_NEIGHBORS, names)
+        return _build_tables(clock.height, SAMPLES.empty(), drops, NO_NEIGHBORS, all_collisions, names)
 
     early_ids = vehicle_starts.filter("early")["vehicle_id"].implode()
     would_be = find_would_be_neighbors(clock, missing_starts, **rates)
+    clock = clock.with_columns(lane)
     kept = np.ones(clock.height, np.bool_)
 
     def filter_piece(bounds: tuple[int, int]) -> tuple[pl.DataFrame, dict[str, int]]:
@@ -114,7 +122,17 @@ def draw_samples(
     nearest = find_nearest(clock, protocol.nearest, kept) if protocol.nearest else pl.lit(None)
     samples = samples.with_columns(nearest.alias("nearest"))
     clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
-    return _build_tables(clock.height, samples, drops, find_neighbors(clock, kept), names)
+    return _build_tables(clock.height, samples, drops, find_neighbors(clock, kept), all_collisions, names)
+
+
+def _count_all_collisions(tracks: pl.DataFrame, first_frame: int, frame_rate_hz: float) -> int | None:
+    """Count the collisions in the grids of all entries at 10 Hz; None without lanes or with a slower camera."""
+    if tracks["lane"].null_count() or frame_rate_hz < PUBLISHED_HZ:
+        return None
+    columns = ("vehicle_id", "frame", "x_m", "lane")
+    return count_collisions(
+        put_on_clock(tracks.select(columns), first_frame=first_frame, frame_rate_hz=frame_rate_hz, rate_hz=PUBLISHED_HZ)
+    )
 
 
 def _find_short(piece: pl.DataFrame, protocol: Protocol) -> dict[str, Flags]:
@@ -177,7 +195,12 @@ def find_error_entries(
 
 
 def _build_tables(
-    entries: int, samples: pl.DataFrame, drops: dict[str, int], found: Neighborhood, names: dict[str, str]
+    entries: int,
+    samples: pl.DataFrame,
+    drops: dict[str, int],
+    found: Neighborhood,
+    all_collisions: int | None,
+    names: dict[str, str],
 ) -> SampleTables:
     """Build the tables of one subset."""
     constants = [pl.lit(value).alias(name) for name, value in names.items()]
@@ -188,6 +211,7 @@ def _build_tables(
         "samples": samples.height,
         "neighbors": found.neighbors.height,
         "collisions": found.collisions,
+        "all_collisions": all_collisions,
         "crowded_out": found.crowded_out,
     }
     return SampleTables(

@@ -134,7 +134,7 @@ def test_samples_and_drops(report):
     assert (lower["samples"], lower["vehicles"], lower["dropped"], lower["kept_share"]) == (3, 2, 5, 0.375)
     assert (lower["lane_change_left"], lower["lane_change_right"], lower["brake"]) == (1, 0, 1)
     assert lower["mean_neighbors"] == pytest.approx(1 / 3)
-    assert (lower["collisions"], lower["crowded_out"]) == (2, 1)
+    assert (lower["collisions"], lower["all_collisions"], lower["crowded_out"]) == (2, 5, 1)
     drops = [(each["reason"], each["entries"], each["share"]) for each in report.quality["samples"]["drops"]]
     assert drops == [("history", 4, 0.5), ("future", 1, 0.125)]
 

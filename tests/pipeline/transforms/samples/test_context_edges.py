@@ -152,7 +152,7 @@ def test_agrees_with_loops_over_entries(scene, data, rates):
     found = drawn.neighbors.drop("protocol", "dataset", "subset")
     assert found.rows() == [(*row[:4], float(np.float32(row[4] / 2000))) for row in around]
     counts = (len(clock), len(samples), len(around), collisions, crowded_out)
-    assert drawn.sample_counts.drop("protocol", "dataset", "subset").row(0) == counts
+    assert drawn.sample_counts.drop("protocol", "dataset", "subset", "all_collisions").row(0) == counts
 
 
 def test_the_scenes_give_samples_and_collisions():

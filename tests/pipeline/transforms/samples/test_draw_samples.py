@@ -46,7 +46,16 @@ def make_findings(rows):
 
 
 def draw(
-    entries, *, early=(), missing=(), findings=(), protocol=SHORT, first_frame=0, frame_rate_hz=10.0, excluded=False
+    entries,
+    *,
+    early=(),
+    missing=(),
+    findings=(),
+    protocol=SHORT,
+    first_frame=0,
+    frame_rate_hz=10.0,
+    excluded=False,
+    last_lane=None,
 ):
     """Draw, validate, and check that nothing is lost: tables and {reason: entries}."""
     ids = sorted({vehicle for vehicle, *_ in entries})
@@ -65,6 +74,7 @@ def draw(
         first_frame=first_frame,
         frame_rate_hz=frame_rate_hz,
         excluded=excluded,
+        last_lane=last_lane,
     )
     SAMPLES.validate(drawn.samples, where="test")
     SAMPLE_DROPS.validate(drawn.sample_drops, where="test")
@@ -85,6 +95,34 @@ def count(drawn, name):
 
 def drive(vehicle, frames, *, lane=1, x_m=0.0):
     return [(vehicle, frame, x_m + frame, lane) for frame in frames]
+
+
+def test_lanes_beyond_the_last_count_as_the_last():
+    """1 changes from lane 6 to 7, abreast of 2, 20 m ahead in lane 8: of no meaning where lanes from 6 on are one."""
+    entries = [(1, frame, float(frame), 6 if frame < 10 else 7) for frame in range(21)] + drive(
+        2, range(21), lane=8, x_m=20
+    )
+    drawn, _ = draw(entries)
+    assert set(drawn.samples.filter(vehicle_id=1)["lateral_maneuver"]) == {"right"}
+    assert set(drawn.neighbors.filter(vehicle_id=1)["cell"]) == {26 + 10}, "the right lane, from frame 10 on"
+    folded, _ = draw(entries, last_lane=6)
+    assert set(folded.samples["lateral_maneuver"]) == {"keep"}
+    assert set(folded.samples["lane"]) == {6}
+    ahead = folded.neighbors.filter(vehicle_id=1)
+    assert (ahead.height, set(ahead["cell"])) == (folded.samples.filter(vehicle_id=1).height, {13 + 10}), "the own lane"
+
+
+def test_collisions_are_counted_over_all_entries_at_10_hz():
+    """Three vehicles within 2 m of each other in 21 frames: each of the 63 grids has two others in one cell."""
+    entries = drive(1, range(21)) + drive(2, range(21), x_m=1) + drive(3, range(21), x_m=2)
+    drawn, _ = draw(entries)
+    assert (count(drawn, "all_collisions"), count(drawn, "collisions")) == (63, drawn.samples.height)
+    excluded, _ = draw(entries, excluded=True)
+    assert (count(excluded, "all_collisions"), count(excluded, "collisions")) == (63, 0)
+    slower, _ = draw(entries, frame_rate_hz=5.0)
+    assert count(slower, "all_collisions") is None
+    unknown, _ = draw([*entries, (4, 0, 0.0, None)])
+    assert count(unknown, "all_collisions") is None
 
 
 def test_history_and_future_are_inclusive():

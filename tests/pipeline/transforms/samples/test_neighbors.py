@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.samples import neighbors as module
-from tracklake.pipeline.transforms.samples.neighbors import NEIGHBOR_DTYPES, find_neighbors
+from tracklake.pipeline.transforms.samples.neighbors import NEIGHBOR_DTYPES, count_collisions, find_neighbors
 from tracklake.schemas.errors import TracklakeError
 
 CELL_M = Fraction("4.572")
@@ -223,12 +223,14 @@ def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_chunks(entri
     random.shuffle(shuffled)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "CHUNK_ROWS", chunk_rows)
-        found = find_neighbors(make_clock([(v, t, x / 1000, lane) for v, t, x, lane in shuffled]))
+        clock = make_clock([(v, t, x / 1000, lane) for v, t, x, lane in shuffled])
+        found, counted = find_neighbors(clock), count_collisions(clock)
     names = ("vehicle_id", "tick", "cell", "neighbor_id")
     rows = found.neighbors.sort("vehicle_id", "tick", "cell")
     assert rows.select(names).rows() == [row[:4] for row in expected]
     assert rows["dx_m"].to_list() == [float(np.float32(float(row[4]))) for row in expected]
     assert (found.collisions, found.crowded_out) == (collisions, crowded_out)
+    assert counted == collisions
 
 
 @pytest.mark.parametrize("grain_mm", [1, 2_000])
@@ -241,7 +243,9 @@ def test_crowded_road_agrees_with_the_loop(grain_mm):
         for tick in (4, 5)
     ]
     expected, collisions, crowded_out = slow_neighbors(entries)
-    found = find_neighbors(make_clock([(v, t, x / 1000, lane) for v, t, x, lane in entries]))
+    clock = make_clock([(v, t, x / 1000, lane) for v, t, x, lane in entries])
+    found, counted = find_neighbors(clock), count_collisions(clock)
     assert found.neighbors.select("vehicle_id", "tick", "cell", "neighbor_id").rows() == [row[:4] for row in expected]
     assert (found.collisions, found.crowded_out) == (collisions, crowded_out)
+    assert counted == collisions
     assert crowded_out > 0
