@@ -23,6 +23,12 @@ class Settings(BaseSettings):
     )
 
     lake: Path = Field(Path("lake"), description="folder of the lake")
+    columns: Path | None = Field(None, description="mapping of the columns of raw files in a format of their own")
+    recording: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
+        description="name of the recording of a file without usable times; none: the file's name",
+    )
     workers: int = Field(min(os.cpu_count() or 1, 4), ge=1, description="recordings worked on at once")
     runner: Literal["threads", "dask"] = Field(
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"

@@ -19,7 +19,7 @@ from tracklake.schemas.errors import TracklakeError
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
 
-Dataset = Literal["ngsim", "highd"]
+Dataset = Literal["ngsim", "highd", "custom"]
 DATASETS: tuple[Dataset, ...] = get_args(Dataset)
 Origin = Literal["recorded", "synthetic"]
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
@@ -77,7 +77,7 @@ def column(
     )
 
 
-DATASET = column(pl.String, "ngsim or highd", isin=DATASETS)
+DATASET = column(pl.String, "ngsim, highd, or custom (read with --columns)", isin=DATASETS)
 SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording")
 PROTOCOL = column(pl.String, "named, hashed recipe of sampling, split and metrics")
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from typing_extensions import TypedDict
 
-Dataset = Annotated[str, "ngsim or highd"]
+Dataset = Annotated[str, "ngsim, highd or custom"]
 Subset = Annotated[str, "one carriageway (arterials: one direction) of one recording"]
 SubsetOrAll = Annotated[str | None, "one subset; null: the whole dataset"]
 Recording = Annotated[str, "one continuous camera recording"]

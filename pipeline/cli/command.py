@@ -73,13 +73,22 @@ def report_failure(terminal: Terminal, message: str, code: int = FAILED) -> type
     return typer.Exit(code)
 
 
-def read_settings(*, lake: Path | None = None, workers: int | None = None, protocol: str | None = None) -> Settings:
+def read_settings(
+    *,
+    lake: Path | None = None,
+    workers: int | None = None,
+    protocol: str | None = None,
+    columns: Path | None = None,
+    recording: str | None = None,
+) -> Settings:
     """Read the settings from file and environment, with the given flags on top.
 
     Raises:
         UsageError: `tracklake.toml` or an environment variable cannot be read.
     """
     flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
+    # Absolute, so that a worker in another folder finds the same file.
+    flags |= {"columns": None if columns is None else columns.absolute(), "recording": recording}
     try:
         return Settings(**{name: value for name, value in flags.items() if value is not None})
     except (TOMLDecodeError, UnicodeDecodeError, OSError) as error:

@@ -6,12 +6,14 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import (
+    ColumnsOption,
     DatasetOption,
     JsonOption,
     LakeOption,
     PruneOption,
     QuietOption,
     RebuildOption,
+    RecordingOption,
     ReplaceOption,
     WorkersOption,
 )
@@ -22,6 +24,8 @@ def ingest(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="A raw file, or a folder of any mix of them.")],
     lake: LakeOption = None,
     dataset: DatasetOption = None,
+    columns: ColumnsOption = None,
+    recording: RecordingOption = None,
     workers: WorkersOption = None,
     replace: ReplaceOption = False,
     prune: PruneOption = False,
@@ -31,7 +35,7 @@ def ingest(
 ) -> None:
     """Read raw files into tracks, vehicles and subsets (the format is detected)."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers)
+        settings = read_settings(lake=lake, workers=workers, columns=columns, recording=recording)
         flags: dict[str, Any] = {"replace": replace, "prune": prune, "rebuild": rebuild}
         outcome = run_steps(terminal, settings, ("ingest",), source, dataset, **flags)
         report_result(terminal, settings, outcome, headline=False)

@@ -19,7 +19,16 @@ ProtocolOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
-DatasetOption = Annotated[str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim or highd.")]
+DatasetOption = Annotated[
+    str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim, highd or custom.")
+]
+ColumnsOption = Annotated[
+    Path | None,
+    typer.Option("--columns", metavar="FILE", help="TOML file that names the columns of SOURCE (docs/data.md)."),
+]
+RecordingOption = Annotated[
+    str | None, typer.Option("--recording", help="Name of the recording, where a file's times do not tell it.")
+]
 ReplaceOption = Annotated[
     bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
 ]

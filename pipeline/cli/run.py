@@ -7,6 +7,7 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.generated_sample import provide_sample, refuse_mixing
 from tracklake.pipeline.cli.options import (
+    ColumnsOption,
     DatasetOption,
     JsonOption,
     LakeOption,
@@ -15,6 +16,7 @@ from tracklake.pipeline.cli.options import (
     PruneOption,
     QuietOption,
     RebuildOption,
+    RecordingOption,
     ReplaceOption,
     SeedOption,
     WorkersOption,
@@ -29,6 +31,8 @@ def run(
     ] = None,
     lake: LakeOption = None,
     dataset: DatasetOption = None,
+    columns: ColumnsOption = None,
+    recording: RecordingOption = None,
     protocol: ProtocolOption = None,
     workers: WorkersOption = None,
     replace: ReplaceOption = False,
@@ -41,7 +45,7 @@ def run(
 ) -> None:
     """Run the whole pipeline: raw files to tables, checks, samples, split, tensors, first score and report."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol, columns=columns, recording=recording)
         check = refuse_mixing if source is None else None
         if source is None:
             if prune or rebuild:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from tracklake.pipeline.lake.manifest import MANIFEST
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
+from tracklake.pipeline.sources.column_mapping import ColumnMapping
 from tracklake.pipeline.sources.csv import (
     ARCHIVE_SUFFIX,
     ArchiveContents,
@@ -20,6 +21,7 @@ from tracklake.pipeline.sources.csv import (
     list_members,
     read_head,
 )
+from tracklake.pipeline.sources.ngsim_heading import MAPPED, read_heading
 from tracklake.pipeline.sources.source import Unit
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import write_file
@@ -55,19 +57,28 @@ class Discovery:
     recognised: tuple[RawFile, ...] = ()
 
 
-def discover(source: Path, *, dataset: str | None = None, digest: Callable[[RawFile], str]) -> Discovery:
+def discover(
+    source: Path,
+    *,
+    dataset: str | None = None,
+    digest: Callable[[RawFile], str],
+    mapping: ColumnMapping | None = None,
+    recording: str = "",
+) -> Discovery:
     """Find and group the raw files of a file or folder.
 
     Args:
         source: a file, or a folder searched at any depth (hidden folders apart); an archive is a folder.
         dataset: take files for this dataset only.
         digest: sha256 of a file's bytes; it may raise SourceError.
+        mapping: the user's description of columns; files that have them are read by it.
+        recording: the user's name for the recording of a file that does not tell it.
 
     Raises:
         SourceError: nothing there, or nothing recognised in it.
     """
     candidates = _list_candidates(source)
-    search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest)
+    search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest, mapping, recording)
     for path in candidates:
         search.sort_file(_open_raw(path, source))
     search.hash_files()
@@ -101,8 +112,17 @@ def recognise(source: Path, dataset: str) -> list[RawFile]:
 class _Search:
     """The results of a search that is going on."""
 
-    def __init__(self, sources: list[Source], source: Path, digest: Callable[[RawFile], str]) -> None:
+    def __init__(
+        self,
+        sources: list[Source],
+        source: Path,
+        digest: Callable[[RawFile], str],
+        mapping: ColumnMapping | None = None,
+        recording: str = "",
+    ) -> None:
         self.sources = sources
+        self._mapping = mapping
+        self._recording = recording
         self.recognised: dict[str, list[RawFile]] = {item.name: [] for item in sources}
         self.refusals: list[str] = []
         self.skipped: list[str] = []
@@ -146,10 +166,15 @@ class _Search:
         except NoTableError as unknown:
             self._skip_or_refuse(file, str(unknown))
             return
-        found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.filename)) is not None)
+        file = replace(file, recording=self._recording)
+        if self._mapping is not None and read_heading(head, file.name, self._mapping) is not None:
+            mapped = replace(file, dialect=MAPPED, columns=self._mapping.model_dump_json(exclude_defaults=True))
+            self._found += [(item, mapped) for item in self.sources if item.name == self._mapping.dataset]
+            return
+        found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.name)) is not None)
         source, dialect = next(found, (None, ""))
         if source is None:
-            self._skip_or_refuse(file, _explain_unknown(file.name, head, self.sources))
+            self._skip_or_refuse(file, _explain_unknown(file.name, head, self.sources, self._mapping))
             return
         self._found.append((source, replace(file, dialect=dialect)))
 
@@ -217,14 +242,16 @@ def _describe_formats(sources: list[Source]) -> str:
     return "; ".join(item.signature for item in sources)
 
 
-def _explain_unknown(name: str, head: bytes, sources: list[Source]) -> str:
+def _explain_unknown(name: str, head: bytes, sources: list[Source], mapping: ColumnMapping | None) -> str:
     if not head.strip():
         return f"{name}: empty file. Expected {_describe_formats(sources)}. Download it again."
     line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
     shown = line if len(line) <= 100 else f"{line[:100]}..."
+    advice = "Name its columns with --columns (docs/data.md). Move the file out of the folder, or restore its header."
+    if mapping is not None:
+        advice = f"Nor has it the columns of the mapping: {', '.join(map(str, mapping.columns.values()))}. Correct it."
     return (
-        f"{name}, line 1: not a known trajectory file. Expected {_describe_formats(sources)}. Got {shown!r}. "
-        "Move the file out of the folder, or restore its header."
+        f"{name}, line 1: not a known trajectory file. Expected {_describe_formats(sources)}. Got {shown!r}. {advice}"
     )
 
 

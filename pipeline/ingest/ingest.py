@@ -46,6 +46,9 @@ class FileContents:
     rows_read: int
     recordings: list[str]
     unassigned: int
+    columns: str
+    recording: str
+    notes: tuple[str, ...]
 
 
 def find_unread_files(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
@@ -59,7 +62,11 @@ def find_unread_files(discovery: Discovery, manifest: Manifest) -> list[tuple[So
 
 def _find_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[str, Any] | None:
     contents = manifest.sources.get(file.sha256)
-    return contents if contents is not None and contents["version"] == source.version else None
+    if contents is None or contents["version"] != source.version or contents["dataset"] != source.name:
+        return None
+    # Older lakes know no mappings.
+    read_by = (contents.get("columns", ""), contents.get("recording", ""))
+    return contents if read_by == (file.columns, file.recording) else None
 
 
 def locate_spill(root: Path, file: RawFile) -> Path:
@@ -88,6 +95,9 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
             rows_read=spilled.rows_read,
             recordings=sorted(spilled.recordings),
             unassigned=spilled.rejects.height if len(spilled.recordings) > 1 else 0,
+            columns=file.columns,
+            recording=file.recording,
+            notes=spilled.notes,
         )
     )
 
@@ -151,7 +161,11 @@ def find_lost(job: Job, commit: Commit) -> list[dict[str, Any]]:
 
 
 def _make_job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:
-    sources = [{"file": file.name, "sha256": file.sha256, "dialect": file.dialect} for file in files]
+    sources = [
+        {"file": file.name, "sha256": file.sha256, "dialect": file.dialect}
+        | ({"columns": file.columns} if file.columns else {})
+        for file in files
+    ]
     job = make_job(
         f"ingest/{dataset}/{title}",
         version_of_stage=VERSION,
@@ -205,7 +219,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
     if not canonical.subsets:
         raise SourceError(_explain_emptiness(recording, canonical))
     info = {
-        "notes": [*canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
+        "notes": [*_recall_notes(root, job), *canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
@@ -243,6 +257,14 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
         for file in files
         if rows[file.sha256] == SPREADSHEET_ROWS
     ]
+
+
+def _recall_notes(root: Path, job: Job) -> list[str]:
+    """Return the notes about how files were read, with the first recording of each file."""
+    known = load(root).sources
+    contents = [known[file.sha256] for file in list_files(job) if file.sha256 in known]
+    named = (found for found in contents if found["recordings"][:1] == [job.inputs["recording"]])
+    return [note for found in named for note in found.get("notes", ())]
 
 
 def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:

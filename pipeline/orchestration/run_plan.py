@@ -19,6 +19,7 @@ from tracklake.pipeline.lake import (
     open_for_writing,
 )
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources.column_mapping import load_mapping
 from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage
@@ -163,7 +164,15 @@ def survey_source(request: RunRequest) -> Discovery:
     if request.source is None:
         raise ValueError("a request to ingest needs a source")
     digests = Digests(request.root)
-    discovery = discover(request.origin, dataset=request.dataset, digest=digests)
+    settings = request.get_settings()
+    mapping = None if settings.columns is None else load_mapping(settings.columns)
+    discovery = discover(
+        request.origin,
+        dataset=request.dataset,
+        digest=digests,
+        mapping=mapping,
+        recording=settings.recording or "",
+    )
     digests.save()
     return discovery
 

@@ -1,9 +1,10 @@
 """The sources: one file per dataset that tracklake reads, listed here and nowhere else."""
 
+from tracklake.pipeline.sources.custom import CUSTOM
 from tracklake.pipeline.sources.highd import HIGHD
 from tracklake.pipeline.sources.ngsim import NGSIM
 from tracklake.pipeline.sources.source import RawFile, Source, SourceError
 
-SOURCES: tuple[Source, ...] = (HIGHD, NGSIM)
+SOURCES: tuple[Source, ...] = (HIGHD, NGSIM, CUSTOM)
 
 __all__ = ["SOURCES", "RawFile", "Source", "SourceError"]

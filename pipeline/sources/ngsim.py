@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +10,32 @@ import polars as pl
 
 from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account_rows, split_duplicates
 from tracklake.pipeline.sources.assembly import assemble_subset
+from tracklake.pipeline.sources.column_mapping import NGSIM_RATE_HZ, ColumnMapping, suggest_mapping
 from tracklake.pipeline.sources.completeness import Announced, compare_counts
-from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, Chunk, map_chunks, read_head
+from tracklake.pipeline.sources.csv import (
+    DIGITS_LOST,
+    REJECT_SCHEMA,
+    Chunk,
+    map_chunks,
+    read_chunks,
+    read_head,
+)
 from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
 from tracklake.pipeline.sources.ngsim_dialects import (
     SITES,
     Site,
-    build_layout,
-    detect,
     find_origin,
     find_site,
+    name_file,
     name_recording,
+)
+from tracklake.pipeline.sources.ngsim_heading import CSV_BARE, MAPPED, TEXT, Heading, detect, read_heading, refine
+from tracklake.pipeline.sources.ngsim_plausibility import (
+    Verdict,
+    find_contradictions,
+    find_order,
+    judge,
+    measure,
 )
 from tracklake.pipeline.sources.source import (
     Canonical,
@@ -35,11 +51,10 @@ from tracklake.pipeline.sources.source import (
 from tracklake.pipeline.transforms.tracks.identities import identify_vehicles
 from tracklake.pipeline.transforms.tracks.orientation import DIRECTIONS, orient_ngsim
 from tracklake.schemas import references
-from tracklake.schemas.columns import FOOT_M
+from tracklake.schemas.columns import FOOT_M, Dataset
 from tracklake.schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
-FRAME_RATE_HZ = 10.0
 CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
 DECIMALS = 6
 """Decimals that measurements are rounded to. The originals have three; files rewritten by other programs hold
@@ -53,6 +68,9 @@ KEY = pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64)
 
 PARSING_THREADS = 3
 """Chunks of one file parsed at once; more threads cost memory and help little, since the parser is threaded too."""
+
+SAMPLE_BYTES = 4 << 20
+"""Size of the first part of a file that is judged before the file is read, in bytes."""
 
 MAX_RECORDINGS = 200
 """Most recordings a file may hold: if the largest ones do not have half of its rows, times or frames are wrong."""
@@ -76,22 +94,24 @@ def group(files: Sequence[RawFile]) -> Grouping:
 def spill_file(file: RawFile, folder: Path) -> Spilled:
     """Read a file of any NGSIM dialect chunk by chunk into a folder per recording.
 
-    Global_Time - 100 * Frame_ID is constant within a recording and identifies it. Rows go to
-    `<folder>/<recording>/<chunk>.arrow` with the columns of schemas.RAW_NGSIM without Location.
+    Global_Time - 100 * Frame_ID is constant within a recording and identifies it; a file without usable times is one
+    recording. Rows go to `<folder>/<recording>/<chunk>.arrow` with the columns of schemas.RAW_NGSIM without Location.
+
+    Raises:
+        SourceError: the columns are not what they are called, or times tell no recordings apart.
     """
-    layout = build_layout(read_head(file), file.dialect, where=file.name)
-    absent = [
-        pl.lit(None, dtype).alias(name)
-        for name, dtype in RAW_NGSIM.dtypes.items()
-        if name not in (LINE, *layout.dtypes)
-    ]
+    mapping = read_mapping(file)
+    found = read_heading(read_head(file), file.name, mapping)
+    if found is None:
+        raise SourceError(f"{file.name}: no longer the file that was recognised. Run again.")
+    heading, verdict = _inspect(file, found, mapping)
+    own_name = None if _tells_recordings(heading, mapping) else name_file(file, mapping.site if mapping else None)
 
     def spill_chunk(number: int, chunk: Chunk) -> tuple[Counter[str], pl.DataFrame, int]:
         counts: Counter[str] = Counter()
-        raw = RAW_NGSIM.validate(chunk.frame.with_columns(absent).select(*RAW_NGSIM.dtypes), where=file.name)
-        for share, (recording, rows) in enumerate(
-            _split_recordings(raw.with_columns(pl.col(pl.Float64).round(DECIMALS)))
-        ):
+        raw = RAW_NGSIM.validate(_to_raw(chunk.frame, heading), where=file.name)
+        parts = _split_recordings(raw) if own_name is None else [(own_name, raw.drop("Location"))]
+        for share, (recording, rows) in enumerate(parts):
             counts[recording] += rows.height
             target = folder / recording
             target.mkdir(parents=True, exist_ok=True)
@@ -100,11 +120,97 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
         _require_constant_keys(counts, file)
         return counts, chunk.rejects, chunk.rows_read
 
-    spilled = list(map_chunks(file, layout, spill_chunk, threads=PARSING_THREADS))
+    spilled = list(map_chunks(file, heading.to_layout(), spill_chunk, threads=PARSING_THREADS))
     recordings = sum((counts for counts, _, _ in spilled), Counter())
     _require_constant_keys(recordings, file)
     rejects = pl.concat([pl.DataFrame(schema=REJECT_SCHEMA), *(rejects for _, rejects, _ in spilled)])
-    return Spilled(dict(recordings), sum(rows_read for _, _, rows_read in spilled), rejects)
+    rows_read = sum(rows_read for _, _, rows_read in spilled)
+    return Spilled(dict(recordings), rows_read, rejects, tuple(f"{file.name}: {note}" for note in verdict.notes))
+
+
+def read_mapping(file: RawFile) -> ColumnMapping | None:
+    """Return the user's description of a file's columns, if there is one."""
+    return ColumnMapping.model_validate_json(file.columns) if file.columns else None
+
+
+def _tells_recordings(heading: Heading, mapping: ColumnMapping | None) -> bool:
+    """Return whether the times of a file tell its recordings apart."""
+    return "Global_Time" in heading.names and (mapping is None or mapping.dataset == "ngsim")
+
+
+def _inspect(file: RawFile, heading: Heading, mapping: ColumnMapping | None) -> tuple[Heading, Verdict]:
+    """Judge the first rows of a file before any is written; returns how to read it.
+
+    Raises:
+        SourceError: the columns are not what they are called.
+    """
+    tells = _tells_recordings(heading, mapping)
+    layout = heading.to_layout()
+    layout = replace(layout, required=layout.required - {"Global_Time"})
+    chunk = next(read_chunks(file, layout, chunk_bytes=SAMPLE_BYTES), None)
+    if chunk is None or not chunk.rows_read:
+        return heading, Verdict()
+    sample = _to_raw(chunk.frame, heading)
+    if heading.dialect in (CSV_BARE, TEXT) and 2 * sample.height < chunk.rows_read:
+        reason, rows = chunk.rejects["reason"].value_counts(sort=True).row(0)
+        if not reason.startswith(DIGITS_LOST):
+            problem = f"{rows:,} of the first {chunk.rows_read:,} rows: {reason}"
+            raise SourceError(_explain_problems(file, heading, Verdict(problems=[problem]), sample))
+    if sample.is_empty():
+        return heading, Verdict()
+    timed = sample.filter(pl.col("Global_Time").is_not_null())
+    use_time = 2 * timed.height >= sample.height
+    verdict = judge(measure(timed if use_time else sample, mapping.rate_hz if mapping else NGSIM_RATE_HZ))
+    if not use_time:
+        verdict.use_time = False
+        verdict.notes.insert(0, "Global_Time is missing, so the frames tell one recording")
+    elif heading.units.get("Global_Time") == "s":
+        verdict.notes.insert(0, "Global_Time is in seconds, and is read as such")
+    elif not tells and mapping is None:
+        verdict.notes.insert(0, "no times tell its recordings apart, so it is read as one")
+    if heading.dialect in (CSV_BARE, TEXT) and verdict.use_time:
+        verdict.problems += find_contradictions(sample)
+    if mapping is not None and verdict.units:
+        verdict.problems += verdict.notes  # the user has said what the units are
+    if verdict.problems:
+        raise SourceError(_explain_problems(file, heading, verdict, sample))
+    return refine(heading, verdict.units, use_time=verdict.use_time), verdict
+
+
+def _explain_problems(file: RawFile, heading: Heading, verdict: Verdict, sample: pl.DataFrame) -> str:
+    start = (
+        f"{file.name}: its columns are not what they are called: {'; '.join(verdict.problems)}. Expected NGSIM's "
+        "columns in feet, ft/s and ms"
+    )
+    if heading.dialect == MAPPED:
+        return f"{start}, or what the mapping says. Correct the mapping."
+    if heading.dialect not in (CSV_BARE, TEXT):
+        return (
+            f"{start}, or units behind the names, as in `Local_X(m)`. Correct the header, or "
+            "name the columns with `--columns` (docs/data.md)."
+        )
+    order = find_order(sample)
+    numbers = {name: number for number, name in enumerate(heading.names, start=1) if name in RAW_NGSIM.columns}
+    guesses = {name: numbers[order.get(name, name)] for name in numbers} if order else {}
+    fitting = "The order below fits; check it" if order else "No order is known that fits; replace each `?`"
+    return (
+        f"{start}, in the order of the original files, since it has no header. {fitting}, write it to columns.toml, "
+        f"and run again with `--columns columns.toml` (docs/data.md).\n\n{suggest_mapping(guesses)}"
+    )
+
+
+def _to_raw(frame: pl.DataFrame, heading: Heading) -> pl.DataFrame:
+    """Turn parsed rows into the columns of schemas.RAW_NGSIM: NGSIM's units, and null for missing columns."""
+    factors = heading.factors
+    converted = [
+        (pl.col(name) * factor).round(0 if name == "Global_Time" else DECIMALS).cast(RAW_NGSIM.dtypes[name])
+        for name, factor in factors.items()
+    ]
+    absent = [pl.lit(None, dtype).alias(name) for name, dtype in RAW_NGSIM.dtypes.items() if name not in frame.columns]
+    rows = frame.with_columns(*converted, *absent)
+    if "Global_Time" not in heading.names:
+        rows = rows.with_columns(Global_Time=100 * pl.col("Frame_ID").cast(pl.Int64))
+    return rows.select(*RAW_NGSIM.dtypes).with_columns(pl.col(pl.Float64).round(DECIMALS))
 
 
 def _require_constant_keys(counts: Counter[str], file: RawFile) -> None:
@@ -131,8 +237,10 @@ def _split_recordings(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
         yield name_recording(key, location), part.drop("key", "Location")
 
 
-def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
+def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset = "ngsim") -> Canonical:
     """Turn the spilled rows of one recording, a part per file that holds some of it, into its tables."""
+    mapping = read_mapping(parts[0].file)
+    rate_hz = mapping.rate_hz if mapping else NGSIM_RATE_HZ
     shares = [
         part.rows.collect().with_columns(pl.lit(index, pl.Int64).alias(FILE))
         for index, part in enumerate(parts)
@@ -142,19 +250,20 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     raw, derived = split_derived(raw, shares, ["Vehicle_ID", "Frame_ID", "Local_X", "Local_Y"])
     rows, duplicates = split_duplicates(raw, ["Vehicle_ID", "Frame_ID"])
     dropped = [(derived, IN_FULLER_FILE), (duplicates, DUPLICATE)]
-    log, rejects = account_rows("ngsim", recording, parts, [share.height for share in shares], dropped)
-    site_name = find_site(recording)
+    log, rejects = account_rows(dataset, recording, parts, [share.height for share in shares], dropped)
+    site_name = find_site(recording) if dataset == "ngsim" or mapping is None else mapping.site or recording
     one_direction = rows["Direction"].is_null().all()
-    site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", None, (), "")
+    site = SITES.get(site_name) or Site(site_name, one_direction, "unknown", mapping.lanes if mapping else None, (), "")
     first_frame, last_frame = rows.select(first=pl.col("Frame_ID").min(), last=pl.col("Frame_ID").max()).row(0)
     recording_facts: dict[str, Any] = {
+        "dataset": dataset,
         "recording": recording,
         "site": site.name,
         "origin": find_origin(rows.select(KEY.unique()).to_series().to_list()),
         "freeway": site.freeway,
-        "frame_rate_hz": FRAME_RATE_HZ,
+        "frame_rate_hz": rate_hz,
         "lanes": site.lanes,
-        "seconds": (last_frame - first_frame + 1) / FRAME_RATE_HZ,
+        "seconds": (last_frame - first_frame + 1) / rate_hz,
         "first_frame": first_frame,
         "on_ramp_lanes": list(site.on_ramp_lanes),
         "lane_markings_m": None,
@@ -173,7 +282,7 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             subsets.append(_to_subset(entries, f"{recording}-{direction}", oriented_as, facts, files))
     totals = PUBLISHED_TOTALS.get(recording, {})
     announced = Announced(totals, totals_by=PUBLISHED, vehicles=None, vehicles_by=TOTAL_FRAMES)
-    completeness = compare_counts("ngsim", recording, subsets, announced, log)
+    completeness = compare_counts(dataset, recording, subsets, announced, log)
     notes = (*_describe_subsets(subsets), *completeness.notes)
     return Canonical(tuple(subsets), log, rejects, completeness.table, notes)
 
@@ -194,7 +303,7 @@ def _to_subset(
     identified = identify_vehicles(
         entries,
         constants=CONSTANTS,
-        frame_rate_hz=FRAME_RATE_HZ,
+        frame_rate_hz=facts["frame_rate_hz"],
         announced="Total_Frames",
         one_way=facts["freeway"],
     )
@@ -211,7 +320,7 @@ def _to_subset(
     return assemble_subset(
         entries.drop(*CONSTANTS, "source_id", "leader_source_id", "follower_source_id"),
         sizes,
-        dataset="ngsim",
+        dataset=facts["dataset"],
         name=name,
         facts={**facts, "ids_split": identified.ids_split, "columns_missing": sorted(missing)},
         use_recorded_headway=True,

@@ -1,15 +1,14 @@
 """NGSIM's dialects as data: the fields of a file, their names, and the names of recordings."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from zoneinfo import ZoneInfo
 
-from tracklake.pipeline.sources.csv import BOM, LINE, NULL_WORDS, UNNAMED, Layout
-from tracklake.pipeline.sources.source import SourceError
+from tracklake.pipeline.sources.source import RawFile
 from tracklake.schemas.columns import Origin
-from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 TEXT_FIELDS = (
     *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y"),
@@ -26,29 +25,51 @@ EXPORT_FIELDS = (
 )
 """Columns of the portal's export, in order."""
 
-ALIASES = {
-    "tot_frames": "Total_Frames",
-    "epoch_ms": "Global_Time",
-    "veh_len": "v_length",
-    "veh_wid": "v_Width",
-    "veh_class": "v_Class",
-    "veh_velocity": "v_Vel",
-    "vehicle_acc": "v_Acc",
-    "org_zone": "O_Zone",
-    "dest_zone": "D_Zone",
-    "intersection": "Int_ID",
-    "section": "Section_ID",
-    "preceding_veh": "Preceding",
-    "following_veh": "Following",
-    "spacing": "Space_Headway",
-    "headway": "Time_Headway",
-    **{name.lower(): name for name in EXPORT_FIELDS},
+_ALSO = {
+    "Vehicle_ID": ("vehicleidentificationnumber", "vehicleidentification", "vehid"),
+    "Frame_ID": ("frameidentificationnumber", "frameidentification", "framenumber"),
+    "Total_Frames": ("totframes", "totalframe"),
+    "Global_Time": ("epochms", "globaltimeepochtime"),
+    "v_length": ("vehlen", "vlen", "vehiclelength"),
+    "v_Width": ("vehwid", "vwid", "vehiclewidth"),
+    "v_Class": ("vehclass", "vehicleclass"),
+    "v_Vel": ("vehvelocity", "vehiclevelocity", "vvelocity", "vehiclespeed", "localvelocity"),
+    "v_Acc": ("vehicleacc", "vehicleacceleration", "vacceleration", "localaccel"),
+    "Lane_ID": ("laneidentification", "lanenumber"),
+    "O_Zone": ("orgzone",),
+    "D_Zone": ("destzone",),
+    "Int_ID": ("intersection",),
+    "Section_ID": ("section",),
+    "Preceding": ("precedingveh", "precedingvehicle", "precedingvehicleid", "preceeding"),
+    "Following": ("followingveh", "followingvehicle", "followingvehicleid"),
+    "Space_Headway": ("spacing", "spacehdwy"),
+    "Time_Headway": ("headway", "timehdwy"),
 }
-"""Names that headers use, in lower case, and the raw schema's name of each."""
+ALIASES = {
+    **{name.lower().replace("_", ""): name for name in EXPORT_FIELDS},
+    **{alias: name for name, aliases in _ALSO.items() for alias in aliases},
+}
+"""Names that headers use, in lower case without blanks and underscores, and the raw schema's name of each."""
+
+_OFTEN = {
+    "Vehicle_ID": ("id", "vehicle", "veh", "carid", "trackid", "agentid", "objectid"),
+    "Frame_ID": ("frame", "frameno", "timestep", "step"),
+    "Global_Time": ("time", "t", "timestamp", "epoch"),
+    "Local_X": ("lateral", "lat", "laterallocation", "ylocal"),
+    "Local_Y": ("longitudinal", "along", "position", "long"),
+    "v_length": ("length", "len"),
+    "v_Width": ("width",),
+    "v_Class": ("class", "type", "vehicletype"),
+    "v_Vel": ("v", "vel", "velocity", "speed"),
+    "v_Acc": ("a", "acc", "accel", "acceleration"),
+    "Lane_ID": ("lane",),
+    "Preceding": ("leader", "leaderid", "precedingid", "lead"),
+    "Following": ("follower", "followerid", "followingid"),
+}
+GUESSES = {alias: name for name, aliases in _OFTEN.items() for alias in aliases}
+"""Likely meanings of names that are not NGSIM's, for the mapping that a refusal suggests."""
 
 LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
-ESSENTIAL = ("Vehicle_ID", "Frame_ID", "Global_Time", "Local_X", "Local_Y", "v_Vel")
-TEXT, CSV = "ngsim-text", "ngsim-csv"
 
 
 @dataclass(frozen=True)
@@ -145,72 +166,10 @@ def find_site(recording: str) -> str:
     return next((site for site in SITES if recording.startswith(f"{site}-")), UNKNOWN)
 
 
-def detect(head: bytes, _name: str) -> str | None:
-    """Recognise an NGSIM trajectory file by its first lines.
-
-    A header that names the essential columns, or a line of 18 numbers: separated by commas, or by blanks.
-    """
-    lines = head.removeprefix(BOM).decode("utf-8", errors="replace").splitlines()[:25]
-    if not lines:
-        return None
-    header = _canonical_names(lines[0])
-    if set(ESSENTIAL) <= set(header):
-        return CSV
-    if any(_are_numbers(line.split(",")) for line in lines):
-        return f"{CSV}-no-header"
-    return TEXT if any(_are_numbers(line.split()) for line in lines) else None
-
-
-def build_layout(head: bytes, dialect: str, *, where: str) -> Layout:
-    """Build the layout of a file of a dialect from its first bytes; `where` names the file in the message.
-
-    Raises:
-        SourceError: two columns have one meaning.
-    """
-    if dialect == CSV:
-        line = head.removeprefix(BOM).split(b"\n", 1)[0].decode("utf-8", errors="replace")
-        names = _make_unique(_canonical_names(line), where)
-    else:
-        names = TEXT_FIELDS
-    wanted = [name for name in RAW_NGSIM.columns if name in names and name != LINE]
-    return Layout(
-        names=names,
-        dtypes={name: RAW_NGSIM.dtypes[name] for name in wanted},
-        required=RAW_NGSIM.required & set(wanted),
-        # The portal's export has them in five columns; other columns may have them too.
-        thousands=frozenset(name for name in wanted if dialect == CSV and RAW_NGSIM.dtypes[name].is_numeric()),
-        bounds={name: limits for name, limits in RAW_NGSIM.bounds.items() if name in wanted},
-        choices={"Location": LOCATIONS} if "Location" in names else {},
-        header_lines=1 if dialect == CSV else 0,
-        blanks=dialect == TEXT,
-    )
-
-
-def _canonical_names(line: str) -> list[str]:
-    names = [field.strip().strip('"') for field in line.rstrip("\r\n").split(",")]
-    return [ALIASES.get(name.lower(), name) for name in names]
-
-
-def _make_unique(names: list[str], where: str) -> tuple[str, ...]:
-    """Make names unique: unknown fields are numbered if their name is missing, repeated or reserved."""
-    taken = {LINE, ""}
-    unique = []
-    for number, name in enumerate(names, start=1):
-        if name in taken and name in RAW_NGSIM.columns and name != LINE:
-            raise SourceError(
-                f"{where}, line 1: two columns stand for {name}. Expected one; remove or rename the other."
-            )
-        unique.append(f"{name}{UNNAMED}{number}" if name in taken else name)
-        taken.add(name)
-    return tuple(unique)
-
-
-def _are_numbers(fields: list[str]) -> bool:
-    """Whether a line's fields are the 18 numbers of a file without header; a few may be missing."""
-    if len(fields) != len(TEXT_FIELDS):
-        return False
-    try:
-        numbers = [float(field) for field in fields if field.strip().lower() not in ("", *NULL_WORDS)]
-    except ValueError:
-        return False
-    return len(numbers) >= len(RAW_NGSIM.required)
+def name_file(file: RawFile, site: str | None = None) -> str:
+    """Name the recording of a file that is one: as the user says, else after the file; the site comes first."""
+    name = file.recording
+    if not name:
+        stem = re.sub(r"(\.(csv|tsv|txt|dat|gz|parquet|feather|arrow|mat))+$", "", file.filename.lower())
+        name = re.sub(r"[^a-z0-9]+", "-", stem).strip("-") or UNKNOWN
+    return name if site is None or name.startswith(site) else f"{site}-{name}"

@@ -25,6 +25,8 @@ class RawFile:
         dialect: format of its lines; empty until recognised.
         sha256: hash of its bytes (a member's own, unpacked); empty until recognised.
         member: name of the member in its archive; None for a file of its own.
+        columns: the user's description of its columns, as JSON; empty without one.
+        recording: the user's name for the recording of a file that does not tell it; empty without one.
     """
 
     path: Path
@@ -32,6 +34,8 @@ class RawFile:
     dialect: str = ""
     sha256: str = ""
     member: str | None = None
+    columns: str = ""
+    recording: str = ""
 
     @property
     def folder(self) -> str:
@@ -67,11 +71,13 @@ class Spilled:
         recordings: number of rows by recording; the rows are in `<folder>/<recording>/*.arrow`.
         rows_read: number of data lines of the file.
         rejects: `line`, `reason`, `text` of lines that belong to no recording.
+        notes: messages for the user.
     """
 
     recordings: Mapping[str, int]
     rows_read: int
     rejects: pl.DataFrame
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,24 @@ KEYS = {
 """Global_Time - 100 * Frame_ID of the six freeway recordings, in the script's order of data sets."""
 
 
+def find_speeds(rows):
+    """Speed in ft/s of each (vehicle, frame), by its way since the frame before."""
+    along = {(v, f): float(y) for v, f, _, y, _ in rows}
+    return {(v, f): 10 * abs(y - along.get((v, f - 1), y)) for (v, f), y in along.items()}
+
+
 def write_ngsim(folder, recordings):
     """The original text: {recording: rows (Vehicle_ID, Frame_ID, Local_X, Local_Y, Lane_ID)}, numbers or text."""
     paths = []
     for recording, rows in recordings.items():
+        speeds = find_speeds(rows)
         named = [
-            ngsim_row(v, f, key=KEYS.get(recording, recording), Local_X=x, Local_Y=y, Lane_ID=lane, Total_Frames=99)
+            ngsim_row(
+                v, f, key=KEYS.get(recording, recording), Local_X=x, Local_Y=y, Lane_ID=lane, Total_Frames=99,
+                v_Vel=f"{speeds[v, f]:.2f}",
+            )
             for v, f, x, y, lane in rows
-        ]
+        ]  # fmt: skip
         paths.append(write(Path(folder) / f"{recording}.txt", as_text(named)))
     return paths
 

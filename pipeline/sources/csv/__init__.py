@@ -7,6 +7,7 @@ from tracklake.pipeline.sources.csv.archives import ARCHIVE_SUFFIX, ArchiveConte
 from tracklake.pipeline.sources.csv.line_bytes import BOM, LINE
 from tracklake.pipeline.sources.csv.raw_files import fetch_lines, hash_raw, measure_unpacked, read_head
 from tracklake.pipeline.sources.csv.reader import (
+    DIGITS_LOST,
     NULL_WORDS,
     REJECT_SCHEMA,
     UNNAMED,
@@ -20,6 +21,7 @@ from tracklake.pipeline.sources.csv.table_files import NoTableError
 __all__ = [
     "ARCHIVE_SUFFIX",
     "BOM",
+    "DIGITS_LOST",
     "LINE",
     "NULL_WORDS",
     "REJECT_SCHEMA",

@@ -50,7 +50,7 @@ def recognise_form(head: bytes) -> TextForm:
     text = head if codec is None else head.decode(codec, errors="ignore").encode()
     text = text.removeprefix(BOM)
     replacements = []
-    if b"\r" in text and b"\n" not in text:
+    if b"\r" in text.strip() and b"\n" not in text:
         replacements.append((b"\r", b"\n"))
         text = text.replace(b"\r", b"\n")
     lines = text.split(b"\n")

@@ -38,6 +38,9 @@ THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
 EXPONENT = r"^[+-]?\d(?:\.(\d*))?[eE]([+-]?\d{1,2})$"
 """Pattern of a number in scientific notation; its groups are the fraction and the exponent."""
 
+DIGITS_LOST = "digits lost in scientific notation (a spreadsheet rounded it)"
+"""Reason to reject a whole number of which not all digits were written."""
+
 NULL_WORDS = ("nan", "na", "n/a", "#n/a", "<na>", "null", "none")
 """Words in lower case that programs write for a missing value."""
 
@@ -289,8 +292,7 @@ def _list_value_reasons(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
         if layout.dtypes[name].is_integer():
             unread = cell.is_not_null() & pl.col(name).is_null()
             whole = cell.str.contains(r"^[+-]?\d+$")
-            lost = f"digits lost in scientific notation (a spreadsheet rounded it): {name}"
-            reasons.append(_reject_if(unread & _lost_digits(cell), lost))
+            reasons.append(_reject_if(unread & _lost_digits(cell), f"{DIGITS_LOST}: {name}"))
             reasons.append(_reject_if(unread & ~whole, f"not a plain whole number: {name}"))
             reasons.append(_reject_if(unread, f"out of range: {name}"))
     reasons += [_reject_if(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]

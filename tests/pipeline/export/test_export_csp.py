@@ -34,7 +34,9 @@ def make_rows(seed, vehicles=14):
         for row in range(length):
             y += steps[row]
             lane = int(lanes[0] if row < length // 2 else lanes[1])
-            rows.append((3 * place + 1, first + row, f"{random.uniform(0, 70):.3f}", f"{max(y, 0):.3f}", lane))
+            rows.append(
+                (3 * place + 1, first + row, f"{5 * place + random.uniform(0, 0.5):.3f}", f"{max(y, 0):.3f}", lane)
+            )
     return rows
 
 

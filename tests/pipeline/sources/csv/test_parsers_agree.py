@@ -10,7 +10,7 @@ from tracklake.pipeline.sources.csv.line_bytes import count_lines
 from tracklake.pipeline.sources.csv.reader import _parse_line_by_line, _parse_strictly
 from tracklake.pipeline.sources.highd import HIGHD_FORMAT
 from tracklake.pipeline.sources.levelx import RECORDING, TRACKS, VEHICLES
-from tracklake.pipeline.sources.ngsim_dialects import CSV, TEXT, build_layout
+from tracklake.pipeline.sources.ngsim_heading import CSV, CSV_BARE, TEXT, Heading
 
 
 def cells_of(text):
@@ -32,13 +32,13 @@ ROW_RECORDING = cells_of(
 
 
 def ngsim_layout(names, dialect=CSV):
-    return build_layout(",".join(names).encode() + b"\n", dialect, where="test")
+    return Heading(dialect, tuple(names), int(dialect == CSV), dialect == TEXT).to_layout()
 
 
 CASES = {
     "text": (ngsim_layout(TEXT_NAMES, TEXT), ROW_18),
     "plain": (ngsim_layout(TEXT_NAMES), ROW_18),
-    "no header": (ngsim_layout(TEXT_NAMES, f"{CSV}-no-header"), ROW_18),
+    "no header": (ngsim_layout(TEXT_NAMES, CSV_BARE), ROW_18),
     "export": (ngsim_layout(EXPORT_NAMES), ROW_25),
     "more columns": (ngsim_layout(("remark", *EXPORT_NAMES, "more")), ['"a,b"', *ROW_25, "x"]),
     "tracks": (HIGHD_FORMAT.build_layout(TRACKS), ROW_TRACKS),

@@ -4,7 +4,7 @@ import gzip
 
 import polars as pl
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from raw_texts import physical_lines
@@ -12,6 +12,7 @@ from raw_texts import write as write_bytes
 
 from tracklake.pipeline.sources.csv import Layout, fetch_lines, raw_files, read_chunks, read_head
 from tracklake.pipeline.sources.csv.line_bytes import split_lines, squeeze_blanks
+from tracklake.pipeline.sources.csv.plain_text import recognise_form
 from tracklake.pipeline.sources.csv.reader import _parse_line_by_line, _parse_strictly, parse_lines
 from tracklake.pipeline.sources.source import RawFile, SourceError
 
@@ -313,6 +314,7 @@ def edits():
 def test_no_damage_crashes_or_loses_a_line(tmp_path_factory, edits, chunk_bytes, comma):
     good = GOOD * 3 if comma else b" 1 a  2\t3.5 \r\n\t2 b 4 5\n3 c 6 7\n" * 3
     data = mutate(good, edits)
+    assume(recognise_form(data).is_plain)  # what ends in carriage returns alone has other lines
     layout = Layout(**{**vars(LAYOUT), "header_lines": 0}) if comma else PLAIN
     path = write(tmp_path_factory.mktemp("fuzz") / "raw", data)
     chunks = list(read_chunks(path, layout, chunk_bytes=chunk_bytes))
