@@ -11,6 +11,7 @@ import polars as pl
 
 from tracklake.quality_reports.published import SOURCE, select_published
 from tracklake.quality_reports.rules.registry import RULES, Rule, describe
+from tracklake.quality_reports.verdicts import judge
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.quality import (
     QUALITY_SCHEMA,
@@ -199,20 +200,25 @@ def collect(
     source_files = _query_rows(connection, "source_files", SourceFile)
     recordings = _query_rows(connection, "recordings", RecordingFacts)
     published, left_out = select_published(recordings)
+    subsets = _query_rows(connection, "subsets", SubsetFacts)
+    scored = _query_rows(connection, "subset_scores", SubsetScores)
+    completeness = _query_rows(connection, "completeness", Completeness)
+    checked = _collect_rules(connection, rules, provenance.get("thresholds") or {})
     return {
         "schema": QUALITY_SCHEMA,
         "headline": _query_rows(connection, "headline", Headline)[0],
+        "verdicts": judge(subsets, scored, checked, completeness),
         "stages": _query_rows(connection, "stages", StageProgress),
         "left_out": _query_rows(connection, "left_out", LeftOut),
-        "subsets": _query_rows(connection, "subsets", SubsetFacts),
-        "rules": _collect_rules(connection, rules, provenance.get("thresholds") or {}),
+        "subsets": subsets,
+        "rules": checked,
         "speeds": {
             "summary": _query_rows(connection, "speeds", SpeedsOfEntries),
             "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
             "histogram": _query_rows(connection, "speed_histogram", SpeedBin),
         },
         "recordings": recordings,
-        "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
+        "subset_scores": scored,
         "published": {"source": SOURCE, "figures": published, "left_out": left_out},
         "starts": _collect_starts(connection),
         "samples": {
@@ -220,7 +226,7 @@ def collect(
             "drops": _query_rows(connection, "sample_drops", SampleDrops),
         },
         "splits": _collect_splits(connection),
-        "completeness": _query_rows(connection, "completeness", Completeness),
+        "completeness": completeness,
         "ingestion": {
             "files": _query_rows(connection, "ingested_files", IngestedFile),
             "rejects": _query_rows(

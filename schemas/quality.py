@@ -24,6 +24,7 @@ from tracklake.schemas.quality_tracks import (
     Subset,
     SubsetFacts,
     SubsetScores,
+    Verdict,
 )
 
 QUALITY_SCHEMA: Final = "tracklake/quality/1"
@@ -344,6 +345,7 @@ class Quality(TypedDict):
 
     schema: Annotated[str, "version of this document"]
     headline: Headline
+    verdicts: list[Verdict]
     stages: list[StageProgress]
     left_out: list[LeftOut]
     subsets: list[SubsetFacts]

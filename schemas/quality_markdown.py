@@ -29,7 +29,7 @@ In the paths below, `[]` stands for every item of a list and `*` for any name. A
 """
 
 SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    ("Document and lake", "", ("schema", "headline", "stages", "left_out")),
+    ("Document and lake", "", ("schema", "headline", "verdicts", "stages", "left_out")),
     ("Subsets and recordings", "", ("subsets", "recordings")),
     (
         "Findings",

@@ -33,6 +33,17 @@ class Headline(TypedDict):
     rows_dropped: Annotated[int | None, "data rows that were written to `rejects`"]
 
 
+class Verdict(TypedDict):
+    """Whether a subset or a dataset can be used; limits are in [report.md](report.md)."""
+
+    dataset: Dataset
+    subset: SubsetOrAll
+    verdict: Annotated[str, "usable, usable with care, not usable or not checked"]
+    entries: Annotated[int, "rows of `tracks`"]
+    error_share: Annotated[float | None, "share of the entries with an error; null before validation"]
+    reasons: Annotated[list[str], "reasons of the verdict, the gravest first; none where a subset is usable"]
+
+
 class StageProgress(TypedDict):
     """Progress of one stage, in subsets."""
 

@@ -15,6 +15,9 @@ from tracklake.schemas.text import make_visible
 DASH = "\N{EN DASH}"
 """Text of a number that is unknown or was not computed."""
 
+COUNTED_UNITS = ("changes", "frames")
+"""Units of findings that are whole numbers."""
+
 
 @cache
 def make_environment() -> jinja2.Environment:
@@ -35,6 +38,7 @@ def make_environment() -> jinja2.Environment:
         duration=format_duration,
         labelled=label_sums,
         unit=_unit,
+        worst=_format_worst,
     )
     templates = files("tracklake.quality_reports") / "templates"
     for name, file in (("style", "report.css"), ("script", "report.js")):
@@ -103,6 +107,13 @@ def flatten(value: object, prefix: str = "") -> list[tuple[str, str]]:
 def _unit(symbol: str) -> str:
     """Format a unit, its exponents raised."""
     return symbol.replace("s2", "s\N{SUPERSCRIPT TWO}").replace("s3", "s\N{SUPERSCRIPT THREE}")
+
+
+def _format_worst(value: float | None, unit: str) -> str:
+    """Format a finding's worst value with its unit; counts have no decimals."""
+    if value is None:
+        return DASH
+    return f"{_integer(value) if unit in COUNTED_UNITS else _fixed(value, 2)} {_unit(unit)}"
 
 
 def _integer(value: float | None) -> str:

@@ -16,8 +16,10 @@ from tracklake.quality_reports.pages.rendering import describe_origins, flatten,
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
 from tracklake.quality_reports.plots import charts
 from tracklake.quality_reports.plots import distributions as plots
+from tracklake.quality_reports.plots.verdicts import draw_verdicts
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import Connection, collect
+from tracklake.quality_reports.verdicts import LIMITS, rank_rules, rank_verdicts
 from tracklake.schemas.quality import Provenance, Quality
 from tracklake.schemas.references import EDIE, HAMALAINEN, Reference, find_references
 
@@ -74,13 +76,14 @@ def build_report(
 def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
     """Render the page; everything but our own style sheet and plots is escaped."""
     pages = name_pages(quality["subsets"]) if pages is None else pages
+    addresses = {key: f"{FOLDER}/{quote(name)}" for key, name in pages.items()}
     return (
         make_environment()
         .get_template("report.html.j2")
         .render(
-            **quality,
+            **{**quality, "rules": rank_rules(quality["rules"])},
             banner=describe_origins(quality),
-            drawings=_draw_plots(quality),
+            drawings=_draw_plots(quality, addresses),
             stage={row["stage"]: row for row in quality["stages"]},
             found_in={
                 (rule["name"], row["dataset"], row["subset"]): row
@@ -98,7 +101,9 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
             dropping=[row for row in quality["ingestion"]["files"] if row["rows_dropped"]],
             assessed=tabulate_assessments(quality["starts"]["assessed"]),
             name_estimator=charts.name_estimator,
-            pages={key: f"{FOLDER}/{quote(name)}" for key, name in pages.items()},
+            pages=addresses,
+            ranked_verdicts=rank_verdicts(quality["verdicts"]),
+            limits=LIMITS,
             horizons=sorted({row["seconds"] for score in quality["model_scores"] for row in score["rows"]}),
         )
     )
@@ -114,13 +119,14 @@ def _omit_files(provenance: Provenance) -> dict[str, object]:
     return {key: value for key, value in provenance.items() if key != "source_files"}
 
 
-def _draw_plots(quality: Quality) -> dict[str, Any]:
+def _draw_plots(quality: Quality, pages: Mapping[tuple[str, str], str]) -> dict[str, Any]:
     """Draw the page's plots, by name, as markup; None where there are no data."""
     speeds, starts, splits = quality["speeds"], quality["starts"], quality["splits"]
     # Plots of other splits are on the page of splits.
     beside = {row["split"] for row in splits["recipes"] if not row["trains"]}
     parts = dict.fromkeys((row["split"], row["dataset"]) for row in splits["balance"] if row["split"] not in beside)
     return {
+        "verdicts": Markup(draw_verdicts(quality["verdicts"], pages)) if quality["verdicts"] else None,
         "speed_histogram": Markup(plots.draw_speed_histogram(speeds["histogram"], speeds["summary"]))
         if speeds["histogram"]
         else None,

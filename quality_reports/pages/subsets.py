@@ -20,6 +20,7 @@ from tracklake.quality_reports.summaries import (
     query,
     query_frame,
 )
+from tracklake.quality_reports.verdicts import judge, rank_rules
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.quality_tracks import SubsetFacts
 
@@ -55,12 +56,15 @@ def render_pages(
     declared = [
         {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in figures["rules"]
     ]
+    judged = judge(figures["subsets"], figures["subset_scores"], figures["rules"], figures["completeness"])
+    verdicts = {(row["dataset"], row["subset"]): row for row in judged}
     for subset in figures["subsets"]:
         content = {**_select_figures(figures, subset), **_query_subset(connection, subset, declared)}
         yield (
             names[subset["dataset"], subset["subset"]],
             template.render(
                 subset=subset,
+                verdict=verdicts[_get_key(subset)],
                 provenance=figures["provenance"],
                 banner=describe_synthetic({subset["subset"]: subset["origin"]}),
                 **content,
@@ -80,7 +84,7 @@ def _select_figures(figures: SubsetFigures, subset: SubsetFacts) -> Row:
     return {
         "rules": [
             {**{key: rule[key] for key in ("name", "severity", "unit", "meaning")}, **row}
-            for rule in figures["rules"]
+            for rule in rank_rules(figures["rules"])
             for row in of_subset(rule["subsets"])
         ],
         "starts": starts[0] if starts else None,
