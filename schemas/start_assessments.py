@@ -17,7 +17,7 @@ START_ASSESSMENTS = Table(
         "subset": SUBSET,
         "estimator": column(
             pl.String,
-            "regression is that of missing_starts; mean_speed and no_margin are simpler, local_regression fits the 12 "
+            "regression is that of missing_starts; mean_speed and no_margin are simpler, local_regression fits the 10 "
             "references nearest in time",
             isin=ESTIMATORS,
         ),

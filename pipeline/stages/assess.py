@@ -26,6 +26,6 @@ STAGE = Stage(
     meaning="Measure the estimates on tracks cut on purpose.",
     scope="freeway recording",
     after=(INGEST, "repair"),
-    version=1,
+    version=2,
     build=build,
 )
