@@ -56,7 +56,7 @@ def write_output(target: Path, content: bytes | Callable[[BinaryIO], object]) ->
     if not _is_stream(target):
         write_file(target.resolve(), content)
         return
-    with explain_file_errors(target), target.open("wb") as stream:
+    with explain_file_errors(target), target.open("ab") as stream:
         if isinstance(content, bytes):
             stream.write(content)
         else:

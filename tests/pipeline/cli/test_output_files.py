@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import polars as pl
@@ -11,6 +12,7 @@ import pytest
 from small_lake import write_round
 
 from tracklake.pipeline.lake import find_lake
+from tracklake.schemas.files import write_output
 
 LAKES_OWN = (
     "manifest.json",
@@ -146,6 +148,12 @@ def test_devices_are_written_to_and_not_replaced(command, lake):
     full = command.here(*arguments, "/dev/full")
     assert (full.code, "No space left on device" in full.err, "Traceback" in full.err) == (1, True, False)
     assert Path("/dev/null").is_char_device()
+    with tempfile.TemporaryFile() as stream:  # `--out /dev/fd/3 3>>file` adds to the file
+        stream.write(b"before\n")
+        stream.flush()
+        write_output(Path(f"/proc/self/fd/{stream.fileno()}"), b"after\n")
+        stream.seek(0)
+        assert stream.read() == b"before\nafter\n"
 
 
 @pytest.mark.parametrize("options", [(), ("--format", "csv")])
