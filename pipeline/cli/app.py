@@ -38,6 +38,10 @@ MODULES = {"validate": "stage", "samples": "stage", "tensors": "stage"}
 """Modules of the commands that have none of their own."""
 
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as that of a program that the signal ended."""
+
+
 class LazyGroup(TyperGroup):
     """A group whose help page needs none of its commands' modules."""
 
@@ -45,6 +49,14 @@ class LazyGroup(TyperGroup):
         """Register a stand-in for every command."""
         stand_ins = {name: TyperCommand(name, help=text) for name, text in COMMANDS.items()}
         super().__init__(**{**attributes, "commands": stand_ins})
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401  (see resolve_command)
+        """Run the command; Ctrl-C before it has its own frame, while modules are imported, is a message as well."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("error: interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401  (Typer keeps its types private)
         """Import the command that is called."""
@@ -71,7 +83,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
-    epilog="Exit codes: 0 done, 1 failed, 2 usage, 3 done but some recordings were refused.",
+    epilog="Exit codes: 0 done, 1 failed, 2 usage, 3 done but some recordings were refused, 130 interrupted.",
 )
 
 

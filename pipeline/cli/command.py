@@ -18,8 +18,11 @@ from tracklake.pipeline.settings import Settings
 from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
 from tracklake.schemas.text import make_visible
 
-DONE, FAILED, USAGE, REFUSED = 0, 1, 2, 3
-"""Exit codes: done, failed, wrong usage, and done but for refused recordings."""
+DONE, FAILED, USAGE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 130
+"""Exit codes: done, failed, wrong usage, done but for refused recordings, and interrupted by Ctrl-C."""
+
+QUERY_INTERRUPTED = "Query interrupted"
+"""Message with which DuckDB ends a query at Ctrl-C, as a RuntimeError."""
 
 DEBUG = "TRACKLAKE_DEBUG"
 """Environment variable: if set to 1, every error shows its traceback, as with the option --debug."""
@@ -53,12 +56,19 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt as error:
         _show_traceback_if_debugging(error)
-        message = "interrupted; what was committed stays; run the same command again"
-        raise report_failure(terminal, message) from None
+        raise report_failure(terminal, str(error) or "interrupted", INTERRUPTED) from None
+    except RuntimeError as error:
+        if str(error) != QUERY_INTERRUPTED:
+            raise _report_bug(terminal, error) from None
+        raise report_failure(terminal, "interrupted", INTERRUPTED) from None
     except Exception as bug:  # noqa: BLE001  (the outermost: nothing is hidden, the traceback is shown)
-        terminal.print_bug(describe_bug(bug))
-        terminal.print_json({"error": f"{type(bug).__name__}: {bug}", "bug": True})
-        raise typer.Exit(FAILED) from None
+        raise _report_bug(terminal, bug) from None
+
+
+def _report_bug(terminal: Terminal, bug: Exception) -> typer.Exit:
+    terminal.print_bug(describe_bug(bug))
+    terminal.print_json({"error": f"{type(bug).__name__}: {bug}", "bug": True})
+    return typer.Exit(FAILED)
 
 
 def _show_traceback_if_debugging(error: BaseException) -> None:

@@ -1,8 +1,8 @@
 """The flow that the pipeline's commands share: run what is missing or stale, then report what was done."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import require_choice
 from tracklake.pipeline.cli.summary import show_assessment, show_headline, show_result
 from tracklake.pipeline.ingest.discovery import Discovery
-from tracklake.pipeline.lake import load, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake import LakeError, load, refuse_foreign, refuse_if_busy
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
@@ -80,9 +80,29 @@ def run_steps(
         terminal.print_line(
             "catalog and folders do not agree with the manifest: they are brought up to date", style="dim"
         )
-    with terminal.show_stages(), explain_file_errors(request.root):
+    with terminal.show_stages(), explain_file_errors(request.root), _explain_interrupt(request.root):
         result: RunResult = import_flows().execute(request, plan)
         return result
+
+
+@contextmanager
+def _explain_interrupt(lake: Path) -> Iterator[None]:
+    """Say after Ctrl-C what of the work is in the lake."""
+    before = _list_commits(lake)
+    try:
+        yield
+    except KeyboardInterrupt:
+        made = len(_list_commits(lake) - before)
+        kept = {0: "nothing of this run is", 1: "1 result of this run is"}.get(made, f"{made} results of this run are")
+        raise KeyboardInterrupt(f"interrupted; {kept} in the lake. Run the same command again to go on") from None
+
+
+def _list_commits(lake: Path) -> set[tuple[str, str]]:
+    """Return keys and fingerprints of what is in the lake."""
+    try:
+        return {(key, commit.fingerprint) for key, commit in load(lake).commits.items()}
+    except LakeError:
+        return set()
 
 
 def _survey_while_importing(request: RunRequest) -> Discovery:

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tracklake.pipeline.cli.command import command, read_settings, report_failure
+from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST
 from tracklake.pipeline.cli.options import (
@@ -110,7 +110,7 @@ def train(
             again += ["--protocol", protocol] if protocol is not None else []
             again += ["--no-evaluation"] if no_evaluation else []
             command_again = f"{find_command()} {' '.join(map(quote_shell, again))}"
-            raise report_failure(terminal, f"{stopped}\nTo go on: {command_again}") from None
+            raise KeyboardInterrupt(f"{stopped}\nTo go on: {command_again}") from None
         if metrics["evaluation"] is not None:
             _show_scores(terminal, metrics["evaluation"])
         else:

@@ -77,8 +77,9 @@ def discover(
     Raises:
         SourceError: nothing there, or nothing recognised in it.
     """
-    candidates = _list_candidates(source)
+    candidates, unreadable = _list_candidates(source)
     search = _Search([item for item in SOURCES if dataset in (None, item.name)], source, digest, mapping, recording)
+    search.refusals += unreadable
     for path in candidates:
         search.sort_file(_open_raw(path, source))
     search.hash_files()
@@ -104,7 +105,7 @@ def recognise(source: Path, dataset: str) -> list[RawFile]:
         SourceError: no such file or folder.
     """
     search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
-    for path in _list_candidates(source):
+    for path in _list_candidates(source)[0]:
         search.sort_file(_open_raw(path, source))
     return search.found
 
@@ -214,23 +215,40 @@ class _Search:
             self.refusals.append(refusal)
 
 
-def _list_candidates(source: Path) -> list[Path]:
+def _list_candidates(source: Path) -> tuple[list[Path], list[str]]:
+    """Return the files below a source, and messages about folders and files that cannot be looked at."""
     if not source.exists():
         raise SourceError(
             f"{source}: no such file or folder. Give the folder with the raw files as downloaded, or one file; "
             "`tracklake sample --out sample` generates some to try with."
         )
     if source.is_file():
-        return [source]
+        return [source], []
     found: list[Path] = []
+    refusals: list[str] = []
     visited: set[str] = set()
-    for folder, below, names in os.walk(source, followlinks=True):
+
+    def refuse(error: OSError) -> None:
+        path = Path(os.fsdecode(error.filename))
+        name = path.relative_to(source).as_posix() if path != source else str(source)
+        refusals.append(
+            f"{name}: cannot be read ({error.strerror}). Give yourself the right to read it, or move it away."
+        )
+
+    for folder, below, names in os.walk(source, followlinks=True, onerror=refuse):
         real = os.path.realpath(folder)
         below[:] = [] if real in visited else [name for name in below if not name.startswith(".")]
         if real not in visited:
             found += [Path(folder, name) for name in names if not name.startswith(".")]
         visited.add(real)
-    return sorted(path for path in found if path.is_file())
+    files = []
+    for path in sorted(found):
+        try:
+            if path.is_file():
+                files.append(path)
+        except OSError as error:
+            refuse(error)
+    return files, sorted(refusals)
 
 
 def _open_raw(path: Path, source: Path) -> RawFile:

@@ -61,7 +61,18 @@ class Folder:
         if path is None or not self._tells or not Path(path).is_relative_to(self._root):
             return False
         known = (path, file["file"]) in self._places
-        return file["sha256"] not in self._hashes and (known or not os.path.lexists(path))
+        return file["sha256"] not in self._hashes and (known or _is_gone(path))
+
+
+def _is_gone(path: str) -> bool:
+    """Return whether nothing is at a path; what lies in a folder that cannot be read is not known to be gone."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def find_missing(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:

@@ -1,7 +1,7 @@
 """Steps of making a sample: simulate, add noise, inject defects, write files, read them back, list the truth."""
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,10 +24,13 @@ from tracklake.pipeline.synthetic.scenarios import (
     Road,
     Traffic,
 )
-from tracklake.pipeline.synthetic.sumo import find_sumo, simulate
+from tracklake.pipeline.synthetic.sumo import find_sumo, simulate, stop_programs
 
 AT_ONCE = 2
 """Simulations that run at the same time; each is a process with one thread."""
+
+STOP_POLL_S = 0.05
+"""Time between two attempts to end what is still simulated, in seconds."""
 
 BOM = b"\xef\xbb\xbf"
 TRUTH_FILE = "truth.parquet"
@@ -146,12 +149,23 @@ def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[s
     with TemporaryDirectory(prefix="tracklake-sample-") as folder, ThreadPoolExecutor(AT_ONCE) as pool:
         # Congested traffic takes longest and starts first.
         slowest = sorted(jobs, key=lambda job: job.run.traffic.bottleneck_mps is None)
-        waiting = {job.subset: pool.submit(simulate_job, job, Path(folder)) for job in slowest}
-        tracks = {}
-        for done, (subset, future) in enumerate(waiting.items(), start=1):
-            tracks[subset] = future.result()
-            progress(f"simulated {subset} ({done}/{len(waiting)})")
-    return tracks
+        waiting = {pool.submit(simulate_job, job, Path(folder)): job.subset for job in slowest}
+        try:
+            for done, future in enumerate(as_completed(waiting), start=1):
+                future.result()
+                progress(f"simulated {waiting[future]} ({done}/{len(waiting)})")
+        except BaseException:
+            _stop(waiting)
+            raise
+    return {subset: future.result() for future, subset in waiting.items()}
+
+
+def _stop(simulations: Collection[Future[pl.DataFrame]]) -> None:
+    """End simulations at once, or an interrupt would wait for the longest of them."""
+    for simulation in simulations:
+        simulation.cancel()
+    while wait(simulations, timeout=STOP_POLL_S).not_done:
+        stop_programs()
 
 
 def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:

@@ -81,6 +81,10 @@ TRACK_SCHEMA = {
 the left edge to the right, m/s and m/s2 along the direction of travel, lane 1 leftmost; sorted by vehicle, frame."""
 
 
+_RUNNING: set["subprocess.Popen[str]"] = set()
+"""SUMO's programs that run now, in threads of this process."""
+
+
 class SumoError(TracklakeError):
     """SUMO is not installed, or a run of it failed."""
 
@@ -100,12 +104,24 @@ def find_sumo() -> Path:
 
 def _call(home: Path, program: str, arguments: list[str]) -> None:
     environment = {**os.environ, "SUMO_HOME": str(home)}
-    done = subprocess.run(
-        [str(home / "bin" / program), *arguments], env=environment, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        tail = "\n".join(done.stderr.strip().splitlines()[-5:])
-        raise SumoError(f"{program} failed with exit code {done.returncode}:\n{tail}")
+    call = [str(home / "bin" / program), *arguments]
+    with subprocess.Popen(
+        call, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        _RUNNING.add(process)
+        try:
+            _, errors = process.communicate()
+        finally:
+            _RUNNING.discard(process)
+    if process.returncode:
+        tail = "\n".join(errors.strip().splitlines()[-5:])
+        raise SumoError(f"{program} failed with exit code {process.returncode}:\n{tail}")
+
+
+def stop_programs() -> None:
+    """Kill the programs that run now; their calls raise SumoError."""
+    for process in tuple(_RUNNING):
+        process.kill()
 
 
 def _edges(road: Road, traffic: Traffic) -> list[tuple[str, float, float, int, float]]:

@@ -331,13 +331,10 @@ def test_constant_velocity_has_nothing_to_learn_and_is_written_all_the_same(tens
 
 
 def test_without_an_evaluation_part_there_is_no_score(tmp_path):
-    folder = write_tiny(
-        tmp_path / "tensors", pl.concat([split_row("a", "train"), split_row("b", "train")]), subsets="ab"
-    )
+    folder = write_tiny(tmp_path / "tensors", split_row("a", "train"), subsets="a")
     assert train("constant-velocity", folder, tmp_path / "cv")["evaluation"] is None
     with pytest.raises(TracklakeError, match=r"has no samples in `eval`.*--no-evaluation"):
         train("lstm", folder, tmp_path / "run", FEW)
-    assert not (tmp_path / "run").exists()
     assert train("lstm", folder, tmp_path / "run", FEW, without_evaluation=True)["evaluation"] is None
 
 

@@ -6,8 +6,10 @@ import stat
 from dataclasses import replace
 
 import pytest
+from small_recordings import write_highd
 
-from tracklake.pipeline.cli import report
+from tracklake.pipeline.cli import app, report, session
+from tracklake.pipeline.lake import Commit, open_for_writing
 from tracklake.schemas.errors import FileAccessError, MissingExtraError, TracklakeError, UsageError, describe_error
 
 
@@ -116,3 +118,38 @@ def test_work_that_broke_off_is_described():
     described = describe_error(ValueError("boom"))
     assert described.startswith("ValueError: boom")
     assert "This is a bug in tracklake" in described
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt(), RuntimeError("Query interrupted")])
+def test_an_interrupt_is_one_line(command, break_load, tmp_path, raised):
+    break_load(raised)
+    done = command.here("report", "--compare", tmp_path)
+    assert (done.code, done.err) == (130, "error: interrupted\n")
+
+
+def test_an_interrupt_while_a_command_is_imported_is_one_line(command, monkeypatch):
+    def interrupt(_name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(app, "load_command", interrupt)
+    done = command.here("sql", "SELECT 1")
+    assert (done.code, done.err) == (130, "error: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("made", "words"), [(0, "nothing of this run is"), (1, "1 result of this run is"), (2, "2 results of this run are")]
+)
+def test_an_interrupted_run_says_what_is_in_the_lake(command, tmp_path, monkeypatch, made, words):
+    write_highd(tmp_path / "raw", "04")
+
+    class Flows:
+        def execute(self, request, _plan):
+            with open_for_writing(request.root) as writer:
+                for number in range(made):
+                    writer.commit(Commit(f"ingest/highd/{number}", "0" * 16, {}))
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "import_flows", Flows)
+    done = command.here("ingest", tmp_path / "raw", "--lake", tmp_path / "lake")
+    assert done.code == 130
+    assert done.err.strip() == f"error: interrupted; {words} in the lake. Run the same command again to go on"

@@ -53,7 +53,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr("tracklake.pipeline.cli.console.Terminal.show_training", interrupting)
         stopped = command.here(*steps)
-    assert stopped.code == 1
+    assert stopped.code == 130
     assert "interrupted; the checkpoint is" in stopped.err
     assert f"To go on: tracklake train lstm --resume --name half --lake {lake.root}" in stopped.err
     assert [path.name for path in models.iterdir() if "half" in path.name] == [".half.unfinished"]

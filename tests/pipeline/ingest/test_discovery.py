@@ -10,6 +10,7 @@ from highd_files import write_recording
 from raw_texts import TEXT_NAMES, as_csv, as_text, ngsim_row, write
 
 from tracklake.pipeline.ingest.discovery import Digests, discover
+from tracklake.pipeline.ingest.removal import Folder
 from tracklake.pipeline.sources import RawFile, SourceError
 
 ROWS = [ngsim_row(5, frame) for frame in range(1, 4)]
@@ -177,3 +178,36 @@ def test_a_damaged_memory_of_digests_is_forgotten(tmp_path, remembered):
     write(tmp_path / ".hashes.json", remembered)
     path = write(tmp_path / "a.csv", b"one")
     assert Digests(tmp_path)(RawFile(path, "a.csv")) == hashlib.sha256(b"one").hexdigest()
+
+
+@pytest.fixture
+def closed(tmp_path, monkeypatch):
+    """A folder that nobody, not even root, may list, and in which nothing can be looked at."""
+    write(tmp_path / "closed" / "b.csv", as_csv(ROWS[:2]))
+    real_scan, real_lstat = os.scandir, os.lstat
+
+    def deny(call):
+        def call_or_deny(path, *rest, **options):
+            if str(path).startswith(str(tmp_path / "closed")):
+                raise PermissionError(13, "Permission denied", str(path))
+            return call(path, *rest, **options)
+
+        return call_or_deny
+
+    monkeypatch.setattr(os, "scandir", deny(real_scan))
+    monkeypatch.setattr(os, "lstat", deny(real_lstat))
+    return tmp_path / "closed"
+
+
+def test_a_folder_that_cannot_be_read_is_refused_and_the_others_go_through(tmp_path, closed):
+    write(tmp_path / "a.csv", as_csv(ROWS))
+    discovery = find(tmp_path)
+    assert names(discovery) == [("ngsim", ["a.csv"])]
+    assert discovery.refusals == (
+        "closed: cannot be read (Permission denied). Give yourself the right to read it, or move it away.",
+    )
+    # What the lake holds of it is not lost, so that --prune leaves it.
+    lost = {"path": str(tmp_path / "gone.csv"), "file": "gone.csv", "sha256": "0"}
+    kept = {"path": str(closed / "b.csv"), "file": "closed/b.csv", "sha256": "0"}
+    folder = Folder(tmp_path, discovery)
+    assert (folder.is_lost(lost), folder.is_lost(kept)) == (True, False)

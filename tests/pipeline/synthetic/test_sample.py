@@ -1,6 +1,7 @@
 """A tiny sample from SUMO, checked against its own truth and the raw formats."""
 
 import re
+import time
 from pathlib import Path
 
 import polars as pl
@@ -10,7 +11,7 @@ from raw_texts import read_highd, read_ngsim
 from simulated import simulate_once
 
 from tracklake.pipeline import synthetic
-from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, write_sample
+from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, build, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
 
@@ -320,3 +321,20 @@ def test_a_failed_run_says_what_sumo_said(tmp_path):
 
 def test_the_package_exports_what_it_promises():
     assert set(synthetic.__all__) >= {"ALL_FORMATS", "SampleSummary", "write_sample"}
+
+
+def test_simulations_end_at_once_where_one_fails(tmp_path, monkeypatch):
+    """The same happens at Ctrl-C; the others would go on for half a minute."""
+    sumo, waits = tmp_path / "sumo", tmp_path / "waits"
+    (sumo / "bin").mkdir(parents=True)
+    program = sumo / "bin" / "netconvert"
+    program.write_text(f"#!/bin/sh\nif mkdir '{waits}'; then exec sleep 60; fi\necho broken >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(build, "find_sumo", lambda: sumo)
+    began = time.monotonic()
+    with pytest.raises(SumoError, match="netconvert"):
+        write_sample(tmp_path / "out")
+    assert time.monotonic() - began < 30
+    assert waits.exists()
+    assert not sumo_runs._RUNNING
+    assert not (tmp_path / "out").exists()
