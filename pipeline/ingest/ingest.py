@@ -221,6 +221,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
     info = {
         "notes": [*_recall_notes(root, job), *canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
+        "row_order": canonical.row_order,
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }

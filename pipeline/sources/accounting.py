@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import polars as pl
 
 from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, fetch_lines
-from tracklake.pipeline.sources.source import Part
+from tracklake.pipeline.sources.source import Part, RowOrder
 from tracklake.schemas import INGEST_LOG, REJECTS
 
 FILE = "file_index"
@@ -44,6 +44,13 @@ def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFra
 
 
 _PACKED = "packed_key"
+
+
+def find_row_order(rows: pl.DataFrame, vehicle: str, frame: str) -> RowOrder:
+    """Tell by what the rows of a recording are sorted in its files; vehicle and frame are Int32 columns."""
+    if rows.select(_pack([vehicle, frame])).to_series().is_sorted():
+        return "vehicle"
+    return "frame" if rows.select(_pack([frame, vehicle])).to_series().is_sorted() else "other"
 
 
 def _pack(key: Sequence[str]) -> pl.Expr:

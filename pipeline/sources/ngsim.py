@@ -8,7 +8,7 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account_rows, split_duplicates
+from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account_rows, find_row_order, split_duplicates
 from tracklake.pipeline.sources.assembly import assemble_subset
 from tracklake.pipeline.sources.column_mapping import NGSIM_RATE_HZ, ColumnMapping, suggest_mapping
 from tracklake.pipeline.sources.completeness import Announced, compare_counts
@@ -248,6 +248,7 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset = "ngsi
     ]
     raw = pl.concat(shares)
     raw, derived = split_derived(raw, shares, ["Vehicle_ID", "Frame_ID", "Local_X", "Local_Y"])
+    row_order = find_row_order(raw, "Vehicle_ID", "Frame_ID")
     rows, duplicates = split_duplicates(raw, ["Vehicle_ID", "Frame_ID"])
     dropped = [(derived, IN_FULLER_FILE), (duplicates, DUPLICATE)]
     log, rejects = account_rows(dataset, recording, parts, [share.height for share in shares], dropped)
@@ -284,7 +285,7 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset = "ngsi
     announced = Announced(totals, totals_by=PUBLISHED, vehicles=None, vehicles_by=TOTAL_FRAMES)
     completeness = compare_counts(dataset, recording, subsets, announced, log)
     notes = (*_describe_subsets(subsets), *completeness.notes)
-    return Canonical(tuple(subsets), log, rejects, completeness.table, notes)
+    return Canonical(tuple(subsets), log, rejects, completeness.table, notes, row_order)
 
 
 def _to_subset(

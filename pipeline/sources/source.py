@@ -3,12 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 
 from tracklake.schemas.columns import Dataset
 from tracklake.schemas.errors import TracklakeError
+
+RowOrder = Literal["vehicle", "frame", "other"]
 
 
 class SourceError(TracklakeError):
@@ -122,6 +124,7 @@ class Canonical:
         rejects: rows of schemas.REJECTS.
         completeness: rows of schemas.COMPLETENESS.
         notes: messages for the user.
+        row_order: what the rows of its files are sorted by: vehicle and frame, frame and vehicle, or neither.
     """
 
     subsets: tuple[Subset, ...]
@@ -129,6 +132,7 @@ class Canonical:
     rejects: pl.DataFrame
     completeness: pl.DataFrame
     notes: tuple[str, ...] = ()
+    row_order: RowOrder = "vehicle"
 
 
 @dataclass(frozen=True)

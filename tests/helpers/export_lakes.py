@@ -61,7 +61,7 @@ def ingest(root, folder, recordings, highd=()):
                     written = write_table(root, table, frame, values, FINGERPRINT, where=recording)
                     files.setdefault(table.name, []).extend(written)
             subsets = [{"subset": s.name, "freeway": s.facts["freeway"][0]} for s in made.subsets]
-            info = {"dataset": dataset, "recording": recording, "subsets": subsets}
+            info = {"dataset": dataset, "recording": recording, "subsets": subsets, "row_order": made.row_order}
             writer.commit(Commit(f"ingest/{dataset}/{recording}", FINGERPRINT, files, {"sources": []}, info))
     return root
 

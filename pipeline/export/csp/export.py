@@ -20,7 +20,7 @@ from tracklake.pipeline.lake import Manifest, load, scan
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.transforms.csp.grid import OverwritingGrid
-from tracklake.pipeline.transforms.csp.parts import EXCLUDED, NO_LANE, count_rows, number_datasets
+from tracklake.pipeline.transforms.csp.parts import EXCLUDED, NO_LANE, number_datasets
 from tracklake.pipeline.transforms.csp.subset import (
     COLUMNS,
     CspRecording,
@@ -67,8 +67,7 @@ def export_csp(settings: Settings, out: Path, options: CspOptions, *, force: boo
     manifest = load(root)
     refuse_taken(out, (*FILES, CARD), force=force)
     subsets = _choose_subsets(root, manifest, options)
-    rows = count_rows({(facts["dataset"], facts["subset"]): facts["dataset_id"] for facts in subsets})
-    export = CspExport(out, options, [CspFile(*both) for both in zip(FILES, PARTS, strict=True)], rows)
+    export = CspExport(out, options, [CspFile(*both) for both in zip(FILES, PARTS, strict=True)])
     prepared = _prepare_all(settings, manifest, subsets, options, export)
     _count_entries(prepared, export)
     _refuse_large(export)
@@ -115,6 +114,7 @@ def _prepare_all(
             first_frame=facts["first_frame"],
             frame_rate_hz=facts["frame_rate_hz"],
             last_lane=LAST_LANES.get(facts["site"]),
+            by_frame=_find_row_order(manifest, facts, export) == "frame",
         )
         clock = put_on_csp_clock(scan(root, manifest, TRACKS, **values).select(TRACK_COLUMNS).collect(), recorded)
         context = None if contexts is None else contexts[facts["dataset"], facts["subset"]]
@@ -135,6 +135,17 @@ def _prepare_all(
             prepared.append(subset)
         show.advance("read", facts["subset"])
     return prepared
+
+
+def _find_row_order(manifest: Manifest, facts: dict[str, Any], export: CspExport) -> str:
+    """Find the order of rows in a recording's files, which is that of the script's samples; note an unknown one."""
+    commit = manifest.commits.get(f"ingest/{facts['dataset']}/{facts['recording']}")
+    order = str(commit.info.get("row_order", "vehicle")) if commit is not None else "vehicle"
+    if order == "other" and not export.options.clean:
+        export.notes.append(
+            f"{facts['subset']}: its files are sorted neither by vehicle nor by frame; samples are sorted by vehicle"
+        )
+    return order
 
 
 def _count_entries(prepared: Sequence[CspSubset], export: CspExport) -> None:
@@ -188,13 +199,17 @@ def _write_all(folder: Path, prepared: Sequence[CspSubset], export: CspExport) -
         show.advance("write", facts["subset"])
     for part, file in enumerate(export.files):
         # Popped from the list, so that a file's samples are freed once they are written.
-        savemat(folder / file.name, {"traj": samples.pop(0), "tracks": _collect_tracks(prepared, part, export.rows)})
+        savemat(folder / file.name, {"traj": samples.pop(0), "tracks": _collect_tracks(prepared, part)})
 
 
-def _collect_tracks(prepared: Sequence[CspSubset], part: int, rows: int) -> NDArray[np.object_]:
-    """Collect `tracks` of a part: (3, T) singles by data set and vehicle id; cells without a track are empty."""
+def _collect_tracks(prepared: Sequence[CspSubset], part: int) -> NDArray[np.object_]:
+    """Collect `tracks` of a part: (3, T) singles by data set and vehicle id; cells without a track are empty.
+
+    As in the script, the rows end with the last data set, and the columns with the highest id, that has a track.
+    """
     present = [subset for subset in prepared if (subset.part == part).any()]
     stacked = [(subset.dataset_id - 1, *stack_tracks(subset, part)) for subset in present]
+    rows = max((row + 1 for row, *_ in stacked), default=0)
     cells = np.empty((rows, max((int(ids[-1]) for _, ids, _, _ in stacked), default=0)), object)
     cells.fill(np.zeros((0, 0)))
     for row, ids, lengths, values in stacked:

@@ -44,7 +44,6 @@ class CspExport:
         out: folder of the files.
         options: options of the export.
         files: counts of each file, one per part.
-        rows: number of rows of `tracks`.
         datasets: id, dataset, subset, recording and origin of each row of `tracks` that is not empty.
         left_out: entries that are in no file, by reason.
         overwritten: neighbors lost because a later row had the same cell (without --clean).
@@ -56,7 +55,6 @@ class CspExport:
     out: Path
     options: CspOptions
     files: list[CspFile]
-    rows: int
     datasets: list[dict[str, Any]] = field(default_factory=list)
     left_out: dict[str, int] = field(default_factory=dict)
     overwritten: int = 0

@@ -166,9 +166,3 @@ def number_datasets(subsets: Iterable[tuple[str, str]]) -> dict[tuple[str, str],
     known = {subset: number for subset, number in original.items() if subset in given}
     others = sorted(given - known.keys(), key=lambda subset: (subset[0] != "ngsim", subset))
     return known | {subset: number for number, subset in enumerate(others, start=1 + len(original) * bool(known))}
-
-
-def count_rows(ids: Mapping[tuple[str, str], int]) -> int:
-    """Count the rows of `tracks`: the script's six if one of them is present, and one for each other subset."""
-    has_known = any(dataset == "ngsim" and subset in ORIGINAL_ORDER for dataset, subset in ids)
-    return max([*ids.values(), len(ORIGINAL_ORDER) * has_known])

@@ -54,12 +54,14 @@ class CspRecording:
         first_frame: first frame of the recording.
         frame_rate_hz: frame rate of the source.
         last_lane: highest lane; higher ones count as this one. None = no limit.
+        by_frame: whether the source's rows are sorted by frame and vehicle, not by vehicle and frame.
     """
 
     dataset_id: int
     first_frame: int
     frame_rate_hz: float
     last_lane: int | None
+    by_frame: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ class CspSubset:
         dropped: number of entries of each part that are no samples, by reason.
         left_out: number of entries that are in no file, by reason.
         positions: track_id, tick, x_m, lane of the entries if collisions are resolved, else None.
+        by_frame: whether samples are in the order of frame and vehicle, as the script finds them in such a file.
     """
 
     dataset_id: int
@@ -102,6 +105,7 @@ class CspSubset:
     dropped: dict[str, list[int]]
     left_out: dict[str, int]
     positions: pl.DataFrame | None = None
+    by_frame: bool = False
 
     def open_grid(self) -> OverwritingGrid | ResolvedGrid:
         """Build the grid around the samples; it is large, so only when it is needed."""
@@ -110,8 +114,9 @@ class CspSubset:
         return ResolvedGrid(self.positions, self.kept, self.part)
 
     def find_samples(self, part: int) -> Integers:
-        """Return the rows of a part's samples, in order."""
-        return np.flatnonzero(self.kept & (self.part == part))
+        """Return the rows of a part's samples, in the order of the source's rows."""
+        rows = np.flatnonzero(self.kept & (self.part == part))
+        return rows[np.argsort(self.entries.frame[rows], kind="stable")] if self.by_frame else rows
 
     def assemble_samples(self, rows: Integers, grid: OverwritingGrid | ResolvedGrid) -> Iterator[Singles]:
         """Yield the samples of some rows as blocks (47, B) of columns of `traj`."""
@@ -162,7 +167,9 @@ def prepare_original_subset(
     part = assign_parts_by_id(entries.track_id)
     kept, dropped = keep_samples(part, find_drops(entries, full_future=full_future))
     left_out = _drop_zero_counts({SAME_ID: shared, ID_ZERO: zeros})
-    return CspSubset(recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, left_out, None)
+    return CspSubset(
+        recorded.dataset_id, entries, *code_maneuvers(entries), part, kept, dropped, left_out, None, recorded.by_frame
+    )
 
 
 def prepare_clean_subset(

@@ -74,7 +74,7 @@ def test_the_files_are_those_of_the_script_on_the_raw_text(ngsim, tmp_path):
         assert len(samples) > 100
         assert contents["traj"].dtype == np.float32
         np.testing.assert_array_equal(contents["traj"], np.array(samples))
-        assert contents["tracks"].shape == (6, max(vehicle for _, vehicle in tracks))
+        assert contents["tracks"].shape == tuple(map(max, zip(*tracks, strict=True)))
         for place in np.ndindex(contents["tracks"].shape):
             track = tracks.get((place[0] + 1, place[1] + 1))
             if track is None:
@@ -85,6 +85,34 @@ def test_the_files_are_those_of_the_script_on_the_raw_text(ngsim, tmp_path):
         assert file.samples + sum(file.dropped.values()) == file.entries == sum(t.shape[1] for t in tracks.values())
     assert export.overwritten > 0
     assert [facts["subset"] for facts in export.datasets] == list(KEYS)
+
+
+def sort_rows(rows, order):
+    if order == "frame":
+        return sorted(rows, key=lambda row: (row[1], row[0]))
+    return rows[::-1] if order == "other" else rows
+
+
+@pytest.mark.parametrize("order", ["vehicle", "frame", "other"])
+def test_samples_keep_the_order_of_the_files_rows(tmp_path, order):
+    """Of two data sets the second one has no vehicle in validation, so `tracks` of ValSet has one row."""
+    rows = sort_rows(make_rows(0), order)
+    alone = [(1, frame, "20.000", f"{5 * frame:.3f}", 2) for frame in range(1, 61)]
+    lake = ingest(tmp_path / "lake", tmp_path / "raw", {"us-101-0750": rows, "us-101-0805": alone})
+    export = export_csp(Settings(lake=lake), tmp_path / "out", CspOptions())
+    as_read = {
+        1: [(v, f, float(x), float(y), lane) for v, f, x, y, lane in (sorted(rows) if order == "other" else rows)]
+    }
+    as_read[2] = [(v, f, float(x), float(y), lane) for v, f, x, y, lane in alone]
+    expected, _ = run_script(as_read, folded=(1, 2, 3))
+    contents = read(tmp_path / "out")
+    for part, (samples, tracks) in expected.items():
+        np.testing.assert_array_equal(contents[part]["traj"], np.array(samples).reshape(-1, 47))
+        assert contents[part]["tracks"].shape == tuple(map(max, zip(*tracks, strict=True)))
+    assert [len(contents[part]["tracks"]) for part in PARTS] == [2, 1, 1]
+    assert [note for note in export.notes if "neither" in note] == [
+        "us-101-0750: its files are sorted neither by vehicle nor by frame; samples are sorted by vehicle"
+    ] * (order == "other")
 
 
 @pytest.mark.parametrize("clean", [False, True])
@@ -236,7 +264,7 @@ def test_a_recording_keeps_its_number_and_parts_may_be_empty(tmp_path):
     assert [len(part["traj"]) for part in contents.values()] == [8, 8, 0]
     assert set(contents["train"]["traj"][:, 0]) == {2.0}
     assert contents["eval"]["traj"].shape == (0, 47)
-    assert [part["tracks"].shape for part in contents.values()] == [(6, 1), (6, 2), (6, 0)]
+    assert [part["tracks"].shape for part in contents.values()] == [(2, 1), (2, 2), (0, 0)]
     assert export.notes == ["TestSet.mat: no samples"]
 
 
