@@ -66,7 +66,8 @@ def write_output(target: Path, content: bytes | Callable[[BinaryIO], object]) ->
 def _is_stream(target: Path) -> bool:
     """Return whether a path is a pipe, a device or an open descriptor (/dev/stdout), which nothing may replace."""
     leads_to = target.readlink() if target.is_symlink() else target
-    return Path("/proc") in (target.parent / leads_to).parents or (target.exists() and not target.is_file())
+    places = (target.parent.resolve(), target.parent / leads_to)
+    return any(Path("/proc") in place.parents for place in places) or (target.exists() and not target.is_file())
 
 
 def remove_unfinished(folder: Path) -> None:
