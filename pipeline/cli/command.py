@@ -38,7 +38,10 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
     try:
         yield terminal
         sys.stdout.flush()  # what fails here would otherwise fail at exit
-    except (typer.Exit, typer.Abort, typer.TyperException):
+    except typer.TyperException as misuse:
+        misuse.message = make_visible(misuse.message, keep="\n")
+        raise
+    except (typer.Exit, typer.Abort):
         raise
     except TracklakeError as error:
         _show_traceback_if_debugging(error)

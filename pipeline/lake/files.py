@@ -18,6 +18,7 @@ from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import sync
+from tracklake.schemas.text import quote_shell
 
 STORE = ".files"
 """Folder of the lake for the content of tables, under names with fingerprints; other folders have links to it."""
@@ -236,7 +237,8 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
         if values.items() <= stated.items():
             if not (root / file.path).is_file():
                 raise DamagedFileError(
-                    f"{root / file.path}: a live file of the lake is missing; `tracklake run SOURCE --lake {root}` on "
+                    f"{root / file.path}: a live file of the lake is missing; `tracklake run SOURCE --lake "
+                    f"{quote_shell(root)}` on "
                     "the raw files makes it again"
                 )
             by_values.setdefault(tuple(stated.items()), []).append(root / file.path)

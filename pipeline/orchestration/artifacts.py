@@ -15,6 +15,7 @@ from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult
 from tracklake.pipeline.stages.report import PAGE, read_quality
+from tracklake.schemas.text import make_visible
 
 OUR_FAULTS = (400, 422)
 """HTTP statuses with which Prefect's API answers a request that is wrong in itself."""
@@ -104,7 +105,7 @@ def tabulate_messages(root: Path, lake_id: str, result: RunResult) -> FigureTabl
         ("skipped, no raw data", "INFO", result.skipped),
     )
     rows = [
-        {"kind": kind, "level": level, "message": message}
+        {"kind": kind, "level": level, "message": make_visible(message, keep="\n")}
         for kind, level, messages in kinds
         for message in dict.fromkeys(messages)
     ]
