@@ -83,6 +83,7 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
         .render(
             **{**quality, "rules": rank_rules(quality["rules"])},
             banner=describe_origins(quality),
+            recorded=not quality["subsets"] or any(row["origin"] == "recorded" for row in quality["subsets"]),
             drawings=_draw_plots(quality, addresses),
             stage={row["stage"]: row for row in quality["stages"]},
             found_in={
