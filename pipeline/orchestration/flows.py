@@ -271,3 +271,6 @@ def _mute_console() -> None:
         for handler in list(logger.handlers):
             if isinstance(handler, PrefectConsoleHandler):
                 logger.removeHandler(handler)
+    # Nor what it logs of a server that breaks off, which is one message of ours.
+    logging.root.addHandler(logging.NullHandler())
+    logging.raiseExceptions = False

@@ -1,6 +1,7 @@
 """The folder in which Prefect keeps its own state, looked at before Prefect is imported."""
 
 import os
+import resource
 import tempfile
 from functools import cache
 from importlib import import_module
@@ -11,18 +12,37 @@ from tracklake.schemas.errors import TracklakeError
 
 TRIAL_BYTES = 1 << 20
 """Bytes that a disk must still take for Prefect to record a run on it."""
+FEWEST_FILES, MANY_FILES = 128, 4096
+"""Open files without which a run is not begun, and to which the limit is raised where the system allows it."""
 
 
 def import_flows() -> ModuleType:
     """Import the flows, and with them Prefect, which takes seconds: only where there is work to do.
 
     Prefect reads its variables, and makes its home, when it is imported.
+
+    Raises:
+        TracklakeError: this process may open too few files at once; the embedded server would wait for ever.
     """
+    _provide_descriptors()
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")  # it locks the embedded server's database
     os.environ.setdefault("DO_NOT_TRACK", "1")
     if find_home_fault() is not None:
         os.environ["PREFECT_HOME"] = str(make_temporary_folder())
     return import_module("tracklake.pipeline.orchestration.flows")
+
+
+def _provide_descriptors() -> None:
+    """Raise the limit of open files as far as this process may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MANY_FILES if hard == resource.RLIM_INFINITY else min(hard, MANY_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if wanted < FEWEST_FILES:
+        raise TracklakeError(
+            f"this process may open {wanted} files at once; expected {FEWEST_FILES} or more. Raise the limit, for "
+            "instance by `ulimit -n 1024`, and run the same command again."
+        )
 
 
 @cache

@@ -1,6 +1,7 @@
 """The Prefect server that records a run: the one that PREFECT_API_URL names, or one inside this process."""
 
 import logging
+import re
 import socket
 import sqlite3
 import threading
@@ -25,6 +26,8 @@ from tracklake.schemas.errors import TracklakeError
 
 SERVER_START_S = 120.0
 """Longest wait for the embedded server, in seconds."""
+EXCEPTION_LINE = re.compile(r"^[\w.]+(?:Error|Exception): .*$", re.MULTILINE)
+"""Line of a traceback that names the error."""
 LOCK_WAIT_S = 5.0
 """Longest wait for another process that locks Prefect's database, in seconds."""
 MAX_CHECKED_BYTES = 64 << 20
@@ -174,9 +177,9 @@ def _embed_server() -> str:
         limit = time.monotonic() + SERVER_START_S
         while not server.started:
             if not thread.is_alive() or time.monotonic() > limit:
-                last = "".join(failures).strip().splitlines()[-1:] or ["it gave no reason"]
+                last = EXCEPTION_LINE.findall("".join(failures))[-1:] or ["it gave no reason"]
                 raise PrefectError(
-                    f"Prefect's embedded server did not start ({last[0]}). Look at PREFECT_HOME, or set "
+                    f"Prefect's embedded server did not start ({last[0]}). Look at PREFECT_HOME and its disk, or set "
                     "PREFECT_API_URL to a running server."
                 )
             time.sleep(0.01)

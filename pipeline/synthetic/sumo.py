@@ -115,7 +115,8 @@ def _call(home: Path, program: str, arguments: list[str]) -> None:
             _RUNNING.discard(process)
     if process.returncode:
         tail = "\n".join(errors.strip().splitlines()[-5:])
-        raise SumoError(f"{program} failed with exit code {process.returncode}:\n{tail}")
+        end = f"with exit code {process.returncode}" if process.returncode > 0 else f"by signal {-process.returncode}"
+        raise SumoError(f"{program} ended {end}; its last lines: {tail or 'none'}")
 
 
 def stop_programs() -> None:

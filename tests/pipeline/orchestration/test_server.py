@@ -1,6 +1,7 @@
 """The server that records a run: the one that is named, the embedded one, and a temporary one where that cannot be."""
 
 import os
+import resource
 import sqlite3
 from unittest.mock import Mock
 
@@ -14,6 +15,7 @@ from prefect.settings import (
 )
 
 from tracklake.pipeline.orchestration import prefect_home, server
+from tracklake.schemas.errors import TracklakeError
 
 
 @pytest.fixture
@@ -152,3 +154,16 @@ def test_a_server_that_does_not_start_says_why_and_leaves_no_socket(monkeypatch,
     with pytest.raises(server.PrefectError, match="did not start \\(ValueError: no such revision\\)"):
         server._embed_server()
     assert [str(warning.message) for warning in recwarn if warning.category is ResourceWarning] == []
+
+
+@pytest.mark.parametrize(("hard", "raised"), [(24, None), (1000, 1000), (resource.RLIM_INFINITY, 4096)])
+def test_too_few_open_files_are_refused_and_few_are_raised(monkeypatch, hard, raised):
+    changed = []
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: (24, hard))
+    monkeypatch.setattr(resource, "setrlimit", lambda _which, limits: changed.append(limits))
+    if raised is None:
+        with pytest.raises(TracklakeError, match=r"may open 24 files at once; expected 128 or more.*ulimit -n 1024"):
+            prefect_home.import_flows()
+    else:
+        prefect_home._provide_descriptors()
+        assert changed == [(raised, hard)]

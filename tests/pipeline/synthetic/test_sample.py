@@ -315,7 +315,7 @@ def test_without_sumo_the_message_says_what_to_install(tmp_path, monkeypatch):
 
 
 def test_a_failed_run_says_what_sumo_said(tmp_path):
-    with pytest.raises(SumoError, match=r"sumo failed with exit code 1:(.|\n)*nowhere.xml"):
+    with pytest.raises(SumoError, match=r"sumo ended with exit code 1;(.|\n)*nowhere.xml"):
         sumo_runs._call(sumo_runs.find_sumo(), "sumo", ["-n", str(tmp_path / "nowhere.xml")])
 
 
