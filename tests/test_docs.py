@@ -32,7 +32,7 @@ def newcomer(command, lake, sample, tmp_path):
 
 SHORTER = {
     "--seconds 60": "--seconds 1",
-    "--minutes 0.2 --seed 3": " ".join(SAMPLE),
+    "--minutes 0.2 --seed 3": " ".join([*SAMPLE, "--format", "ngsim-text"]),
     "--examples 1000": "--examples 200",
 }
 """Options of the README's commands with shorter ones; the sample is that of the session, simulated already."""

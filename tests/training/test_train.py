@@ -29,9 +29,6 @@ def tensors(tmp_path_factory):
     return write_tiny(tmp_path_factory.mktemp("tensors"))
 
 
-# What it learns
-
-
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
     """The small LSTM on vehicles that keep their speed, brake or accelerate, under the protocol `csp`."""
