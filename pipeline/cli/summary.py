@@ -1,5 +1,7 @@
 """Summaries of a run in the terminal: what was done, the report's figures, the quality of estimates."""
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,26 @@ from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
 from tracklake.schemas.text import quote_shell
 
+NUMBER = re.compile(r"\d[\d.,]*")
+FEW_NOTES = 3
+"""Most notes that differ only in names and numbers and are printed one by one."""
+
+
+def join_notes(notes: Iterable[str]) -> list[str]:
+    """Return notes once each; of many that differ only in the name before a colon and in numbers, one and a count."""
+    alike: dict[str, list[str]] = {}
+    for note in dict.fromkeys(notes):
+        name, separator, text = note.partition(": ")
+        alike.setdefault(NUMBER.sub("0", text if separator and " " not in name else note), []).append(note)
+    return [
+        *(note for same in alike.values() if len(same) <= FEW_NOTES for note in same),
+        *(f"{same[0]} (and {len(same) - 1} alike)" for same in alike.values() if len(same) > FEW_NOTES),
+    ]
+
 
 def show_result(terminal: Terminal, result: RunResult) -> None:
     """Print the notes, refusals and failures of a run."""
-    for note in dict.fromkeys(result.notes):
+    for note in join_notes(result.notes):
         terminal.print_line(f"note: {note}", style="dim")
     if result.skipped and terminal.verbose:
         shown = ", ".join(result.skipped[:5]) + (", ..." if len(result.skipped) > 5 else "")

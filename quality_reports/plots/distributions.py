@@ -32,7 +32,7 @@ def draw_speed_histogram(histogram: Sequence[Row], summary: Sequence[Row]) -> st
         summary: rows of speeds.sql.
     """
     speeds = [row["speed_mps"] for row in histogram]
-    x = Scale(min(0, *speeds, 0), max([*speeds, 10]) + 1, LEFT, WIDTH - RIGHT)
+    x = Scale(*find_speed_range(speeds), LEFT, WIDTH - RIGHT)
     drawn = []
     height = TOP
     for dataset in list_names(histogram, "dataset"):
@@ -62,7 +62,7 @@ def draw_speed_ranges(summary: Sequence[Row]) -> str:
         summary: rows of speeds.sql.
     """
     rows = [row for row in summary if row["subset"] is not None]
-    x = Scale(min(0, *(row["min_mps"] for row in rows), 0), max(row["max_mps"] for row in rows) + 1, LABELS, WIDTH)
+    x = Scale(*find_speed_range([row[name] for row in rows for name in ("min_mps", "max_mps")]), LABELS, WIDTH)
     lines, (thin, thick, median) = _place_lines(rows), ("", "", "")
     for row in rows:
         y = lines[row["dataset"], row["subset"]]
@@ -109,6 +109,12 @@ def draw_start_positions(positions: Sequence[Row], starts: Sequence[Row]) -> str
     legend += draw_text(WIDTH - RIGHT, 14, f"the largest mark: {most:,} vehicles in 2 m", anchor="end")
     content = legend + marks + f'<path d="{ticks}" stroke="{INK}" stroke-width="2" fill="none"/>'
     return _wrap_lines(lines, x, "x of the first entry (m)", "First positions of tracks per subset", content)
+
+
+def find_speed_range(speeds: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of a speed axis in m/s: from 0, unless half of the axis would be empty."""
+    low, high = min(speeds), max(speeds)
+    return (min(low, 0.0) if low < high / 2 else math.floor(low) - 1.0), max(math.floor(high) + 1.0, low + 5.0)
 
 
 def draw_mark(x: float, y: float, radius: float, judged: str) -> str:

@@ -6,7 +6,14 @@ import re
 import pytest
 from page_elements import HOSTILE, drop_script, parse
 
-from tracklake.quality_reports.pages.comparison import MINUS, format_difference, format_value, render_comparison
+from tracklake.quality_reports.pages.comparison import (
+    MINUS,
+    format_difference,
+    format_value,
+    judge_change,
+    render_comparison,
+    summarise,
+)
 from tracklake.quality_reports.pages.lake_differences import Side, compare
 from tracklake.quality_reports.pages.rendering import DASH
 
@@ -220,7 +227,9 @@ def test_the_page_shows_every_change_and_fetches_nothing(against, tables):
     html = render_comparison(against(tables, now={"facts": {"lake": "new"}}), report="index.html")
     page = parse(html).elements
     assert "<title>What changed: new against x · tracklake</title>" in html
-    assert '<td class="n">2</td><td class="n">1,235</td><td class="n">+1,233</td>' in html
+    changed = '<td class="n">2</td><td class="n">1,235</td><td class="n worse" title="worse">+1,233</td>'
+    assert changed in html, "more findings"
+    assert html.index('<section id="summary">') < html.index('<section id="figures">')
     assert "<code>vehicles</code></td>" in html
     links = [value for _, attributes in page for name, value in attributes.items() if name in ("src", "href")]
     assert [link for link in links if not link.startswith("#")] == ["index.html"]
@@ -260,3 +269,32 @@ def test_a_figure_of_any_kind_is_put_into_words(value, text):
 @pytest.mark.parametrize(("difference", "text"), [(3, "+3"), (-3, f"{MINUS}3"), (0, ""), (None, ""), (0.25, "+0.25")])
 def test_a_difference_has_a_sign(difference, text):
     assert format_difference({"difference": difference}) == text
+
+
+@pytest.mark.parametrize(
+    ("figure", "difference", "verdict"),
+    [
+        ("rmse_m", -0.1, "better"),
+        ("rmse_m", 0.1, "worse"),
+        ("findings", 2, "worse"),
+        ("share_without_error", 0.1, "better"),
+        ("samples", -1, "worse"),
+        ("vehicles", 5, ""),
+        ("rmse_m", None, ""),
+        ("rmse_m", 0, ""),
+    ],
+)
+def test_a_change_is_for_the_better_or_the_worse_where_a_side_is_better(figure, difference, verdict):
+    assert judge_change({"difference": difference}, figure) == verdict
+
+
+def test_the_summary_counts_the_differences_of_every_part(against, tables):
+    tables["findings"][1] |= {"vehicle_id": 2, "entries": 5}
+    tables["samples"] = tables["samples"][:2]
+    rows = {row["name"]: row for row in summarise(against(tables))}
+    # Findings: 2 entries became 6. Samples: fewer of them and a smaller share kept are worse; vehicles, braking and
+    # neighbors have no better side.
+    assert rows["findings"] == {
+        "name": "findings", "anchor": "rules", "changed": 1, "only": 0, "better": 0, "worse": 1,
+    }  # fmt: skip
+    assert (rows["samples"]["changed"], rows["samples"]["worse"], rows["samples"]["better"]) == (5, 2, 0)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tracklake.quality_reports.plots.axes import Scale, draw_line, find_range, format_number, make_ticks
+from tracklake.quality_reports.plots.distributions import find_speed_range
 from tracklake.quality_reports.plots.rasters import EMPTY, LEVELS, encode_png, grade_values, make_palette
 from tracklake.quality_reports.plots.time_space import COLUMNS, ROWS, Grid, draw_lanes, make_grid, rasterise
 from tracklake.quality_reports.summaries import query, query_frame
@@ -155,3 +156,16 @@ def test_every_lane_has_its_diagram_and_its_marks():
         assert "position (m)" in svg
         assert "time since the recording began (s)" in svg
         assert len(re.findall(r'href="data:image/png;base64,[A-Za-z0-9+/=]+"', svg)) == 1
+
+
+@pytest.mark.parametrize(
+    ("speeds", "ends"),
+    [
+        ([0, 12, 20], (0.0, 21.0)),
+        ([24, 30, 33], (23.0, 34.0)),
+        ([-3, 5], (-3.0, 6.0)),
+        ([5], (4.0, 10.0)),
+    ],
+)
+def test_a_speed_axis_is_not_half_empty(speeds, ends):
+    assert find_speed_range(speeds) == ends
