@@ -89,7 +89,7 @@ def describe_maneuvers(picture: Picture) -> list[str]:
 def describe_marks(picture: Picture, view: picture_rows.View) -> list[str]:
     """Describe the marks that the legend does not show, in one line; no line where there are none."""
     others, own = any(vehicle.has_density for vehicle in picture.vehicles[1:]), picture.own.has_density
-    sigmas = f"{'1 and ' if own else ''}3 sigma at each second{', of others 3' if own and others else ''}"
+    sigmas = f"{'1 and ' if own else ''}3 sigma at each second{', of others 3 at the last' if own and others else ''}"
     marks = {
         f"ellipses: {sigmas}": own or others,
         "thin lines: less probable, with probability": any(map(picture_rows.find_likely, picture.own.forecasts)),
@@ -177,7 +177,7 @@ def _draw_vehicles(to: _Channels, present: list[str], own: str) -> Iterator[alt.
 def _draw_paths(to: _Channels) -> Iterator[alt.Chart]:
     place = {"x": to.along("x_m:Q"), "y": to.across("y_m:Q"), "stroke": to.stroke}
     own, inner, thin = "datum.own", "datum.sigmas === 1", "datum.kind === 'alternative'"
-    faint = alt.when(inner).then(alt.value(0.16)).when(own).then(alt.value(0.06)).otherwise(alt.value(0.02))
+    faint = alt.when(inner).then(alt.value(0.16)).when(own).then(alt.value(0.06)).otherwise(alt.value(0))
     ellipses = name_rows("ellipses").mark_line(interpolate="linear-closed", clip=True)
     yield ellipses.encode(
         **place,

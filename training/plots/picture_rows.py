@@ -139,7 +139,8 @@ def find_likely(forecast: Forecast) -> tuple[Alternative, ...]:
 def list_ellipses(picture: Picture) -> list[Row]:
     """List outlines of the most probable alternatives at whole seconds, ELLIPSE_POINTS rows each.
 
-    The own vehicle's come last, at 3 and 1 sigma; those of others are at 3. The view's border cuts them.
+    The own vehicle's come last, at 3 and 1 sigma. Others have one each, at 3 sigma of the last second: with all of them
+    a scene is one coloured fog. The view's border cuts them.
     """
     seconds = slice(picture.rate_hz - 1, None, picture.rate_hz)
     return [
@@ -156,9 +157,12 @@ def list_ellipses(picture: Picture) -> list[Row]:
         for sigmas in (SIGMAS if vehicle is picture.own else SIGMAS[:1])
         for forecast in vehicle.forecasts
         for best in forecast.alternatives[:1]
-        for second, outline in enumerate(
-            trace_ellipses(best.mean_m[seconds], best.sigma_m[seconds], best.correlation[seconds], sigmas).tolist(), 1
-        )
+        for second, outline in list(
+            enumerate(
+                trace_ellipses(best.mean_m[seconds], best.sigma_m[seconds], best.correlation[seconds], sigmas).tolist(),
+                1,
+            )
+        )[0 if vehicle is picture.own else -1 :]
         for order, (x_m, y_m) in enumerate(outline)
     ]
 
