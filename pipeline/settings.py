@@ -74,6 +74,9 @@ class Settings(BaseSettings):
     split_purge_s: float = Field(
         8.0, ge=0, description="time-blocks: time between two blocks, s; at least history and future"
     )
+    drop_cut_samples: bool = Field(
+        False, description="time-blocks: samples of val and eval with a neighbor that is cut off are left out"
+    )
 
     @classmethod
     def settings_customise_sources(

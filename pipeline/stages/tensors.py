@@ -1,10 +1,11 @@
 """Tensors: the split's tracks, samples and neighbors as flat arrays."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest, find_free_path, write_folder
@@ -17,7 +18,9 @@ from tracklake.pipeline.stages.stage import INGEST, Stage, StageError, StageResu
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
 from tracklake.schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, TRACKS, VEHICLES
+from tracklake.schemas.columns import PARTS
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.split_recipes import TIME_BLOCKS
 from tracklake.schemas.tensors import INDEX_FILE
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane", "speed_mps")
@@ -37,11 +40,16 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     if not included:
         return StageResult(info={"path": None, "samples": 0}, notes=["no subset gives samples: no tensors"])
 
+    drops = drops_cut_samples(settings)
+    cut_samples = np.zeros(len(PARTS), np.int64)
+
     def build_all() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
         for subset in included:
             vehicles = left_out.filter(**subset.partition)["vehicle_id"]
             blocks = splits.filter(**subset.partition)
-            yield subset.facts, build_subset(subset, blocks, vehicles, protocol, storage)
+            tensors = build_subset(subset, blocks, vehicles, protocol, storage, drop_cut=drops)
+            cut_samples[:] += tensors.cut_samples
+            yield subset.facts, tensors
 
     def write(folder: Path) -> None:
         recipe = {**_describe_recipe(settings, split), "left_out_vehicles": left_out.height}
@@ -50,8 +58,28 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     path = find_free_path(root, f"{TENSORS}/{split}/{reader.job.fingerprint}")
     files = write_folder(root, path, write)
     index = json.loads((root / path / INDEX_FILE).read_text(encoding="utf-8"))
-    info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": index["samples_by_part"]}
-    return StageResult(files={TENSORS: files}, info=info)
+    by_part = index["samples_by_part"]
+    cut = dict(zip(PARTS, cut_samples.tolist(), strict=True))
+    info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": by_part, "cut_samples_by_part": cut}
+    return StageResult(files={TENSORS: files}, info=info, notes=_list_cut(protocol.split, cut, by_part, drops=drops))
+
+
+def drops_cut_samples(settings: Settings) -> bool:
+    """Return whether samples with a neighbor that the split cuts off are left out of val and eval."""
+    return settings.drop_cut_samples and settings.get_protocol().split == TIME_BLOCKS
+
+
+def _list_cut(split: str, cut: Mapping[str, int], by_part: Mapping[str, int], *, drops: bool) -> list[str]:
+    """List a note for each part of time-blocks in which samples lost a neighbor."""
+    if split != TIME_BLOCKS:
+        return []
+    what = "left out" if drops else "kept (drop_cut_samples = true leaves them out)"
+    return [
+        f"{split}: {count:,} of {by_part[part] + drops * count:,} samples of {part} have a neighbor in another block "
+        f"or in no part, which they do not see: {what}"
+        for part, count in cut.items()
+        if count
+    ]
 
 
 def _describe_recipe(settings: Settings, split: str) -> dict[str, Any]:
@@ -67,7 +95,13 @@ def read_split(reader: LakeReader, split: str) -> tuple[pl.DataFrame, pl.DataFra
 
 
 def build_subset(
-    reader: SubsetReader, blocks: pl.DataFrame, left_out: pl.Series, protocol: Protocol, storage: str
+    reader: SubsetReader,
+    blocks: pl.DataFrame,
+    left_out: pl.Series,
+    protocol: Protocol,
+    storage: str,
+    *,
+    drop_cut: bool,
 ) -> SubsetTensors:
     """Read a subset's tables and build its arrays.
 
@@ -77,6 +111,7 @@ def build_subset(
         left_out: its vehicles that the split leaves out of all parts but `train`.
         protocol: the protocol of the samples.
         storage: how positions are stored.
+        drop_cut: whether samples outside train with a neighbor that is cut off are left out.
     """
     return build_subset_tensors(
         put_on_clock(reader.table(TRACKS, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
@@ -88,6 +123,7 @@ def build_subset(
         protocol=protocol,
         storage=storage,
         left_out=left_out,
+        drop_cut=drop_cut,
         **reader.clock,
     )
 
@@ -101,7 +137,8 @@ def _list_sampled_subsets(reader: LakeReader, splits: pl.DataFrame, protocol: Pr
 
 
 def _describe_settings(settings: Settings) -> dict[str, Any]:
-    return {
+    dropped = {"drop_cut_samples": True} if drops_cut_samples(settings) else {}
+    return dropped | {
         "protocol": settings.get_protocol().digest,
         "positions": settings.tensor_positions,
     }
@@ -151,4 +188,6 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
             f"{json.dumps(found.get('parameters', {}))}) than the settings now give ({recipe.digest}: "
             f"{recipe.parameters}). Run `tracklake run` with these settings, or set what they were made with."
         )
+    if drops_cut_samples(settings) != commit.built_from.get("drop_cut_samples", False):
+        raise StageError(f"{root}: the tensors were made with another `drop_cut_samples`. Run `tracklake tensors`.")
     return root / str(commit.info["path"])

@@ -39,6 +39,7 @@ class SubsetTensors:
         max_error_m: largest rounding error of stored positions: along, across; 0 without rows.
         squared_error_m2: sums of the squared rounding errors: along, across.
         last_lane: highest lane of any entry; 0 if no lane is known.
+        cut_samples: number of samples with a neighbor that is cut off, in the order of PARTS; train is not counted.
     """
 
     arrays: Arrays
@@ -46,6 +47,7 @@ class SubsetTensors:
     max_error_m: tuple[float, float]
     squared_error_m2: tuple[float, float]
     last_lane: int
+    cut_samples: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,7 @@ def build_subset_tensors(
     protocol: Protocol,
     storage: str = POSITION_STORAGES[0],
     left_out: pl.Series | None = None,
+    drop_cut: bool = False,
 ) -> SubsetTensors:
     """Build the arrays of one subset of the split.
 
@@ -112,6 +115,7 @@ def build_subset_tensors(
         protocol: protocol of the clock, samples and neighbors.
         storage: storage of positions, one of `schemas.tensors.POSITION_STORAGES`.
         left_out: ids of vehicles (`schemas.splits.SPLIT_LEFT_OUT`) whose entries outside `train` are in no part.
+        drop_cut: whether samples outside `train` with a neighbor in another block or in no part are left out, too.
 
     Raises:
         ValueError: blocks overlap; the clock is not sorted; samples or neighbors do not fit the clock (they were made
@@ -128,17 +132,18 @@ def build_subset_tensors(
     x_m, y_m, speed_mps = (clock[name].to_numpy()[kept.is_kept] for name in ("x_m", "y_m", "speed_mps"))
     stored = store_positions(x_m, y_m, storage=storage, where=where)
     lane = clock["lane"].fill_null(0).to_numpy()[kept.is_kept]
+    sample_arrays, cut_samples = _build_sample_arrays(kept, samples, neighbors, protocol, where, drop_cut=drop_cut)
     arrays = {
         "position_m": stored.steps,
         "speed_mps": speed_mps,
         "lane": lane,
         "finding": mark_findings(kept.vehicle_id, kept.tick, findings, **rates)[kept.is_kept],
         **_build_run_arrays(kept, vehicles, where),
-        **_build_sample_arrays(kept, samples, neighbors, protocol, where),
+        **sample_arrays,
     }
     arrays = {array.name: np.ascontiguousarray(arrays[array.name], dtype=array.stored_as(storage)) for array in ARRAYS}
     last_lane = int(lane.max(initial=0))
-    return SubsetTensors(arrays, stored.centre_m, stored.max_error_m, stored.squared_error_m2, last_lane)
+    return SubsetTensors(arrays, stored.centre_m, stored.max_error_m, stored.squared_error_m2, last_lane, cut_samples)
 
 
 @dataclass(frozen=True)
@@ -205,9 +210,18 @@ def _build_run_arrays(kept: _KeptEntries, vehicles: pl.DataFrame, where: str) ->
 
 
 def _build_sample_arrays(
-    kept: _KeptEntries, samples: pl.DataFrame, neighbors: pl.DataFrame, protocol: Protocol, where: str
-) -> dict[str, npt.NDArray[Any]]:
-    """Build the arrays of samples, neighbors and scenes; rows are those of the whole clock until `new_row`."""
+    kept: _KeptEntries,
+    samples: pl.DataFrame,
+    neighbors: pl.DataFrame,
+    protocol: Protocol,
+    where: str,
+    *,
+    drop_cut: bool,
+) -> tuple[dict[str, npt.NDArray[Any]], tuple[int, ...]]:
+    """Build the arrays of samples, neighbors and scenes, and count the samples outside train that lost a neighbor.
+
+    Rows are those of the whole clock until `new_row`.
+    """
     samples = _sort_rows(samples.filter(pl.col("protocol") == protocol.name))
     neighbors = _sort_rows(neighbors.filter(pl.col("protocol") == protocol.name))
     origin = _find_origins(samples, kept.whole_runs, protocol, where)
@@ -218,14 +232,21 @@ def _build_sample_arrays(
         & (origin - first[origin] >= protocol.history_ticks - 1)
         & (last[origin] - origin >= protocol.min_future_ticks)
     )
-    together = usable[pair_sample] & (kept.block[pair_row] == kept.block[origin[pair_sample]])
+    beside = kept.block[pair_row] == kept.block[origin[pair_sample]]
+    part = kept.part_of_block[kept.block[origin]]
+    cut = np.zeros(len(origin), dtype=np.bool_)
+    cut[pair_sample[~beside]] = True
+    cut &= usable & (part != PARTS.index("train"))
+    if drop_cut:
+        usable &= ~cut
+    together = usable[pair_sample] & beside
     number = np.cumsum(usable) - 1
     pairs_of = np.bincount(number[pair_sample[together]], minlength=int(usable.sum()))
     pair_row, own = pair_row[together], origin[usable]
     sample_of_row = np.full(len(kept.tick), -1, dtype=np.int64)
     sample_of_row[own] = np.arange(len(own))
     scenes = find_scenes(kept.tick[kept.is_kept], kept.block[kept.is_kept], sample_of_row[kept.is_kept])
-    return {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "sample_row": kept.new_row[own],
         "sample_part": kept.part_of_block[kept.block[own]],
         "sample_lateral": _encode_names(samples["lateral_maneuver"], LATERAL_MANEUVERS)[usable],
@@ -240,6 +261,7 @@ def _build_sample_arrays(
         "scene_sample": scenes.sample,
         "scene_part": kept.part_of_block[scenes.block],
     }
+    return arrays, tuple(np.bincount(part[cut], minlength=len(PARTS)).tolist())
 
 
 def count_sizes(arrays: Arrays) -> dict[str, int]:

@@ -9,6 +9,7 @@ from stage_runs import plan_stage, run_stage
 
 from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.stage import StageError
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -76,3 +77,23 @@ def test_tensors_are_made_again_where_findings_change(remade):
     validated = {job.key: job.fingerprint for job in plan_stage(root, "validate", settings)}
     assert validated
     assert job.built_from["validate"] == validated
+
+
+def test_samples_with_a_neighbor_cut_off_are_counted_and_dropped_by_setting(remade):
+    """In time-blocks of 10 s, vehicles at a border are left out of eval, and those beside them do not see them."""
+    given = {"lake": remade[0], "split": "time-blocks", "splits": ["time-blocks"], "split_block_s": 10.0}
+    found = {}
+    for name in ("samples", "split"):
+        run_stage(remade[0], name, Settings(**given))
+    for drops in (False, True):
+        settings = Settings(**given, drop_cut_samples=drops)
+        run_stage(remade[0], "tensors", settings)
+        commit = load(remade[0]).commits["tensors"]
+        found[drops] = (commit.info["samples_by_part"], commit.info["cut_samples_by_part"])
+        assert tensor_folder(remade[0], load(remade[0]), settings).is_dir()
+        with pytest.raises(StageError, match="another `drop_cut_samples`"):
+            tensor_folder(remade[0], load(remade[0]), Settings(**given, drop_cut_samples=not drops))
+    (kept, cut), (fewer, same) = found[False], found[True]
+    assert cut == same
+    assert cut["train"] == 0
+    assert (fewer["train"], fewer["eval"]) == (kept["train"], kept["eval"] - cut["eval"])

@@ -157,6 +157,19 @@ def test_a_tick_between_two_frames_stands_in_a_block_only_if_both_do():
     assert 1 not in ticks_of(build(sampled=samples(), split=split))
 
 
+def test_samples_with_a_neighbor_cut_off_are_counted_and_left_out_on_demand():
+    """TOP is left out of eval, so that the sample of 3 does not see it; its own sample is in no part."""
+    given = {"around": neighbors((3, 1, 20, TOP)), "left_out": pl.Series([TOP], dtype=pl.Int32)}
+    kept, dropped = build_tensors(**given), build_tensors(**given, drop_cut=True)
+    assert kept.cut_samples == dropped.cut_samples == (0, 0, 1)
+    assert (kept.arrays["sample_row"].tolist(), dropped.arrays["sample_row"].tolist()) == ([1], [])
+    assert dropped.arrays["lane"].tolist() == kept.arrays["lane"].tolist(), "its track stays"
+    trained = build_tensors(**given, split=blocks((0, 1, 100, None, None, "train")), drop_cut=True)
+    assert (trained.cut_samples, len(trained.arrays["sample_row"])) == ((0, 0, 0), 2)
+    alone = build_tensors(left_out=given["left_out"], drop_cut=True)
+    assert (alone.cut_samples, alone.arrays["sample_row"].tolist()) == ((0, 0, 0), [1])
+
+
 def test_a_vehicle_left_out_keeps_what_trains_and_nothing_else():
     # Vehicle 3 has ticks 0 to 2 in train and 4 in eval; TOP has 0 to 2 in train and 3, 4 in eval.
     split = blocks((0, 1, 26, None, None, "train"), (1, 27, 70, None, None, "eval"))
