@@ -69,7 +69,7 @@ KEY = pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64)
 PARSING_THREADS = 3
 """Chunks of one file parsed at once; more threads cost memory and help little, since the parser is threaded too."""
 
-SAMPLE_BYTES = 4 << 20
+SAMPLE_BYTES = 1 << 20
 """Size of the first part of a file that is judged before the file is read, in bytes."""
 
 MAX_RECORDINGS = 200
