@@ -54,7 +54,8 @@ def render_pages(
     names = names or name_pages(figures["subsets"])
     extremes = {rule.name: rule.extreme for rule in rules}
     declared = [
-        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]} for rule in figures["rules"]
+        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]}
+        for rule in rank_rules(figures["rules"])
     ]
     judged = judge(figures["subsets"], figures["subset_scores"], figures["rules"], figures["completeness"])
     verdicts = {(row["dataset"], row["subset"]): row for row in judged}

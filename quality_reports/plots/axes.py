@@ -1,6 +1,6 @@
 """Axes, ticks and lines as plain SVG: the fast path for plots that a subset's page draws by the dozen.
 
-A plot takes 7 ms this way and 85 to 185 ms by Altair (benchmarks/report_plots.py), and every subset has a page. Plots
+A plot takes 2.3 ms this way and 85 to 185 ms by Altair (benchmarks/report_plots.py), and every subset has a page. Plots
 that a whole report has once are Altair's, in `charts.py`.
 """
 
@@ -120,11 +120,13 @@ def draw_line(points: pl.DataFrame, x: Scale, y: Scale, of: str, against: str) -
         of: drawn column; its nulls break the line.
         against: column along the horizontal axis.
     """
-    known = points.with_columns(follows=pl.col("follows") & pl.col(of).shift().is_not_null()).drop_nulls(of)
-    follows = known["follows"].to_numpy()
-    at = format_points(x.to_pixels(known[against].to_numpy()), y.to_pixels(known[of].to_numpy()))
-    commands = np.char.add(np.where(follows, "L", "M"), at)
-    return "".join(np.char.add(commands, np.where(follows, "", "h0")).tolist())
+    known = points[of].is_not_null().to_numpy()
+    follows = points["follows"].to_numpy() & np.concatenate([[False], known[:-1]])
+    values = points[of].cast(pl.Float64).to_numpy()  # NaN where it is null
+    at = format_points(x.to_pixels(points[against].to_numpy()[known]), y.to_pixels(values[known]))
+    # A point that does not follow begins a line, and is drawn by itself as well.
+    begun = np.char.add(np.where(follows[known], "L", "M"), at)
+    return "".join(np.char.add(begun, np.where(follows[known], "", "h0")).tolist())
 
 
 def format_points(across: Floats, down: Floats) -> NDArray[np.str_]:
