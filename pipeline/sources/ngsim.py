@@ -32,6 +32,7 @@ from tracklake.pipeline.sources.ngsim_dialects import (
 from tracklake.pipeline.sources.ngsim_heading import CSV_BARE, MAPPED, TEXT, Heading, detect, read_heading, refine
 from tracklake.pipeline.sources.ngsim_plausibility import (
     Verdict,
+    counts_from_start,
     find_contradictions,
     find_order,
     judge,
@@ -164,6 +165,9 @@ def _inspect(file: RawFile, heading: Heading, mapping: ColumnMapping | None) -> 
     if not use_time:
         verdict.use_time = False
         verdict.notes.insert(0, "Global_Time is missing, so the frames tell one recording")
+    elif tells and counts_from_start(timed):
+        verdict.use_time = False
+        verdict.notes.insert(0, "Global_Time counts from the recording's start, so the frames tell one recording")
     elif heading.units.get("Global_Time") == "s":
         verdict.notes.insert(0, "Global_Time is in seconds, and is read as such")
     elif not tells and mapping is None:

@@ -10,6 +10,7 @@ from itertools import combinations
 import polars as pl
 
 from tracklake.pipeline.sources.column_mapping import SPEED_UNITS
+from tracklake.pipeline.sources.ngsim_dialects import DAY_MS
 from tracklake.schemas.columns import FOOT_M
 
 FEWEST = 30
@@ -20,7 +21,10 @@ FRAME_MS = 100
 
 FRAMES_PER_S = 1000 / FRAME_MS
 
-SWAPS = (("Local_X", "Local_Y"), ("v_Vel", "v_Acc"), ("Preceding", "Following"), ("Vehicle_ID", "Frame_ID"))
+SWAPS = (
+    *(("Local_X", "Local_Y"), ("v_Vel", "v_Acc"), ("Preceding", "Following")),
+    *(("Vehicle_ID", "Frame_ID"), ("v_length", "v_Width")),
+)
 """Pairs of columns that files hold in the other order."""
 
 MOVING = 5.0
@@ -65,12 +69,12 @@ class Figures:
         ms_per_frame: median step of Global_Time between consecutive frames of a vehicle, in its unit.
         mean_ms_per_frame: the mean of these steps.
         one_time: the value of Global_Time if all rows have the same one.
-        agreement: share of these steps that are the usual one.
         speed_ratio: median speed by positions over v_Vel, of moving vehicles.
         sideways: distance along Local_X over distance along Local_Y.
         backwards: share of negative v_Vel.
         lane_width: median distance between the middles of neighboring lanes.
-        length: median v_length of a vehicle.
+        length: median v_length of the vehicles.
+        width: median v_Width of the vehicles.
         leaders_ahead: share of the named leaders that are ahead.
         followers_behind: share of the named followers that are behind.
     """
@@ -78,12 +82,12 @@ class Figures:
     ms_per_frame: float | None
     mean_ms_per_frame: float | None
     one_time: int | None
-    agreement: float | None
     speed_ratio: float | None
     sideways: float | None
     backwards: float | None
     lane_width: float | None
     length: float | None
+    width: float | None
     leaders_ahead: float | None
     followers_behind: float | None
 
@@ -111,23 +115,33 @@ def measure(rows: pl.DataFrame, rate_hz: float) -> Figures:
         speed=(pl.col("v_Vel") + pl.col("v_before")).abs() / 2,
         along=~pl.col("Direction").is_in([1.0, 3.0]).fill_null(value=False),
     )
-    ratio = (pl.col("dx").pow(2) + pl.col("dy").pow(2)).sqrt() / pl.col("seconds") / pl.col("speed")
-    moving = moves.filter(pl.col("speed") > MOVING)
+    advance = (pl.col("dx").pow(2) + pl.col("dy").pow(2)).sqrt() / pl.col("seconds")
+    # Either of the two is enough: where v_Vel is no speed, it may say that nothing moves.
+    moving = moves.filter((pl.col("speed") > MOVING) | (advance > MOVING))
     roads = moves.filter("along")
     freeway = rows.filter(pl.col("Direction").is_null())
     return Figures(
         ms_per_frame=_as_float(usual),
         mean_ms_per_frame=None if usual is None else _as_float(step.mean()),
         one_time=_find_one_time(rows),
-        agreement=None if usual is None else _as_float((step == usual).mean()),
-        speed_ratio=_as_float(moving.select(ratio).to_series().median()) if moving.height >= FEWEST else None,
+        speed_ratio=_as_float(moving.select(advance / pl.col("speed")).to_series().median())
+        if moving.height >= FEWEST
+        else None,
         sideways=_as_float(roads.select(SIDEWAYS).item()) if roads.height >= FEWEST else None,
         backwards=_as_float((moves["v_Vel"] < 0).mean()) if moves.height >= FEWEST else None,
         lane_width=_measure_lane_width(freeway),
-        length=_measure_length(keyed),
+        length=_measure_size(keyed, "v_length"),
+        width=_measure_size(keyed, "v_Width"),
         leaders_ahead=_measure_neighbors(keyed, "Preceding"),
         followers_behind=_measure_neighbors(keyed, "Following", sign=-1),
     )
+
+
+def counts_from_start(rows: pl.DataFrame) -> bool:
+    """Return whether Global_Time advances with the frames from the recording's start instead of from 1970."""
+    time = pl.col("Global_Time").cast(pl.Int64)
+    start = time - FRAME_MS * pl.col("Frame_ID").cast(pl.Int64)
+    return bool(rows.select((start.n_unique() == 1) & time.max().is_between(1, DAY_MS)).item())
 
 
 def _as_float(value: object) -> float | None:
@@ -164,12 +178,10 @@ def _measure_lane_width(rows: pl.DataFrame) -> float | None:
     return width
 
 
-def _measure_length(rows: pl.DataFrame) -> float | None:
-    lengths = (
-        rows.group_by("key", "Vehicle_ID").agg(pl.col("v_length").first(ignore_nulls=True))["v_length"].drop_nulls()
-    )
-    lengths = lengths.filter(lengths > 0)
-    return _as_float(lengths.median()) if lengths.len() >= 5 else None
+def _measure_size(rows: pl.DataFrame, name: str) -> float | None:
+    sizes = rows.group_by("key", "Vehicle_ID").agg(pl.col(name).first(ignore_nulls=True))[name].drop_nulls()
+    sizes = sizes.filter(sizes > 0)
+    return _as_float(sizes.median()) if sizes.len() >= 5 else None
 
 
 def _measure_neighbors(rows: pl.DataFrame, role: str, *, sign: int = 1) -> float | None:
@@ -208,6 +220,8 @@ def judge(found: Figures) -> Verdict:
         verdict.problems.append(f"{found.backwards:.0%} of v_Vel are negative")
     if found.sideways is not None and found.sideways > 1:
         verdict.problems.append(f"vehicles move {found.sideways:.1f} times as far along Local_X as along Local_Y")
+    if found.length is not None and found.width is not None and found.width > found.length:
+        verdict.problems.append(f"v_Width of {found.width:g} is larger than v_length of {found.length:g}")
     sides = (("Preceding", "ahead", found.leaders_ahead), ("Following", "behind", found.followers_behind))
     verdict.problems += [
         f"only {share:.0%} of the vehicles in {name} are {side}"
@@ -273,11 +287,10 @@ def find_contradictions(rows: pl.DataFrame) -> list[str]:
     errors = [abs((_as_float(ratio.median()) or 0) - 1) for ratio in headways if ratio.len() >= FEWEST]
     # One that fits the other is no other column, even if a script has changed the headways.
     found += ["headways are not what positions and speeds say"] if errors and min(errors) > HEADWAY_ERROR else []
-    sizes = pairs.select(
-        pl.col("v_length", "v_Width").median(), pl.col("v_Acc").abs().median(), pl.col("Lane_ID").max()
+    accel, lane = (
+        _as_float(value) or 0.0
+        for value in pairs.select(pl.col("v_Acc").abs().median(), pl.col("Lane_ID").max()).row(0)
     )
-    length, width, accel, lane = (_as_float(value) or 0.0 for value in sizes.row(0))
-    found += [f"v_Width of {width:g} is larger than v_length of {length:g}"] if width > length else []
     found += [f"v_Acc is about {accel:g}"] if accel > HIGHEST_ACCEL else []
     return found + ([f"Lane_ID is up to {lane:g}"] if lane > LANES else [])
 

@@ -41,11 +41,12 @@ def _find_inputs(root: Path, manifest: Manifest, settings: Settings) -> dict[str
 
 
 def _describe_settings(settings: Settings) -> dict[str, Any]:
-    """Return the settings that change what is in the lake, not where it is or how fast it is made; thresholds apart.
+    """Return the settings that change what is made of the tracks; thresholds apart.
 
     Those that the protocol decides where the user sets none are given as they are in force.
     """
-    shown = settings.model_dump(mode="json", exclude={"lake", "workers", "runner", "dask_address", "thresholds"})
+    of_the_run = {"lake", "columns", "recording", "workers", "runner", "dask_address", "refusals_fail"}
+    shown = settings.model_dump(mode="json", exclude={*of_the_run, "thresholds"})
     protocol = settings.get_protocol()
     return {"settings": shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}}
 

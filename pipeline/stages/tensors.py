@@ -40,7 +40,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     if not included:
         return StageResult(info={"path": None, "samples": 0}, notes=["no subset gives samples: no tensors"])
 
-    drops = drops_cut_samples(settings)
+    drops = drops_cut_samples(settings, split)
     cut_samples = np.zeros(len(PARTS), np.int64)
 
     def build_all() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
@@ -61,12 +61,12 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     by_part = index["samples_by_part"]
     cut = dict(zip(PARTS, cut_samples.tolist(), strict=True))
     info = {"path": path, "samples": index["sizes"]["S"], "samples_by_part": by_part, "cut_samples_by_part": cut}
-    return StageResult(files={TENSORS: files}, info=info, notes=_list_cut(protocol.split, cut, by_part, drops=drops))
+    return StageResult(files={TENSORS: files}, info=info, notes=_list_cut(split, cut, by_part, drops=drops))
 
 
-def drops_cut_samples(settings: Settings) -> bool:
+def drops_cut_samples(settings: Settings, split: str) -> bool:
     """Return whether samples with a neighbor that the split cuts off are left out of val and eval."""
-    return settings.drop_cut_samples and settings.get_protocol().split == TIME_BLOCKS
+    return settings.drop_cut_samples and split == TIME_BLOCKS
 
 
 def _list_cut(split: str, cut: Mapping[str, int], by_part: Mapping[str, int], *, drops: bool) -> list[str]:
@@ -137,16 +137,14 @@ def _list_sampled_subsets(reader: LakeReader, splits: pl.DataFrame, protocol: Pr
 
 
 def _describe_settings(settings: Settings) -> dict[str, Any]:
-    dropped = {"drop_cut_samples": True} if drops_cut_samples(settings) else {}
-    return dropped | {
-        "protocol": settings.get_protocol().digest,
-        "positions": settings.tensor_positions,
-    }
+    return {"protocol": settings.get_protocol().digest, "positions": settings.tensor_positions}
 
 
 def _find_inputs(_root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
-    """Return the recipe of the split, which depends on the lake's subsets, for the one job over the whole lake."""
-    return {"": {"split_recipe": _describe_recipe(settings, find_training_split(manifest, settings))}}
+    """Return what follows from the split, which depends on the lake's subsets, for the one job over the whole lake."""
+    split = find_training_split(manifest, settings)
+    dropped = {"drop_cut_samples": True} if drops_cut_samples(settings, split) else {}
+    return {"": {"split_recipe": _describe_recipe(settings, split), **dropped}}
 
 
 STAGE = Stage(
@@ -180,7 +178,8 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
             f"now: by {made['name']} ({made['digest']}). Run `tracklake run` with these settings, or set what they "
             "were made with."
         )
-    recipe = settings.get_split_recipe(find_training_split(manifest, settings))
+    split = find_training_split(manifest, settings)
+    recipe = settings.get_split_recipe(split)
     found = commit.built_from.get("split_recipe", {"digest": "unknown"})
     if found["digest"] != recipe.digest:
         raise StageError(
@@ -188,6 +187,6 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
             f"{json.dumps(found.get('parameters', {}))}) than the settings now give ({recipe.digest}: "
             f"{recipe.parameters}). Run `tracklake run` with these settings, or set what they were made with."
         )
-    if drops_cut_samples(settings) != commit.built_from.get("drop_cut_samples", False):
+    if drops_cut_samples(settings, split) != commit.built_from.get("drop_cut_samples", False):
         raise StageError(f"{root}: the tensors were made with another `drop_cut_samples`. Run `tracklake tensors`.")
     return root / str(commit.info["path"])

@@ -66,6 +66,7 @@ def test_a_header_of_unknown_names_is_never_one_bad_line(tmp_path, separator):
         ([("v_Vel", "v_Acc")], "v_Vel = 13"),
         ([("Preceding", "Following")], "Preceding = 16\nFollowing = 15"),
         ([("Vehicle_ID", "Frame_ID")], "Vehicle_ID = 2\nFrame_ID = 1"),
+        ([("v_length", "v_Width")], "v_length = 10\nv_Width = 9"),
         ([("Vehicle_ID", "Frame_ID"), ("Local_X", "Local_Y")], "ID = 2\nFrame_ID = 1\nLocal_X = 6\nLocal_Y = 5"),
     ],
 )  # fmt: skip
@@ -73,6 +74,21 @@ def test_swapped_columns_without_header_are_found_and_named(tmp_path, swaps, col
     with pytest.raises(SourceError, match="its columns are not what they are called") as refused:
         ngsim(tmp_path, bare(reorder(*swaps)))
     assert columns in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "problem"),
+    [
+        ("Local_X", "Local_Y", "times as far along Local_X"),
+        ("v_length", "v_Width", r"v_Width of 14.* is larger than v_length of 6"),
+        ("Preceding", "Following", "only 0% of the vehicles in Preceding are ahead"),
+        ("Vehicle_ID", "Frame_ID", "Global_Time advances by 0 ms"),
+        ("v_Vel", "v_Acc", "times v_Vel, which fits no unit of speed"),
+    ],
+)
+def test_swapped_columns_under_a_header_are_refused(tmp_path, one, other, problem):
+    with pytest.raises(SourceError, match=problem):
+        ngsim(tmp_path, as_csv(TRAFFIC, reorder((one, other)), header=TEXT_NAMES))
 
 
 INDISTINCT = {"Global_X", "Global_Y", "Total_Frames"}

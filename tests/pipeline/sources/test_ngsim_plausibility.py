@@ -72,6 +72,7 @@ KEY = US_101_0750
 TIMES = {
     "0": ("Global_Time is 0 in every row, so the frames tell one recording", lambda _: 0),
     "whole seconds": ("Global_Time is in whole seconds, so", lambda frame: (KEY + 100 * frame) // 1000),
+    "from the start": ("Global_Time counts from the recording's start, so", lambda frame: 100 * frame),
     "empty": ("Global_Time is missing, so", lambda _: ""),
     "NaN": ("Global_Time is missing, so", lambda _: "NaN"),
 }

@@ -11,6 +11,7 @@ from stage_runs import build_one
 from tracklake.pipeline.lake import Commit, connect, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import split
+from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import Job, StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.hashing import hash_values
@@ -315,6 +316,25 @@ def test_one_subset_trains_on_time_blocks_unless_a_split_is_set(lone_root, chang
         balance = pl.read_parquet([lone_root / file.path for file in commit.files["split_balance"]])
         samples = dict(balance.filter(split=trains).select("part", "samples").iter_rows())
         assert min(samples.values()) > 0
+
+
+def test_samples_cut_off_by_time_blocks_are_dropped_where_one_subset_is_split_by_them(tmp_path):
+    """The protocol's split is another one; vehicles in two blocks are left out of eval, and not seen there."""
+    root = tmp_path / "lake"
+    put_recording(root, "02", on_road_s=12)
+    said, inputs = {}, {}
+    for number, drops in enumerate((False, True)):
+        settings = Settings(lake=root, split_block_s=10, drop_cut_samples=drops)
+        for name in ("split", "tensors"):
+            with open_for_writing(root) as writer:
+                made = build_one(root, Job(name, str(number) * 16), settings)
+                writer.commit(made)
+        said[drops] = [note for note in made.info["notes"] if "which they do not see" in note]
+        inputs[drops] = STAGE_BY_NAME["tensors"].extra_inputs(root, load(root), settings)[""]
+    assert "time-blocks: " in said[False][0]
+    assert "kept (drop_cut_samples = true" in said[False][0]
+    assert said[True][0].endswith("left out")
+    assert inputs[True] == inputs[False] | {"drop_cut_samples": True}
 
 
 def test_enough_subsets_train_on_the_protocols_split(root):
