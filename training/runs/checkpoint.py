@@ -129,8 +129,9 @@ def restore(
     try:
         losses = content["state"]["losses"].tolist()
         state = TypeAdapter(TrainingState).validate_python(content["state"] | {"losses": losses})
-        if not (len(losses) == state.step > 0 < len(state.phases) and state.logged[0] <= state.step):
-            raise ValueError(f"{state.step} steps with {len(losses)} losses in {len(state.phases)} phases")
+        starts = [first for _, first in state.phases]
+        if not len(losses) == state.step > 0 < len(starts) or max(*starts, state.logged[0]) > state.step or min(starts):
+            raise ValueError(f"{state.step} steps with {len(losses)} losses in phases from {starts} on")
         if state.best_weights is not None:
             load_weights(network, state.best_weights, path, RESTART)
         load_weights(network, content["network"], path, RESTART)

@@ -166,7 +166,7 @@ def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None
     """
     if config["blocks"] == folder.index["blocks"]:
         return
-    seen = sorted({*config["train_subsets"], *config["val_subsets"]} & folder.subsets_of(part))
+    seen = sorted({*config["train_subsets"], *config.get("val_subsets", ())} & folder.subsets_of(part))
     if seen:
         raise StaleRunError(
             f"{folder.path}: the run was trained on another allocation of the split, and {len(seen)} subset(s) of "

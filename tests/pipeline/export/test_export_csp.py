@@ -14,7 +14,7 @@ from tracklake.pipeline.export.csp.card import CARD
 from tracklake.pipeline.export.csp.export import FILES, export_csp
 from tracklake.pipeline.export.csp.result import CspOptions
 from tracklake.pipeline.export.folder import ExportError
-from tracklake.pipeline.lake import LakeMissingError, load, scan
+from tracklake.pipeline.lake import LakeError, LakeMissingError, load, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import SAMPLES, VEHICLES
@@ -224,7 +224,7 @@ def test_what_cannot_be_exported_is_named(ngsim, tmp_path):
         export_csp(Settings(lake=tmp_path / "nowhere"), tmp_path / "out", CspOptions())
     with pytest.raises(ExportError, match=r"no freeway recordings of highd; it has recordings of ngsim"):
         export_csp(Settings(lake=ngsim), tmp_path / "out", CspOptions(dataset="highd"))
-    with pytest.raises(ExportError, match="lies in the lake"):
+    with pytest.raises(LakeError, match="lies in the lake"):
         export_csp(Settings(lake=ngsim), ngsim / "out", CspOptions())
 
 

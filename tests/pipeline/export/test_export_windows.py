@@ -16,7 +16,7 @@ from tracklake.pipeline.cli.app import app
 from tracklake.pipeline.export.folder import ExportError
 from tracklake.pipeline.export.windows import export as windows
 from tracklake.pipeline.export.windows.export import export_windows
-from tracklake.pipeline.lake import load, scan
+from tracklake.pipeline.lake import LakeError, load, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
 from tracklake.pipeline.stages.stage import StageError
@@ -195,7 +195,7 @@ def test_places_and_lakes_that_will_not_do(lake, parquet, tmp_path):
     with pytest.raises(ExportError, match=r"holds .*train\.parquet"):
         export_windows(Settings(lake=lake), parquet[1], "parquet")
     export_windows(Settings(lake=lake), parquet[1], "parquet", force=True)
-    with pytest.raises(ExportError, match="lies in the lake"):
+    with pytest.raises(LakeError, match="lies in the lake"):
         export_windows(Settings(lake=lake), lake / "out", "npz")
     with pytest.raises(StageError, match="made by another protocol than csp"):
         export_windows(Settings(lake=lake, min_future_s=5.0), tmp_path / "out", "npz")

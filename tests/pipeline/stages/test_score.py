@@ -4,20 +4,22 @@ import json
 from types import SimpleNamespace
 
 import pytest
+from tiny_network import write_tiny
 
 from tracklake.pipeline.lake.files import MODELS, TENSORS
 from tracklake.pipeline.stages.score import collect_scores
 from tracklake.training.runs.run_folder import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "n": 7}
-INDEX = {"protocol": {"name": "tiny", "digest": "0"}, "blocks": [{"part": "eval"}]}
 MANIFEST = SimpleNamespace(commits={TENSORS: SimpleNamespace(info={"path": "tensors"})})
 
 
 def write_run(root, name, **config):
     folder = root / MODELS / name
     folder.mkdir(parents=True)
-    whole = {"version": RUN_VERSION, "model": "lstm", "parameters": {}, "train_subsets": [], **INDEX, **config}
+    index = json.loads((root / "tensors" / "index.json").read_text())
+    made_of = {name: index[name] for name in ("protocol", "blocks")}
+    whole = {"version": RUN_VERSION, "model": "lstm", "parameters": {}, "train_subsets": [], **made_of, **config}
     (folder / "config.json").write_text(json.dumps(whole))
     metrics = {"evaluation": {"part": "eval", "horizons": [{**ROW, "mae_m": 2.0}]}}
     (folder / "metrics.json").write_text(json.dumps(metrics))
@@ -26,8 +28,7 @@ def write_run(root, name, **config):
 
 @pytest.fixture
 def root(tmp_path):
-    (tmp_path / "tensors").mkdir()
-    (tmp_path / "tensors" / "index.json").write_text(json.dumps(INDEX))
+    write_tiny(tmp_path / "tensors")
     write_run(tmp_path, "whole")
     return tmp_path
 

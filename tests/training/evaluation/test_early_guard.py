@@ -64,4 +64,4 @@ def test_without_an_evaluation_part_the_training_part_tells(tmp_path, monkeypatc
     monkeypatch.setattr("tracklake.training.train.TensorFolder.open", lambda _: folder)
     Peeks.folder, Peeks.honest = folder, False
     with pytest.raises(FutureInputError, match="`forgetful` sees the future"):
-        train("forgetful", tensors, tmp_path / "run", CONFIG)
+        train("forgetful", tensors, tmp_path / "run", CONFIG, without_evaluation=True)
