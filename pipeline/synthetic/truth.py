@@ -109,27 +109,7 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
     markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
     for side, places in markings.items():
         found.surfaces[f"{recording}-{side}"] = Surface(float(facts[1]), tuple(places), headway_stands_in=False)
-    name = f"{recording}_tracks.csv"
-    count = FileCount(name, "highd", recording)
-    seen = set()
-    rows: dict[tuple[int, int], list[float]] = {}
-    for line in _lines(folder / name)[1:]:
-        count.read += 1
-        parts = _usable(line, ",", 25)
-        try:
-            numbers = [_number(part) for part in parts] if parts else None
-        except ValueError:
-            numbers = None
-        if numbers is None:
-            count.malformed += 1
-            continue
-        if line in seen:
-            count.duplicate += 1
-            continue
-        seen.add(line)
-        count.kept += 1
-        rows[int(numbers[1]), int(numbers[0])] = numbers
-    found.files.append(count)
+    rows = _read_rows(folder / f"{recording}_tracks.csv", recording, found)
     headings = find_headings(
         {key: (numbers[6], numbers[7]) for key, numbers in rows.items()}, direction, float(facts[1])
     )
@@ -158,6 +138,31 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         )
         subset = f"{recording}-{'upper' if left else 'lower'}"
         found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry
+
+
+def _read_rows(path: Path, recording: str, found: Found) -> dict[tuple[int, int], list[float]]:
+    """Read the numbers of a tracks file by vehicle and frame, and count its lines."""
+    count = FileCount(path.name, "highd", recording)
+    seen = set()
+    rows: dict[tuple[int, int], list[float]] = {}
+    for line in _lines(path)[1:]:
+        count.read += 1
+        parts = _usable(line, ",", 25)
+        try:
+            numbers = [_number(part) for part in parts] if parts else None
+        except ValueError:
+            numbers = None
+        if numbers is None:
+            count.malformed += 1
+            continue
+        if line in seen:
+            count.duplicate += 1
+            continue
+        seen.add(line)
+        count.kept += 1
+        rows[int(numbers[1]), int(numbers[0])] = numbers
+    found.files.append(count)
+    return rows
 
 
 def find_headings(
