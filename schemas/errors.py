@@ -1,5 +1,6 @@
 """The root of all errors that a user sees as a message."""
 
+import errno
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from tracklake.schemas.text import make_visible
 
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 """Errors that readers of files raise on content that is damaged or of another kind."""
+MORE_FILES = "Raise the limit of open files, for instance by `ulimit -n 1024`, and run the same command again."
+"""Advice to a user whose process may open too few files at once."""
 
 
 class TracklakeError(Exception):
@@ -57,6 +60,7 @@ def explain_file_errors(path: Path, advice: str = "") -> Iterator[None]:
         raise
     except OSError as error:
         reason = error.strerror or str(error)
+        advice = MORE_FILES if error.errno == errno.EMFILE else advice
         raise FileAccessError(f"{error.filename or path}: {reason}. {advice}".rstrip()) from error
 
 

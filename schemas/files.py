@@ -2,8 +2,10 @@
 
 import os
 import re
+import sys
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,6 +13,8 @@ from tracklake.schemas.errors import FileAccessError, explain_file_errors
 
 _UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 """Names of files that are not whole yet; DuckDB writes its log beside a database."""
+MAX_LINKS = 40
+"""Most links that lead from one to the next, as in Linux."""
 
 
 def name_unfinished(target: Path) -> Path:
@@ -39,8 +43,11 @@ def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> N
                 stream.flush()
                 os.fsync(stream.fileno())
             unfinished.replace(target)
-        except BaseException:
-            unfinished.unlink(missing_ok=True)
+        except BaseException as error:
+            with suppress(OSError):
+                unfinished.unlink()
+            if isinstance(error, OSError) and error.filename is not None:
+                error.filename = str(target)  # the hidden name says nothing to a user
             raise
         sync(target.parent)
 
@@ -48,26 +55,40 @@ def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> N
 def write_output(target: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
     """Write a file that a user named: whole or not at all, into what a link leads to, or into a pipe or device.
 
+    What names a descriptor of this process (/dev/stdout, /dev/fd/3) is written where that stands.
+
     Raises:
         FileAccessError: it is a folder, or cannot be written.
     """
     if target.is_dir():
         raise FileAccessError(f"{target}: is a folder; name a file")
-    if not _is_stream(target):
-        write_file(target.resolve(), content)
+    descriptor = _find_descriptor(target)
+    if descriptor is None and (target.is_file() or not target.exists()):
+        write_file(Path(os.path.realpath(target)), content)
         return
-    with explain_file_errors(target), target.open("ab") as stream:
+    sys.stdout.flush()  # what was printed before stands before
+    # Opened by its name, a file would be written from its start, under what others write through the descriptor.
+    with explain_file_errors(target), target.open("wb") if descriptor is None else _reopen(descriptor) as stream:
         if isinstance(content, bytes):
             stream.write(content)
         else:
             content(stream)
 
 
-def _is_stream(target: Path) -> bool:
-    """Return whether a path is a pipe, a device or an open descriptor (/dev/stdout), which nothing may replace."""
-    leads_to = target.readlink() if target.is_symlink() else target
-    places = (target.parent.resolve(), target.parent / leads_to)
-    return any(Path("/proc") in place.parents for place in places) or (target.exists() and not target.is_file())
+def _reopen(descriptor: int) -> BinaryIO:
+    return os.fdopen(os.dup(descriptor), "wb")
+
+
+def _find_descriptor(target: Path) -> int | None:
+    """Return the descriptor of this process that a path names; None: it names none."""
+    folders = (f"/proc/{os.getpid()}/fd", "/dev/fd")
+    for _ in range(MAX_LINKS):
+        if os.path.realpath(target.parent) in folders and target.name.isdecimal():
+            return int(target.name)
+        if not target.is_symlink():
+            break
+        target = target.parent / target.readlink()
+    return None
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -34,8 +34,9 @@ def check(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOption 
             terminal.print_problem(
                 f"{root / name}: not the bytes of the live file, of which it is a copy", label="damaged"
             )
-        if (copies or not is_settled(root, manifest)) and _mend(root, terminal, copies=copies):
-            terminal.print_line("catalog and folders did not agree with the manifest, and are up to date again")
+        if copies or not is_settled(root, manifest):
+            outcome = "are up to date again" if _mend(root, terminal, copies=copies) else "were left so"
+            terminal.print_line(f"catalog and folders did not agree with the manifest, and {outcome}")
         manifest = load(root)
         damaged = find_damaged_files(root, manifest)
         files = [file for commit in manifest.commits.values() for file in commit.all_files if file.sha256 is not None]

@@ -21,9 +21,6 @@ from tracklake.schemas.text import make_visible
 DONE, FAILED, USAGE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit codes: done, failed, wrong usage, done but for refused recordings, and interrupted by Ctrl-C."""
 
-QUERY_INTERRUPTED = "Query interrupted"
-"""Message with which DuckDB ends a query at Ctrl-C, as a RuntimeError."""
-
 DEBUG = "TRACKLAKE_DEBUG"
 """Environment variable: if set to 1, every error shows its traceback, as with the option --debug."""
 
@@ -60,12 +57,16 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
     except KeyboardInterrupt as error:
         _show_traceback_if_debugging(error)
         raise report_failure(terminal, str(error) or "interrupted", INTERRUPTED) from None
-    except RuntimeError as error:
-        if str(error) != QUERY_INTERRUPTED:
-            raise _report_bug(terminal, error) from None
-        raise report_failure(terminal, "interrupted", INTERRUPTED) from None
     except Exception as bug:  # noqa: BLE001  (the outermost: nothing is hidden, the traceback is shown)
+        if _is_interrupt(bug):
+            _show_traceback_if_debugging(bug)
+            raise report_failure(terminal, "interrupted", INTERRUPTED) from None
         raise _report_bug(terminal, bug) from None
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C caused an error, as which DuckDB and pydantic raise it."""
+    return error is not None and (isinstance(error, KeyboardInterrupt) or _is_interrupt(error.__cause__))
 
 
 def _report_bug(terminal: Terminal, bug: Exception) -> typer.Exit:

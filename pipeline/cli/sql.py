@@ -17,7 +17,7 @@ from tracklake.pipeline.lake import LakeResult, connect, query_errors, refuse_la
 from tracklake.pipeline.lake import query as run_query
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
-from tracklake.schemas.errors import FileAccessError, TracklakeError
+from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
 from tracklake.schemas.files import write_output
 from tracklake.schemas.text import make_visible
 
@@ -68,6 +68,7 @@ def write_result(relation: LakeResult, form: str, out: Path | None, terminal: Te
         terminal: terminal of the command, for a table or the number of rows written.
 
     Raises:
+        UsageError: a table for people would go to a file.
         TracklakeError: Parquet, which is no text, would go to a terminal.
         FileAccessError: the file cannot be written.
     """
@@ -75,26 +76,21 @@ def write_result(relation: LakeResult, form: str, out: Path | None, terminal: Te
         _show_rows(relation, terminal)
         return
     if form == "table":
-        raise TracklakeError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
+        raise UsageError("--format table goes to the terminal only: with --out, choose csv, json or parquet")
     if form == "parquet" and out is None and sys.stdout.isatty():
         raise TracklakeError("Parquet is no text: give --out FILE, or redirect standard output to a file")
     frame = (relation if form == "parquet" else relation.to_text(flat=form == "csv")).pl()
     if out is not None:
         write_output(out, lambda stream: _write(frame, form, stream))
-        terminal.print_line(f"{frame.height:,} {'row' if frame.height == 1 else 'rows'} in {out}")
+        _print_count(terminal, frame.height, f" in {out}")
         return
     if sys.stdout.isatty():
         text = BytesIO()
         _write(frame, form, text)
         sys.stdout.write(make_visible(text.getvalue().decode(), keep="\n"))
         return
-    try:
+    with explain_file_errors(Path("standard output")):
         _write(frame, form, sys.stdout.buffer)
-    except OSError as error:
-        # Polars raises the system's error without its number.
-        if f"(os error {errno.EPIPE})" in str(error):
-            raise BrokenPipeError from error
-        raise FileAccessError(f"standard output: {error}") from error
     sys.stdout.buffer.flush()
 
 
@@ -108,7 +104,12 @@ def _show_rows(relation: LakeResult, terminal: Terminal) -> None:
         rest = f"the first {MAX_ROWS} of {relation.count():,} rows; --format csv, json or parquet gives all"
         terminal.err.print(f"[dim]{rest}[/]")
     else:
-        terminal.err.print(f"[dim]{len(rows)} {'row' if len(rows) == 1 else 'rows'}[/]")
+        _print_count(terminal, len(rows))
+
+
+def _print_count(terminal: Terminal, rows: int, where: str = "") -> None:
+    """Print the number of rows on stderr, which is no part of the result."""
+    terminal.err.print(make_visible(f"{rows:,} {'row' if rows == 1 else 'rows'}{where}"), style="dim", markup=False)
 
 
 def _format_cell(value: object) -> str:
@@ -135,10 +136,15 @@ def _take_first_sentence(text: str) -> str:
 
 
 def _write(frame: pl.DataFrame, form: str, target: BinaryIO) -> None:
-    if form == "csv":
-        frame.write_csv(target)
-    elif form == "json":
-        # Any binary file will do, though Polars declares it otherwise than for the other forms.
-        frame.write_json(cast("IOBase", target))
-    else:
-        frame.write_parquet(target)
+    try:
+        if form == "csv":
+            frame.write_csv(target)
+        elif form == "json":
+            # Any binary file will do, though Polars declares it otherwise than for the other forms.
+            frame.write_json(cast("IOBase", target))
+        else:
+            frame.write_parquet(target)
+    except OSError as error:
+        if f"(os error {errno.EPIPE})" in str(error):  # Polars raises the system's error without its number
+            raise BrokenPipeError from error
+        raise

@@ -11,7 +11,7 @@ from tracklake.pipeline.lake.manifest import read_document
 def find_lake(path: Path) -> Path | None:
     """Return the lake that a path lies in or is, whether by its name or by the links in it; None: in no lake."""
     named = Path(os.path.abspath(path))  # noqa: PTH100  (Path.absolute keeps "..")
-    folders = (folder for place in (named, path.resolve()) for folder in (place, *place.parents))
+    folders = (folder for place in (named, Path(os.path.realpath(path))) for folder in (place, *place.parents))
     return next(filter(_is_lake, folders), None)
 
 

@@ -179,7 +179,8 @@ class LakeConnection:
     """Same as `sql`, under the name that DuckDB's connections have."""
 
     def close(self) -> None:
-        """Close the connection and the lake's files."""
+        """Close the connection and the lake's files; a query that still runs, as after Ctrl-C, is broken off."""
+        self._raw.interrupt()  # or closing waits for its end
         self._raw.close()
 
     def __enter__(self) -> "LakeConnection":

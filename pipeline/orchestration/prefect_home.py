@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.errors import MORE_FILES, TracklakeError
 
 TRIAL_BYTES = 1 << 20
 """Bytes that a disk must still take for Prefect to record a run on it."""
@@ -40,8 +40,7 @@ def _provide_descriptors() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
     if wanted < FEWEST_FILES:
         raise TracklakeError(
-            f"this process may open {wanted} files at once; expected {FEWEST_FILES} or more. Raise the limit, for "
-            "instance by `ulimit -n 1024`, and run the same command again."
+            f"this process may open {wanted} files at once; expected {FEWEST_FILES} or more. {MORE_FILES}"
         )
 
 

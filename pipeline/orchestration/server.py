@@ -46,7 +46,7 @@ def use_server() -> Iterator[list[str]]:
         PrefectError: no server can be reached or started, or it broke off during the block.
     """
     address = PREFECT_API_URL.value()
-    if address is not None:
+    if address:  # an empty one is none
         require_server()
         notes: list[str] = []
     else:
@@ -70,7 +70,7 @@ def require_server() -> None:
         PrefectError: it is not set, or what answers there is no Prefect server of a fitting version.
     """
     address = PREFECT_API_URL.value()
-    if address is None:
+    if not address:
         raise PrefectError(
             "PREFECT_API_URL is not set: no server would record the runs. Start one, for instance\n"
             "  prefect server start\n  export PREFECT_API_URL=http://127.0.0.1:4200/api"

@@ -3,6 +3,7 @@
 Whatever is absent, unreadable, cut short or not as declared raises TensorError.
 """
 
+import errno
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, 
 
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.documents import read_json
-from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.errors import MORE_FILES, FileAccessError, TracklakeError
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import (
     ARRAYS,
@@ -130,6 +131,8 @@ def map_arrays(path: Path, index: dict[str, Any]) -> dict[str, npt.NDArray[Any]]
         try:
             mapped = np.lib.format.open_memmap(file, mode="r")
         except Exception as broken:
+            if isinstance(broken, OSError) and broken.errno == errno.EMFILE:
+                raise FileAccessError(f"{file}: {broken.strerror}. {MORE_FILES}") from broken
             raise TensorError.at(file, f"cannot be read ({broken})") from broken
         if (mapped.dtype, mapped.shape) != (dtype, shape):
             raise TensorError.at(file, f"expected {dtype} of shape {shape}, got {mapped.dtype} of shape {mapped.shape}")

@@ -145,6 +145,7 @@ def test_check_reads_a_lake_that_another_process_writes(command, small):
     assert done.code == 1
     assert "note: " in done.err
     assert "is writing to this lake" in done.err
+    assert "catalog and folders did not agree with the manifest, and were left so" in done.out
     assert "its bytes are not those that were written" in done.err
 
 

@@ -1,11 +1,16 @@
 """Errors at a terminal: messages for what a user can mend, tracebacks for bugs, and both with --debug."""
 
+import _thread
 import json
 import os
 import stat
+import threading
+import time
 from dataclasses import replace
 
 import pytest
+from pydantic import BaseModel, model_serializer
+from pydantic_core import PydanticSerializationError
 from small_recordings import write_highd
 
 from tracklake.pipeline.cli import app, report, session
@@ -120,11 +125,32 @@ def test_work_that_broke_off_is_described():
     assert "This is a bug in tracklake" in described
 
 
-@pytest.mark.parametrize("raised", [KeyboardInterrupt(), RuntimeError("Query interrupted")])
-def test_an_interrupt_is_one_line(command, break_load, tmp_path, raised):
-    break_load(raised)
-    done = command.here("report", "--compare", tmp_path)
-    assert (done.code, done.err) == (130, "error: interrupted\n")
+class Interrupted(BaseModel):
+    @model_serializer(mode="wrap")
+    def serialize(self, _serializer) -> int:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_is_one_line(command, break_load, tmp_path):
+    with pytest.raises(PydanticSerializationError) as by_pydantic:
+        Interrupted().model_dump()
+    by_duckdb = RuntimeError("Query interrupted")
+    by_duckdb.__cause__ = KeyboardInterrupt()
+    for raised in (KeyboardInterrupt(), by_duckdb, by_pydantic.value):
+        break_load(raised)
+        done = command.here("report", "--compare", tmp_path)
+        assert (done.code, done.err) == (130, "error: interrupted\n")
+
+
+def test_an_interrupted_query_ends_at_once(command, lake):
+    query = "SELECT sum(a.range * b.range) AS s FROM range(400000) a, range(400000) b"
+    for options in ((), ("--format", "csv")):
+        interrupt = threading.Timer(1.0, _thread.interrupt_main)
+        interrupt.start()
+        began = time.monotonic()
+        done = command.here("sql", query, "--lake", lake.root, *options)
+        assert (done.code, done.err) == (130, "error: interrupted\n")
+        assert time.monotonic() - began < 5
 
 
 def test_an_interrupt_while_a_command_is_imported_is_one_line(command, monkeypatch):

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import polars as pl
@@ -12,6 +11,7 @@ import pytest
 from small_lake import write_round
 
 from tracklake.pipeline.lake import find_lake
+from tracklake.schemas.errors import FileAccessError
 from tracklake.schemas.files import write_output
 
 LAKES_OWN = (
@@ -105,7 +105,7 @@ def test_values_that_csv_and_json_have_no_type_for_are_text(command, lake, tmp_p
     for form in ("csv", "json", "parquet"):
         out = tmp_path / f"out.{form}"
         done = command.here("sql", query, "--lake", lake.root, "--format", form, "--out", out)
-        assert (done.code, done.out) == (0, f"1 row in {out}\n")
+        assert (done.code, done.err) == (0, f"1 row in {out}\n")
         written[form] = out.read_bytes()
     (row,) = json.loads(written["json"])
     assert [row[f"c{i}"] for i in range(len(VALUES))] == list(VALUES.values())
@@ -139,7 +139,9 @@ def test_a_file_is_replaced_whole_or_stays(command, lake, tmp_path, monkeypatch)
     into_folder = command.here(*arguments, out.parent)
     assert (into_folder.code, "is a folder; name a file" in into_folder.err) == (1, True)
     absent = command.here(*arguments, tmp_path / "absent" / "out.csv")
-    assert (absent.code, "No such file or directory" in absent.err) == (1, True)
+    assert (absent.code, absent.err) == (1, f"error: {tmp_path / 'absent' / 'out.csv'}: No such file or directory.\n")
+    for_people = command.here(*arguments[:4], "--out", out)
+    assert (for_people.code, "choose csv, json or parquet" in for_people.err) == (2, True)
 
 
 def test_devices_are_written_to_and_not_replaced(command, lake):
@@ -148,12 +150,28 @@ def test_devices_are_written_to_and_not_replaced(command, lake):
     full = command.here(*arguments, "/dev/full")
     assert (full.code, "No space left on device" in full.err, "Traceback" in full.err) == (1, True, False)
     assert Path("/dev/null").is_char_device()
-    with tempfile.TemporaryFile() as stream:  # `--out /dev/fd/3 3>>file` adds to the file
+
+
+@pytest.mark.parametrize("folder", ["/proc/self/fd", "/dev/fd"])
+def test_an_open_descriptor_is_written_where_it_stands(tmp_path, folder):
+    """As with `>file`, where what others write through the descriptor comes before and behind."""
+    with (tmp_path / "out").open("wb", buffering=0) as stream:
         stream.write(b"before\n")
-        stream.flush()
-        write_output(Path(f"/proc/self/fd/{stream.fileno()}"), b"after\n")
-        stream.seek(0)
-        assert stream.read() == b"before\nafter\n"
+        link = tmp_path / "link"
+        link.symlink_to(f"{folder}/{stream.fileno()}")
+        write_output(link, b"mine\n")
+        stream.write(b"after\n")
+    assert (tmp_path / "out").read_bytes() == b"before\nmine\nafter\n"
+    with pytest.raises(FileAccessError, match="link: Bad file descriptor"):
+        write_output(link, b"mine\n")
+
+
+def test_links_in_a_circle_are_replaced(tmp_path):
+    (tmp_path / "one").symlink_to("two")
+    (tmp_path / "two").symlink_to("one")
+    assert find_lake(tmp_path / "one") is None
+    write_output(tmp_path / "one", b"mine\n")
+    assert (tmp_path / "one").read_bytes() == b"mine\n"
 
 
 @pytest.mark.parametrize("options", [(), ("--format", "csv")])

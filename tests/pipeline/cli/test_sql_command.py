@@ -39,7 +39,7 @@ def test_a_file_is_confirmed_with_its_rows(command, lake, tmp_path):
     )
     frame = pl.read_parquet(target)
     assert frame["frame"].unique().to_list() == [200]
-    assert done.out == f"{frame.height} rows in {target}\n"
+    assert (done.out, done.err) == ("", f"{frame.height} rows in {target}\n")
 
 
 def test_without_a_question_there_is_advice(command):

@@ -136,6 +136,16 @@ def test_an_address_without_a_server_is_named(address):
 
 
 @pytest.mark.usefixtures("home")
+def test_an_empty_address_is_none(monkeypatch):
+    monkeypatch.setattr(server, "_start_embedded", lambda: ("http://here/api", []))
+    with temporary_settings({PREFECT_API_URL: ""}):
+        with pytest.raises(server.PrefectError, match="PREFECT_API_URL is not set"):
+            server.require_server()
+        with server.use_server():
+            assert PREFECT_API_URL.value() == "http://here/api"
+
+
+@pytest.mark.usefixtures("home")
 def test_a_server_that_breaks_off_is_a_message_and_a_wrong_request_is_a_bug(monkeypatch):
     monkeypatch.setattr(server, "_start_embedded", lambda: ("http://here/api", []))
     request = httpx.Request("POST", "http://here/api")

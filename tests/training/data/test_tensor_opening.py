@@ -1,7 +1,9 @@
 """What is not a whole tensor folder of this version is refused, with what and where; what is, is mapped."""
 
+import errno
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from tensor_loop import UNDIVIDED, random_tables
 from tensor_tables import TINY, drive, sample_everything, split_row, write
 
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import FileAccessError
 from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
 from tracklake.training.data.checks import KINDS
 from tracklake.training.data.tensor_folder import TensorError, TensorFolder
@@ -136,6 +139,14 @@ def test_a_damaged_folder_is_refused_with_what_and_where(tmp_path, damage, messa
     write(tmp_path, random_tables(1), UNDIVIDED)
     damage(tmp_path)
     with pytest.raises(TensorError, match=message):
+        TensorFolder.open(tmp_path)
+
+
+def test_too_few_descriptors_are_no_damage(tmp_path, monkeypatch):
+    write(tmp_path, random_tables(1), UNDIVIDED)
+    full = Mock(side_effect=OSError(errno.EMFILE, "Too many open files"))
+    monkeypatch.setattr(np.lib.format, "open_memmap", full)
+    with pytest.raises(FileAccessError, match=r"\.npy: Too many open files\. Raise the limit .*`ulimit -n 1024`"):
         TensorFolder.open(tmp_path)
 
 
