@@ -52,7 +52,7 @@ def test_the_commands_of_the_readme_run_as_printed(newcomer):
         with simulate_once():
             done = (newcomer.here if number else newcomer.alone)(*shlex.split(shorter, comments=True)[1:])
         assert done.code == 0, f"{line}: {done.err}"
-        assert done.out, line
+        assert done.out or done.err, line
 
 
 def test_the_readme_names_every_command():

@@ -56,7 +56,8 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         "quality": f"{_format_count(head['vehicles_with_errors'])} vehicles with errors; " + late,
         "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_describe_balance(quality)}",
     }
-    for score in quality["model_scores"]:
+    scores = [score for score in quality["model_scores"] if score["rows"]]
+    for score in scores:
         rmse = "  ".join(
             f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
         )
@@ -77,7 +78,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     )
     terminal.print_line(
         f"  {command} train lstm{lake_option}{protocol_option}"
-        if head["samples"]
+        if any(score["part"] == "eval" for score in scores)
         else f'  {command} sql "FROM subsets"{lake_option}'
     )
 
