@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from tracklake.quality_reports.pages.examples import find_examples
 from tracklake.quality_reports.pages.page_names import name_pages
+from tracklake.quality_reports.pages.player import make_player
 from tracklake.quality_reports.pages.rendering import make_environment
 from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.flow import draw_flow, draw_fundamental
@@ -118,6 +119,7 @@ def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[R
     extent = query(connection, "subset_extent", where)[0]
     limited = {**where, "most": MOST_ROWS}
     seconds = choose_interval(subset["seconds"])
+    examples = find_examples(connection, where, rules, subset["frame_rate_hz"])
     return {
         "extent": extent,
         **_draw_plots(connection, where, extent, seconds),
@@ -127,10 +129,8 @@ def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[R
         "windows": query(connection, "subset_windows", limited),
         "vehicle_scores": query(connection, "subset_vehicle_scores", limited),
         "drops": query(connection, "subset_sample_drops", where),
-        "examples": [
-            {**example, "plot": example["plot"] and Markup(example["plot"])}
-            for example in find_examples(connection, where, rules, subset["frame_rate_hz"])
-        ],
+        "examples": [{**example, "plot": example["plot"] and Markup(example["plot"])} for example in examples],
+        "player": make_player(connection, where, extent, examples, subset["frame_rate_hz"]),
     }
 
 

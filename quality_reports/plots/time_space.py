@@ -82,8 +82,13 @@ def make_grid(extent: Mapping[str, Any]) -> Grid:
         first_x_m=extent["first_x_m"],
         metres=metres,
         rows=math.floor(length / metres) + 1,
-        top_mps=SPEED_STEP_MPS * max(1, math.ceil((extent["fast_mps"] or 0) / SPEED_STEP_MPS)),
+        top_mps=find_top_speed(extent),
     )
+
+
+def find_top_speed(extent: Mapping[str, Any]) -> float:
+    """Return the upper end of a subset's colour scale, in m/s; `extent` is a row of subset_extent.sql."""
+    return float(SPEED_STEP_MPS * max(1, math.ceil((extent["fast_mps"] or 0) / SPEED_STEP_MPS)))
 
 
 def draw_lanes(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> list[tuple[int | None, str]]:

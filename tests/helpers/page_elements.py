@@ -1,11 +1,14 @@
 """A page taken apart, which fails where it is not well formed; and texts that would break one."""
 
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import tracklake.quality_reports.pages
 
 SCRIPT = Path(tracklake.quality_reports.pages.__file__).parents[1] / "templates" / "report.js"
+PLAYER = SCRIPT.with_name("player.js")
+SCENE = re.compile(r'<script type="application/json" id="scene">[^<]*</script>')
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;\u202e"
 
@@ -34,10 +37,11 @@ class Elements(HTMLParser):
 
 
 def drop_script(html: str) -> str:
-    """The page without the one script that every page has, which is the file of the templates."""
-    own = f"<script>\n{SCRIPT.read_text(encoding='utf-8')}\n</script>"
+    """The page without the script that every page has, and without the player's script and data."""
+    own, player = (f"<script>\n{path.read_text(encoding='utf-8')}\n</script>" for path in (SCRIPT, PLAYER))
     assert html.count(own) == 1
-    return html.replace(own, "")
+    assert html.count(player) == len(SCENE.findall(html)) <= 1
+    return SCENE.sub("", html.replace(own, "").replace(player, ""))
 
 
 def parse(html: str) -> Elements:

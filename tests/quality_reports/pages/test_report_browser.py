@@ -8,6 +8,7 @@ from page_elements import SCRIPT
 
 from tracklake.quality_reports.pages.rendering import DASH
 from tracklake.quality_reports.pages.report import build_report
+from tracklake.quality_reports.pages.subsets import render_pages
 
 RECORDINGS = 60
 SCREEN = 800
@@ -134,3 +135,73 @@ def test_without_a_script_everything_is_shown(browser, large):
     browser.open(large / "index.html", script=False)
     assert browser.run("[...document.querySelectorAll('details')].every(each => each.open)") is True
     assert browser.run("document.querySelectorAll('thead button').length") == 0
+
+
+@pytest.fixture(scope="module")
+def scene(open_lake, small_lake, tmp_path_factory) -> Path:
+    """The page of 01-lower for 20 s at 25 Hz: vehicle 2 drives 1 m behind the front of vehicle 1, which is 4 m long."""
+    where = {"dataset": "highd", "subset": "01-lower"}
+    tracks = [
+        {**where, "vehicle_id": vehicle, "frame": frame, "time_s": (frame - 1) / 25, "x_m": frame * 0.4 - vehicle,
+         "y_m": 2.0, "lane": 1, "speed_mps": 10.0, "accel_mps2": 0.0}
+        for vehicle in (1, 2)
+        for frame in range(1, 501)
+    ]  # fmt: skip
+    vehicles = [
+        {**where, "vehicle_id": vehicle, "length_m": 4.0, "width_m": 1.8, "start_x_m": 0.0, "end_x_m": 200.0}
+        for vehicle in (1, 2)
+    ]
+    overlap = {**where, "rule": "overlap", "severity": "error", "first_frame": 250, "last_frame": 255, "entries": 6}
+    subsets = [{**row, "first_frame": 1, "last_frame": 500} for row in small_lake["subsets"]]
+    findings = [{**overlap, "vehicle_id": vehicle, "worst": 1.0} for vehicle in (1, 2)]
+    lake = open_lake(**{**small_lake, "tracks": tracks, "vehicles": vehicles, "subsets": subsets, "findings": findings})
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "page.html").write_text(dict(render_pages(lake, {}))["01-lower.html"], encoding="utf-8")
+    return folder / "page.html"
+
+
+@pytest.mark.parametrize(("width", "dark"), [(400, True), (1280, False), (1920, True)])
+def test_a_finding_is_watched_with_both_vehicles_of_an_overlap_in_view(browser, scene, width, dark):
+    browser.open(scene, width=width, height=SCREEN, dark=dark)
+    report, clock = (
+        "document.querySelector('.player .note').textContent",
+        "document.querySelector('output').textContent",
+    )
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    assert browser.run(report) == "2 vehicles on the road"
+    browser.run("document.querySelector('[data-finding]').click()")
+    # 5 s before frame 250, at the scene before: frame 125, 4.96 s after the first.
+    assert 4.9 <= float(browser.run(clock).split()[0]) <= 5.3
+    said = browser.run(report)
+    assert "vehicle 1: 36 km/h (10.0 m/s)" in said
+    assert "vehicle 2: 36 km/h (10.0 m/s)" in said
+    assert "out of view" not in said
+    later = browser.run(f"new Promise(done => setTimeout(() => done({clock}), 600))")
+    assert float(later.split()[0]) > 5.2, "it plays"
+    assert browser.errors == []
+
+
+def test_the_player_is_steered_by_keys_and_by_its_slider(browser, scene):
+    browser.open(scene)
+    clock = "document.querySelector('output').textContent"
+    press = "document.querySelector('canvas').dispatchEvent(new KeyboardEvent('keydown', {{key: '{}'}}))"
+    start = float(browser.run(clock).split()[0])
+    browser.run(press.format("ArrowRight"))
+    assert float(browser.run(clock).split()[0]) == pytest.approx(start + 0.2, abs=0.01)
+    browser.run(
+        "{const slider = document.querySelector('.player input'); slider.value = 50;"
+        "slider.dispatchEvent(new Event('input'))}"
+    )
+    assert float(browser.run(clock).split()[0]) == pytest.approx(start + 10, abs=0.01)
+    label = "[...document.querySelectorAll('.player button')][0].textContent"
+    browser.run(press.format(" "))
+    assert browser.run(label) == "Pause"
+    browser.run(press.format(" "))
+    assert browser.run(label) == "Play"
+    assert browser.errors == []
+
+
+def test_without_a_script_a_subset_page_hides_the_player_alone(browser, scene):
+    browser.open(scene, script=False)
+    assert browser.run("document.querySelector('.player').hidden && document.querySelector('[data-finding]').hidden")
+    assert browser.run("document.querySelectorAll('.example svg').length") > 0
