@@ -81,8 +81,7 @@ def train(
     Args:
         model: name in the registry. A model that needs no training is evaluated and written all the same.
         tensors: the tensor folder.
-        out: the run's folder, `models/<run>`; replaced where it exists, after the training. Until then checkpoint and
-            logs are in a hidden folder beside it.
+        out: the run's folder, replaced after the training; until then its checkpoint and logs are hidden beside it.
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
         progress: called after every step.
         resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
@@ -105,9 +104,8 @@ def train(
     require_torch(model)
     if not without_evaluation and len(folder.samples_of("eval")) == 0:
         raise TracklakeError(
-            f"{tensors}: the split `{folder.split}` has no samples in `eval`, so the model would be scored on "
-            'nothing. Add recordings, or set split = "time-blocks" with a shorter `split_block_s` and run `tracklake '
-            "run` again; `--no-evaluation` trains all the same."
+            f"{tensors}: the split `{folder.split}` has no samples in `eval` to score the model on. Add recordings, or "
+            'set split = "time-blocks" or a shorter `split_block_s`, and run again; or give `--no-evaluation`.'
         )
     with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
