@@ -51,6 +51,8 @@ def make_player(
     last_of_first = min(road["last_tick"], road["first_tick"] + round(FIRST_S * rate_hz / stride))
     first = (road["first_tick"], last_of_first)
     ticks = np.unique(np.concatenate([np.arange(begin, end + 1) for begin, end in [first, *windows]]))
+    if not ticks.size:
+        return None
     # Text, since DuckDB looks for pandas once for every number of a list.
     frames = {"frames": ",".join(map(str, (ticks * stride).tolist())), "stride": stride}
     found = query_frame(connection, "subset_scene", {**where, **frames}).sort("vehicle_id", "frame")
