@@ -57,28 +57,15 @@ def column(
         lt: bound that a value stays under.
         isin: the only values.
     """
-    bounds: list[pa.Check] = []
-    if ge is not None:
-        bounds.append(pa.Check.ge(ge))
-    if gt is not None:
-        bounds.append(pa.Check.gt(gt))
-    if le is not None:
-        bounds.append(pa.Check.le(le))
-    if lt is not None:
-        bounds.append(pa.Check.lt(lt))
-    if isin is not None:
-        bounds.append(pa.Check.isin(list(isin)))
-    return pa.Column(
-        dtype,
-        checks=bounds,
-        nullable=nullable,
-        description=description,
-        metadata={"unit": unit},
-    )
+    given = (("ge", ge), ("gt", gt), ("le", le), ("lt", lt), ("isin", isin))
+    checks = [getattr(pa.Check, name)(value) for name, value in given if value is not None]
+    return pa.Column(dtype, checks=checks, nullable=nullable, description=description, metadata={"unit": unit})
 
 
 DATASET = column(pl.String, "ngsim, highd, or custom (read with --columns)", isin=DATASETS)
 SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording")
+PLACE = {"dataset": DATASET, "subset": SUBSET}
+"""Columns that say where a row belongs, the folders of most tables."""
 PROTOCOL = column(pl.String, "named, hashed recipe of sampling, split and metrics")
 
 

@@ -2,15 +2,14 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, SEVERITIES, SUBSET, Table, column
+from tracklake.schemas.columns import PLACE, SEVERITIES, Table, column
 
 FINDINGS = Table(
     "findings",
     "One row per run of consecutive entries of one vehicle that breaks one rule.",
     key=("rule", "vehicle_id", "first_frame"),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "whose entries they are", ge=0),
         "rule": column(pl.String, "the rule's name"),
         "severity": column(pl.String, "error, warning or info", isin=SEVERITIES),

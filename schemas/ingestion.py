@@ -14,11 +14,7 @@ INGEST_LOG = Table(
     partition=("dataset",),
     columns={
         "dataset": DATASET,
-        "recording": column(
-            pl.String,
-            "recording of the rows; null = unknown",
-            nullable=True,
-        ),
+        "recording": column(pl.String, "recording of the rows; null = unknown", nullable=True),
         "file": column(pl.String, "path as given to ingest"),
         "sha256": column(pl.String, "of the file's bytes"),
         "dialect": column(pl.String, "how the file was read"),
@@ -37,11 +33,7 @@ REJECTS = Table(
     partition=("dataset",),
     columns={
         "dataset": DATASET,
-        "recording": column(
-            pl.String,
-            "recording of the row; null = unknown",
-            nullable=True,
-        ),
+        "recording": column(pl.String, "recording of the row; null = unknown", nullable=True),
         "file": column(pl.String, "path as given to ingest"),
         "line": column(pl.Int64, "line number in the file, from 1", ge=1),
         "reason": column(pl.String, "why it was dropped"),

@@ -2,15 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import (
-    DATASET,
-    LATERAL_MANEUVERS,
-    LONGITUDINAL_MANEUVERS,
-    PROTOCOL,
-    SUBSET,
-    Table,
-    column,
-)
+from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PLACE, PROTOCOL, Table, column
 
 CELLS = 39
 """Cells of the neighbor grid: 13 rows x 3 columns (left, own, right)."""
@@ -21,15 +13,10 @@ SAMPLES = Table(
     key=("protocol", "vehicle_id", "tick"),
     columns={
         "protocol": PROTOCOL,
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "whose future is predicted", ge=0),
         "tick": column(pl.Int32, "time_s = tick / the protocol's rate", ge=0),
-        "frame": column(
-            pl.Int32,
-            "the source's frame on the tick; null where none falls on it",
-            nullable=True,
-        ),
+        "frame": column(pl.Int32, "the source's frame on the tick; null where none falls on it", nullable=True),
         "lane": column(pl.Int16, "lane at the tick; in protocols that fold lanes (csp), at most 6 on US-101"),
         "lateral_maneuver": column(
             pl.Enum(LATERAL_MANEUVERS),
@@ -55,8 +42,7 @@ SAMPLE_DROPS = Table(
     key=("protocol", "reason"),
     columns={
         "protocol": PROTOCOL,
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "reason": column(pl.String, "the first that applies"),
         "entries": column(pl.Int64, "entries dropped", ge=1),
     },
@@ -69,8 +55,7 @@ SAMPLE_COUNTS = Table(
     key=("protocol",),
     columns={
         "protocol": PROTOCOL,
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "entries_on_clock": column(pl.Int64, "entries on the protocol's clock: samples and dropped ones", ge=0),
         "samples": column(pl.Int64, "kept", ge=0),
         "neighbors": column(pl.Int64, "vehicles in the samples' grids", ge=0),
@@ -98,15 +83,11 @@ NEIGHBORS = Table(
     key=("protocol", "vehicle_id", "tick", "cell"),
     columns={
         "protocol": PROTOCOL,
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "the sample's vehicle", ge=0),
         "tick": column(pl.Int32, "the sample's tick", ge=0),
         "cell": column(
-            pl.Int8,
-            "13 * column + row; columns left, own, right; row 6 is alongside, 12 ahead",
-            ge=0,
-            lt=CELLS,
+            pl.Int8, "13 * column + row; columns left, own, right; row 6 is alongside, 12 ahead", ge=0, lt=CELLS
         ),
         "neighbor_id": column(pl.Int32, "vehicle in the cell", ge=0),
         "dx_m": column(pl.Float32, "neighbor's x_m - own x_m", unit="m"),

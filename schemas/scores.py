@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import PLACE, Table, column
 
 WITHOUT_ERROR = "of the entries, those that break no rule of severity error"
 WITHOUT_WARNING = "of the entries, those that break no rule of severity error or warning"
@@ -12,8 +12,7 @@ VEHICLE_SCORES = Table(
     "One row per vehicle: its feasibility, judged by the rules that could be checked in its subset.",
     key=("vehicle_id",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "unique within the subset", ge=0),
         "entries": column(pl.Int32, "rows of the track", ge=1),
         "share_without_error": column(pl.Float64, WITHOUT_ERROR, ge=0, le=1),
@@ -27,8 +26,7 @@ SUBSET_SCORES = Table(
     "recomputed motion and recorded headways are with each other. What cannot be compared is null.",
     key=("subset",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "entries": column(pl.Int64, "rows of tracks", ge=1),
         "rules_unchecked": column(pl.List(pl.String), "rules that need a column which the source lacks"),
         "share_without_error": column(pl.Float64, WITHOUT_ERROR, ge=0, le=1),

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, PARTS, SUBSET, Table, column
+from tracklake.schemas.columns import DATASET, PARTS, PLACE, Table, column
 
 SPLITS = Table(
     "splits",
@@ -12,8 +12,7 @@ SPLITS = Table(
     partition=(),
     columns={
         "split": column(pl.String, "the split's name"),
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "block": column(
             pl.Int32, "counted from 0 in each subset; what is seen around a sample never lies beyond its block", ge=0
         ),
@@ -48,10 +47,7 @@ SPLIT_BALANCE = Table(
             unit="veh/lane/s",
             nullable=True,
         ),
-        "relaxed": column(
-            pl.Boolean,
-            "True where the lake is too small to meet every constraint of the split",
-        ),
+        "relaxed": column(pl.Boolean, "True where the lake is too small to meet every constraint of the split"),
         "relaxed_reason": column(pl.String, "which constraint, and by how much", nullable=True),
     },
 )
@@ -64,8 +60,7 @@ SPLIT_LEFT_OUT = Table(
     partition=(),
     columns={
         "split": column(pl.String, "the split's name"),
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "in two parts", ge=0),
         "parts": column(pl.String, "in which it has entries, in the order train, val, eval"),
         "entries": column(pl.Int64, "of it in val and eval, which go into no part", ge=1),

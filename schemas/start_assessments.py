@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import PLACE, Table, column
 
 ESTIMATORS = ("regression", "mean_speed", "no_margin", "local_regression")
 """The contract's (DESIGN section 6), two simpler ones and a better one; see `pipeline.transforms.starts.assessment`."""
@@ -13,8 +13,7 @@ START_ASSESSMENTS = Table(
     "of what was cut off the estimated windows cover. The tracks in the lake stay whole.",
     key=("estimator", "beyond_m"),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "estimator": column(
             pl.String,
             "regression is that of missing_starts; mean_speed and no_margin are simpler, local_regression fits the 10 "

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, ORIGINS, SUBSET, Table, column
+from tracklake.schemas.columns import ORIGINS, PLACE, Table, column
 
 SOURCE_FILE = pl.Struct({"file": pl.String(), "sha256": pl.String()})
 
@@ -11,8 +11,7 @@ SUBSETS = Table(
     "One row per subset: the unit of parallelism, splitting and reporting.",
     key=("subset",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "recording": column(pl.String, "one continuous camera recording"),
         "site": column(pl.String, "where it was recorded"),
         "origin": column(
@@ -21,17 +20,9 @@ SUBSETS = Table(
             isin=ORIGINS,
         ),
         "direction": column(pl.String, "of travel: upper/lower (highD) or north/south/east/west"),
-        "freeway": column(
-            pl.Boolean,
-            "False for arterials, which take no part in late starts, samples and splits",
-        ),
+        "freeway": column(pl.Boolean, "False for arterials, which take no part in late starts, samples and splits"),
         "frame_rate_hz": column(pl.Float64, "of the source", unit="Hz", gt=0),
-        "lanes": column(
-            pl.Int16,
-            "main lanes of the carriageway; null where unknown",
-            nullable=True,
-            ge=1,
-        ),
+        "lanes": column(pl.Int16, "main lanes of the carriageway; null where unknown", nullable=True, ge=1),
         "seconds": column(pl.Float64, "length of the recording", unit="s", gt=0),
         "first_frame": column(pl.Int32, "the recording's first frame, where time_s = 0"),
         "last_frame": column(pl.Int32, "the subset's last frame"),
@@ -70,8 +61,7 @@ SUBSET_STATUS = Table(
     "One row per subset: what validation decided about the whole of it.",
     key=("subset",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "backward_vehicles": column(pl.Int32, "vehicles with any entry of negative speed", ge=0),
         "excluded": column(pl.Boolean, "kept in the lake, out of samples and splits"),
         "excluded_reason": column(pl.String, "null unless excluded", nullable=True),

@@ -2,7 +2,7 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, SUBSET, Table, column
+from tracklake.schemas.columns import PLACE, Table, column
 
 TRACKS = Table(
     "tracks",
@@ -10,13 +10,8 @@ TRACKS = Table(
     "travel, y_m to the driver's right; both are those of the vehicle's FRONT CENTRE.",
     key=("vehicle_id", "frame"),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
-        "vehicle_id": column(
-            pl.Int32,
-            "unique within the subset; the source's own id unless that was reused",
-            ge=0,
-        ),
+        **PLACE,
+        "vehicle_id": column(pl.Int32, "unique within the subset; the source's own id unless that was reused", ge=0),
         "frame": column(pl.Int32, "the source's frame number", ge=0),
         "time_s": column(pl.Float64, "since the recording's first frame", unit="s", ge=0),
         "x_m": column(
@@ -96,16 +91,8 @@ TRACKS = Table(
             unit="m/s2",
             nullable=True,
         ),
-        "leader_id": column(
-            pl.Int32,
-            "vehicle ahead in the lane, as recorded; null = none",
-            nullable=True,
-        ),
-        "follower_id": column(
-            pl.Int32,
-            "vehicle behind in the lane, as recorded; null = none",
-            nullable=True,
-        ),
+        "leader_id": column(pl.Int32, "vehicle ahead in the lane, as recorded; null = none", nullable=True),
+        "follower_id": column(pl.Int32, "vehicle behind in the lane, as recorded; null = none", nullable=True),
         "gap_m": column(
             pl.Float64,
             "leader's front - leader's length - own front, rounded to 1 mm; exact where the leader points along the "
@@ -114,10 +101,7 @@ TRACKS = Table(
             nullable=True,
         ),
         "headway_recorded_m": column(
-            pl.Float32,
-            "the source's own distance headway; null = no leader",
-            unit="m",
-            nullable=True,
+            pl.Float32, "the source's own distance headway; null = no leader", unit="m", nullable=True
         ),
     },
 )

@@ -2,46 +2,26 @@
 
 import polars as pl
 
-from tracklake.schemas.columns import DATASET, SUBSET, VEHICLE_CLASSES, Table, column
+from tracklake.schemas.columns import PLACE, VEHICLE_CLASSES, Table, column
 
 VEHICLES = Table(
     "vehicles",
     "One row per vehicle: who it is and the extent of its track.",
     key=("vehicle_id",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "unique within the subset", ge=0),
         "source_vehicle_id": column(pl.Int32, "the id in the source's file", ge=0),
         "class": column(
-            pl.String,
-            "car, truck or motorcycle; null where the source has none",
-            nullable=True,
-            isin=VEHICLE_CLASSES,
+            pl.String, "car, truck or motorcycle; null where the source has none", nullable=True, isin=VEHICLE_CLASSES
         ),
-        "length_m": column(
-            pl.Float32,
-            "along the direction of travel",
-            unit="m",
-            nullable=True,
-            ge=0,
-            le=100,
-        ),
-        "width_m": column(
-            pl.Float32,
-            "across the direction of travel",
-            unit="m",
-            nullable=True,
-            ge=0,
-            le=20,
-        ),
+        "length_m": column(pl.Float32, "along the direction of travel", unit="m", nullable=True, ge=0, le=100),
+        "width_m": column(pl.Float32, "across the direction of travel", unit="m", nullable=True, ge=0, le=20),
         "first_frame": column(pl.Int32, "the track's first frame"),
         "last_frame": column(pl.Int32, "the track's last frame"),
         "entries": column(pl.Int32, "rows of the track", ge=1),
         "entries_announced": column(
-            pl.Int32,
-            "how many the source's metadata says there are (Total_Frames, numFrames)",
-            nullable=True,
+            pl.Int32, "how many the source's metadata says there are (Total_Frames, numFrames)", nullable=True
         ),
         "start_x_m": column(pl.Float64, "x_m of the first entry", unit="m"),
         "end_x_m": column(pl.Float64, "x_m of the last entry", unit="m"),
@@ -57,21 +37,11 @@ VEHICLE_STARTS = Table(
     "One row per vehicle of a freeway subset: how its track begins.",
     key=("vehicle_id",),
     columns={
-        "dataset": DATASET,
-        "subset": SUBSET,
+        **PLACE,
         "vehicle_id": column(pl.Int32, "unique within the subset", ge=0),
-        "eligible": column(
-            pl.Boolean,
-            "first seen one second or more into the recording, and not on an on-ramp",
-        ),
+        "eligible": column(pl.Boolean, "first seen one second or more into the recording, and not on an on-ramp"),
         "starts_late": column(pl.Boolean, "eligible and first seen beyond the cut-off"),
-        "fully_tracked": column(
-            pl.Boolean,
-            "eligible, first seen at or before the cut-off, and no frame gap",
-        ),
-        "early": column(
-            pl.Boolean,
-            "entered before the road ahead was fully recorded: gives no samples",
-        ),
+        "fully_tracked": column(pl.Boolean, "eligible, first seen at or before the cut-off, and no frame gap"),
+        "early": column(pl.Boolean, "entered before the road ahead was fully recorded: gives no samples"),
     },
 )
