@@ -42,13 +42,9 @@ HASHES = ".hashes.json"
 
 @dataclass(frozen=True)
 class Discovery:
-    """The raw files that a SOURCE holds.
+    """The raw files of a SOURCE: units to be read together, by source; refusals; names of files that are no raw data.
 
-    Args:
-        units: files to be read together, by source.
-        refusals: messages about files that look like raw data but cannot be used.
-        skipped: names of files that are no raw data.
-        recognised: every file of a known format, whether or not it could be grouped with its others.
+    `recognised` are all files of a known format, whether or not they could be grouped with their others.
     """
 
     units: tuple[tuple[Source, Unit], ...]
@@ -67,12 +63,8 @@ def discover(
 ) -> Discovery:
     """Find and group the raw files of a file or folder.
 
-    Args:
-        source: a file, or a folder searched at any depth (hidden folders apart); an archive is a folder.
-        dataset: take files for this dataset only.
-        digest: sha256 of a file's bytes; it may raise SourceError.
-        mapping: the user's description of columns; files that have them are read by it.
-        recording: the user's name for the recording of a file that does not tell it.
+    A folder is searched at any depth, but for hidden folders; an archive is a folder. `digest` returns the sha256 of a
+    file's bytes; files that have the columns of `mapping` are read by it; `recording` names one that its file does not.
 
     Raises:
         SourceError: nothing there, or nothing recognised in it.
@@ -96,10 +88,6 @@ def discover(
 
 def recognise(source: Path, dataset: str) -> list[RawFile]:
     """Find a dataset's raw files by their first lines alone; none is read to its end or hashed.
-
-    Args:
-        source: as for `discover`.
-        dataset: name of the dataset.
 
     Raises:
         SourceError: no such file or folder.

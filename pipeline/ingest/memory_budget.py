@@ -6,11 +6,7 @@ from contextlib import contextmanager
 
 
 class MemoryBudget:
-    """A number of bytes that threads reserve and release.
-
-    Args:
-        size: size of the whole budget, in bytes.
-    """
+    """A number of bytes that threads reserve and release, of a budget of `size` bytes."""
 
     def __init__(self, size: int) -> None:
         self._size = size
@@ -22,9 +18,6 @@ class MemoryBudget:
         """Wait until enough bytes are free, and reserve them for the length of a block.
 
         A size larger than the whole budget reserves all of it, so that its recording is read alone.
-
-        Args:
-            size: how much to reserve, in bytes.
         """
         size = min(size, self._size)
         with self._released:

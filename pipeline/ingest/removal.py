@@ -14,15 +14,9 @@ from tracklake.schemas import TRACKS
 
 @dataclass(frozen=True)
 class Removed:
-    """A recording that was taken out of a lake.
+    """A recording that was taken out of a lake: its subsets, and its rows in `tracks` and in all tables.
 
-    Args:
-        dataset: name of the dataset.
-        recording: name of the recording.
-        subsets: names of its subsets.
-        entries: number of its rows in `tracks`.
-        rows: number of its rows in all tables.
-        files: raw files that are still where they were read.
+    `files` are the raw files that are still where they were read.
     """
 
     dataset: str
@@ -78,11 +72,8 @@ def _is_gone(path: str) -> bool:
 def find_missing(folder: Folder, jobs: Iterable[Job], manifest: Manifest, dataset: str | None = None) -> list[Commit]:
     """Return the commits of ingestion all of whose files were in a folder and are missing from it now.
 
-    Args:
-        folder: present contents of the folder.
-        jobs: all jobs that its files give: what one of these makes is not missing.
-        manifest: live files of the lake.
-        dataset: the only dataset that was searched for; None for all.
+    `jobs` are all that the folder's files give: what one of these makes is not missing. With a dataset only its files
+    were searched for.
     """
     planned = {job.key for job in jobs}
     return [
@@ -164,14 +155,9 @@ def name_recordings(commits: Sequence[Commit]) -> str:
 
 
 def remove_recordings(root: Path, names: Sequence[str]) -> tuple[list[Removed], list[str]]:
-    """Remove recordings from a lake, with all that was made of them; their files are retired, not deleted yet.
+    """Remove recordings, `recording` or `dataset/recording`, with all that was made of them; files are retired first.
 
-    Args:
-        root: the lake's folder.
-        names: names of recordings, as in `subsets.recording`, or `dataset/recording`.
-
-    Returns:
-        What was removed, and the stages over the whole lake that have to run again.
+    Returns what was removed, and the stages over the whole lake that have to run again.
 
     Raises:
         LakeMissingError: no lake there.

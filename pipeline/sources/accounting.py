@@ -16,14 +16,9 @@ CONFLICT = "another row has the same vehicle and frame"
 
 
 def split_duplicates(rows: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split rows from exact repetitions of earlier ones.
+    """Split rows from exact repetitions of earlier ones, both sorted by key, then by values, then by file and line.
 
-    Args:
-        rows: values with FILE and LINE, in the order of these two.
-        key: one or two Int32 columns that sort equal rows next to each other.
-
-    Returns:
-        (first occurrences, repetitions), sorted by key, then by values, then by file and line.
+    `rows` have FILE and LINE and are in the order of these two; `key` is one or two Int32 columns.
     """
     values = [name for name in rows.columns if name not in (FILE, LINE)]
     rest = [name for name in values if name not in key]
@@ -68,17 +63,10 @@ def account_rows(
     rows_parsed: Sequence[int],
     dropped: Sequence[tuple[pl.DataFrame, str]],
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Build the ingest log and the rejects of one recording.
+    """Build the ingest log and the rejects of one recording; read = kept + dropped for each file.
 
-    Args:
-        dataset: name of the dataset.
-        recording: name of the recording.
-        parts: files of the recording.
-        rows_parsed: number of rows of each part that were parsed.
-        dropped: sets of parsed rows (FILE, LINE) that were dropped later, each with its reason.
-
-    Returns:
-        (schemas.INGEST_LOG with one row per file, schemas.REJECTS); read = kept + dropped in each row.
+    `rows_parsed` counts the parsed rows of each part; `dropped` are sets of parsed rows (FILE, LINE) that were dropped
+    later, each with its reason. Returns (schemas.INGEST_LOG with one row per file, schemas.REJECTS).
     """
     later = [rows.select(FILE, LINE, reason=pl.lit(reason)) for rows, reason in dropped]
     rejects, log = [], []

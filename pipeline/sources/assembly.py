@@ -25,16 +25,10 @@ def assemble_subset(
 ) -> Subset:
     """Compute the derived columns of oriented entries and cast everything to the schemas.
 
-    Args:
-        entries: rows sorted by vehicle_id, frame: x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
-            headway_recorded_m, and lateral_speed_mps if the source has it.
-        sizes: one row per vehicle_id: source_vehicle_id, class, length_m, width_m, entries_announced.
-        dataset: name of the dataset.
-        name: name of the subset.
-        facts: recording, site, origin, direction, freeway, frame_rate_hz, lanes, seconds, first_frame, on_ramp_lanes,
-            lane_markings_m, ids_split, columns_missing.
-        use_recorded_headway: whether a recorded headway replaces a missing leader; see `add_gaps`.
-        files: raw files of the recording.
+    `entries` are sorted by vehicle_id, frame and have x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
+    headway_recorded_m, and lateral_speed_mps if the source has it; `sizes` have source_vehicle_id, class, length_m,
+    width_m, entries_announced per vehicle_id; `facts` are the columns of SUBSETS that do not follow from these. For
+    `use_recorded_headway` see `add_gaps`.
     """
     rate_hz, first_frame = facts["frame_rate_hz"], facts["first_frame"]
     entries = add_kinematics(entries, rate_hz).with_columns(

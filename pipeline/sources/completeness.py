@@ -29,10 +29,8 @@ class Announced:
 
     Args:
         totals: counts of the recording by measure (vehicles, cars, trucks, entries); None = not announced.
-        totals_by: authority for the totals.
         vehicles: source_vehicle_id, entries_announced, first_frame, last_frame (null = not announced), one row per
             vehicle, also without rows; None if each vehicle's own rows announce their number.
-        vehicles_by: authority for the vehicles' counts.
     """
 
     totals: Mapping[str, int | None]
@@ -52,14 +50,9 @@ class Completeness:
 def compare_counts(
     dataset: Dataset, recording: str, subsets: Sequence[Subset], announced: Announced, log: pl.DataFrame
 ) -> Completeness:
-    """Compare what was kept of one recording with what was announced.
+    """Compare what was kept of one recording with the counts that metadata, rows or the publisher announce.
 
-    Args:
-        dataset: name of the dataset.
-        recording: name of the recording.
-        subsets: subsets of the recording.
-        announced: counts announced by metadata, rows or the publisher.
-        log: schemas.INGEST_LOG of the files that hold its entries.
+    `log` has the rows of schemas.INGEST_LOG of the files that hold its entries.
     """
     vehicles = pl.concat([VEHICLES.empty(), *(subset.vehicles for subset in subsets)])
     each = _compare_vehicles(vehicles, announced.vehicles)

@@ -19,13 +19,9 @@ def split_derived(
     repetitions. Such a row is dropped if a row of a file with more columns has the same values in all shared columns.
     If the dropped row has a column that the fuller file lacks, its value is first copied to the fuller file's row.
 
-    Args:
-        rows: rows of all files, with FILE.
-        shares: rows of each file, in the order of FILE; a file has the columns that are not all null.
-        essential: columns that identify an entry; files without them in common are not compared.
-
-    Returns:
-        (rows to keep, rows that a fuller file repeats), in the given order; the latter unchanged.
+    `shares` are the rows of each file in the order of FILE; a file has the columns that are not all null. Files that do
+    not share the `essential` columns, which identify an entry, are not compared. Returns (rows to keep, rows that a
+    fuller file repeats), in the given order; the latter unchanged.
     """
     present = [frozenset(_find_filled(share) & set(rows.columns)) for share in shares]
     # Files without a row of the recording have no columns.

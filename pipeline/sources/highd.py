@@ -45,12 +45,7 @@ CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
 
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
-    """Turn a recording's three files into its tables.
-
-    Args:
-        parts: recordingMeta, tracksMeta, tracks, in this order.
-        recording: name of the recording, the number in the files' names.
-    """
+    """Turn a recording's recordingMeta, tracksMeta and tracks, in this order, into its tables."""
     files = [part.file for part in parts]
     read, entries = HIGHD_FORMAT.read_recording(parts, recording)
     markings = _read_markings(read.meta, files[0])
@@ -71,14 +66,9 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
 
 
 def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:
-    """Read recordingMeta and tracksMeta.
+    """Read recordingMeta and tracksMeta among a recording's files by kind; tracks are not read.
 
-    Args:
-        files: the recording's files by kind; tracks are not read.
-        recording: name of the recording, the number in the files' names.
-
-    Returns:
-        The row of recordingMeta; lanes by driving direction; the rows of tracksMeta, one per vehicle.
+    Returns the row of recordingMeta, lanes by driving direction, and the rows of tracksMeta, one per vehicle.
 
     Raises:
         SourceError: a file cannot be read or belongs to another recording.

@@ -13,12 +13,10 @@ from tracklake.pipeline.transforms.splits.tables import COLUMNS
 
 @dataclass(frozen=True)
 class Announcement:
-    """The subsets that metadata files announce.
+    """The subsets that metadata files announce, and messages about recordings that cannot be used.
 
-    Args:
-        subsets: one row per carriageway with vehicles: the columns of `splits.tables.COLUMNS`, `recording`, `origin`,
-            `lanes` and `seconds`. `weight` is the sum of numFrames.
-        refusals: messages about recordings that cannot be used.
+    A row per carriageway with vehicles: the columns of `splits.tables.COLUMNS`, `recording`, `origin`, `lanes` and
+    `seconds`. `weight` is the sum of numFrames.
     """
 
     subsets: pl.DataFrame

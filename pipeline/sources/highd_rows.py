@@ -29,10 +29,8 @@ def split_impossible(
     The lane must be one of the carriageway's or the strip left or right of them (median, shoulder); the speed must lie
     within the bounds of `tracks`.
 
-    Args:
-        entries: laneId, xVelocity, drivingDirection.
-        upper_lanes: lanes of the upper carriageway, whose laneIds begin with 2 (1 is its shoulder).
-        lower_lanes: lanes of the lower carriageway.
+    `entries` have laneId, xVelocity and drivingDirection. The laneIds of the upper lanes begin with 2 (1 is the
+    shoulder).
     """
     direction = entries[DIRECTION].to_numpy()
     # The median has an id of its own between the carriageways: it is left of both.

@@ -34,12 +34,8 @@ FileSet = tuple[tuple[str, str], dict[str, RawFile]]
 class LevelxRecording:
     """The metadata of one recording and the accounting of its rows.
 
-    Args:
-        meta: the row of recordingMeta.
-        vehicles: rows of tracksMeta, one per vehicle.
-        parts: the three files with the lines that could not be parsed.
-        rows_parsed: number of parsed rows of each file.
-        dropped: sets of parsed rows that were dropped, each with its reason.
+    The row of recordingMeta; rows of tracksMeta, one per vehicle; the three files with the lines that could not be
+    parsed; the number of parsed rows of each; sets of parsed rows that were dropped, each with its reason.
     """
 
     meta: dict[str, Any]
@@ -54,8 +50,6 @@ class LevelxFormat:
     """The three files of one dataset.
 
     Args:
-        dataset: name of the dataset, which its dialects begin with.
-        title: name of the dataset in messages.
         fields: header of each kind of file.
         raw: raw schema of each kind.
         choices: allowed values of text columns, in lower case, by kind.
@@ -144,14 +138,9 @@ class LevelxFormat:
         return PurePosixPath(file.filename).stem.endswith(self.find_kind(file))
 
     def read_recording(self, parts: Sequence[Part], recording: str) -> tuple[LevelxRecording, pl.DataFrame]:
-        """Read a recording's three files and drop the rows of tracks that cannot be true.
+        """Read a recording's three files, in the order of KINDS, and drop the rows of tracks that cannot be true.
 
-        Args:
-            parts: the three files in the order of KINDS.
-            recording: name of the recording, the number in the files' names.
-
-        Returns:
-            The recording, and the rows of tracks with FILE and LINE, sorted by vehicle and frame.
+        Returns the recording, and the rows of tracks with FILE and LINE, sorted by vehicle and frame.
 
         Raises:
             SourceError: a file cannot be read or belongs to another recording.
@@ -177,10 +166,7 @@ class LevelxFormat:
         return LevelxRecording(meta, known, rejected, rows_parsed, dropped), entries
 
     def read_metadata(self, files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], pl.DataFrame]:
-        """Read recordingMeta and tracksMeta, from files by kind.
-
-        Returns:
-            The row of recordingMeta; the rows of tracksMeta, one per vehicle.
+        """Read the row of recordingMeta, and the rows of tracksMeta, one per vehicle, from files by kind.
 
         Raises:
             SourceError: a file cannot be read or belongs to another recording.
@@ -258,12 +244,7 @@ class LevelxFormat:
 
 
 def split_conflicts(entries: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split the first row (by LINE) of each vehicle and frame from later ones, which contradict it.
-
-    Args:
-        entries: rows with LINE, sorted by the key.
-        key: columns of the vehicle and the frame.
-    """
+    """Split the first row (by LINE) of each vehicle and frame, the sorted key, from later ones, which contradict it."""
     conflicting = entries.select(
         pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in key).fill_null(value=False)
     ).to_series()

@@ -77,11 +77,8 @@ class Site:
     """A recording site of NGSIM.
 
     Args:
-        name: value of Location.
         freeway: whether it is a freeway; else an arterial with several directions.
-        direction: direction of travel on a freeway.
         lanes: number of main lanes of a freeway.
-        on_ramp_lanes: lanes that are on-ramps.
         day: local date of the recordings.
     """
 

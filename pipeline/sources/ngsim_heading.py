@@ -44,7 +44,6 @@ class Heading:
     """The fields of a file.
 
     Args:
-        dialect: format of its lines.
         names: names of all fields in the file's order; NGSIM's where they are known.
         header_lines: number of lines before the first row.
         blanks: whether runs of blanks separate fields instead of commas.
@@ -97,10 +96,7 @@ def read_heading(head: bytes, where: str, mapping: ColumnMapping | None = None) 
     A first line without a number is a header, behind lines that are blank or begin with # or %. A file without header
     has the columns of the original or of the export, possibly behind an index.
 
-    Args:
-        head: first bytes of the file's text.
-        where: name of the file for messages.
-        mapping: the user's description of the columns; a file that lacks one of them is None.
+    `where` names the file in messages. By a mapping of the user's, a file that lacks one of its columns is None.
 
     Raises:
         SourceError: the header's names are not understood, or two columns have one meaning.

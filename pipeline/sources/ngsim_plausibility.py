@@ -200,10 +200,8 @@ class Verdict:
     """What the figures of a file mean for reading it.
 
     Args:
-        problems: reasons to refuse the file.
         units: units that the file has and its header does not say, by column.
         use_time: whether Global_Time tells recordings apart.
-        notes: messages for the user.
     """
 
     problems: list[str] = field(default_factory=list)

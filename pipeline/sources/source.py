@@ -69,11 +69,8 @@ class RawFile:
 class Spilled:
     """The rows of one file that holds several recordings, left in the staging folder.
 
-    Args:
-        recordings: number of rows by recording; the rows are in `<folder>/<recording>/*.arrow`.
-        rows_read: number of data lines of the file.
-        rejects: `line`, `reason`, `text` of lines that belong to no recording.
-        notes: messages for the user.
+    `recordings` counts rows by recording, which are in `<folder>/<recording>/*.arrow`; `rows_read` counts data lines;
+    `rejects` are `line`, `reason`, `text` of lines that belong to no recording; `notes` are for the user.
     """
 
     recordings: Mapping[str, int]
@@ -86,10 +83,8 @@ class Spilled:
 class Part:
     """One file's share of a recording.
 
-    Args:
-        file: the raw file.
-        rows: spilled rows; None if the source reads the raw file itself.
-        rejects: `line`, `reason`, `text` of rejected lines that can only belong to this recording.
+    `rows` are spilled rows, None if the source reads the raw file itself; `rejects` are `line`, `reason`, `text` of
+    rejected lines that can only belong to this recording.
     """
 
     file: RawFile
@@ -99,14 +94,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Subset:
-    """One subset in canonical form.
-
-    Args:
-        name: name of the subset.
-        tracks: rows of schemas.TRACKS.
-        vehicles: rows of schemas.VEHICLES.
-        facts: the row of schemas.SUBSETS.
-    """
+    """One subset in canonical form: rows of schemas.TRACKS, of schemas.VEHICLES, and its row of schemas.SUBSETS."""
 
     name: str
     tracks: pl.DataFrame
@@ -118,13 +106,8 @@ class Subset:
 class Canonical:
     """One recording in canonical form, with every row of its files accounted for.
 
-    Args:
-        subsets: carriageways that have entries.
-        log: rows of schemas.INGEST_LOG, one per file.
-        rejects: rows of schemas.REJECTS.
-        completeness: rows of schemas.COMPLETENESS.
-        notes: messages for the user.
-        row_order: what the rows of its files are sorted by: vehicle and frame, frame and vehicle, or neither.
+    Its carriageways with entries, the rows of schemas.INGEST_LOG (one per file), REJECTS and COMPLETENESS, messages for
+    the user, and what the rows of its files are sorted by: vehicle and frame, frame and vehicle, or neither.
     """
 
     subsets: tuple[Subset, ...]
@@ -137,11 +120,9 @@ class Canonical:
 
 @dataclass(frozen=True)
 class Unit:
-    """Raw files to be read together: a highD recording's three, or one NGSIM file.
+    """Raw files to be read together, in the order of their source: a highD recording's three, or one NGSIM file.
 
-    Args:
-        files: the files in the order their source expects.
-        recording: name of the recording; None if only the rows tell it.
+    `recording` is None if only the rows tell it.
     """
 
     files: tuple[RawFile, ...]
@@ -161,10 +142,6 @@ class Source:
     """A dataset: its description, and the functions that recognise, read and convert its files.
 
     Args:
-        name: name of the dataset.
-        title: full name for people.
-        licence: licence of the data.
-        citation: reference to cite.
         signature: description of its files, for messages about unknown files.
         version: number that changes with what the functions below make of the same bytes.
         detect: function of the first bytes and the file name; returns a dialect or None.

@@ -44,17 +44,10 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
     is used; if not, x_m, y_m and speed_mps are interpolated linearly between the two frames around it and the lane is
     that of the earlier one. Both frames must exist: a gap is never bridged.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, y_m, lane, speed_mps of one subset, sorted by vehicle_id, frame. y_m, lane and
-            speed_mps are optional.
-        first_frame: first frame of the recording, at tick 0.
-        frame_rate_hz: frame rate of the source.
-        rate_hz: rate of the clock.
-
-    Returns:
-        CLOCK_DTYPES without the columns missing in `tracks`, sorted by vehicle_id, tick; `frame` is null if no source
-        frame falls on the tick. `segment` numbers the gap-free runs of source frames, so ticks are consecutive within a
-        segment. A skipped frame starts a new segment even if no tick falls on that frame.
+    `tracks` have vehicle_id, frame, x_m and perhaps y_m, lane, speed_mps of one subset, sorted by the first two.
+    Returns the given ones of CLOCK_DTYPES, sorted by vehicle_id, tick; `frame` is null if no source frame falls on the
+    tick. `segment` numbers the gap-free runs of source frames, so ticks are consecutive within a segment. A skipped
+    frame starts a new segment even if no tick falls on that frame.
 
     Raises:
         TracklakeError: the clock is faster than the source.
@@ -106,15 +99,7 @@ def join_key(vehicle_id: NDArray[np.integer], frame: NDArray[np.integer]) -> Int
 
 
 def cut_runs(values: NDArray[np.int32], rows: int) -> list[tuple[int, int]]:
-    """Cut rows into pieces that split no run of equal values.
-
-    Args:
-        values: (N,) segments or ticks; equal ones are consecutive.
-        rows: approximate number of rows of a piece; more if a run is longer.
-
-    Returns:
-        First row and end (exclusive) of each piece.
-    """
+    """Cut rows into pieces of about `rows` that split no run of equal values: first row and end of each."""
     starts = find_run_starts(values)
     runs = np.searchsorted(starts, np.arange(0, values.size, rows), side="right") - 1
     cuts = [int(start) for start in np.unique(starts[runs])]

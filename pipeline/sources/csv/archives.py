@@ -29,13 +29,7 @@ ENCRYPTED = 1
 
 @dataclass(frozen=True)
 class ArchiveContents:
-    """The visible files of an archive.
-
-    Args:
-        files: members with a raw file's ending, sorted by name.
-        others: names of members with another ending.
-        refusals: messages about members with a raw file's ending that cannot be read.
-    """
+    """The files of an archive with a raw file's ending, names of the others, and messages about unreadable ones."""
 
     files: tuple[RawFile, ...]
     others: tuple[str, ...]
@@ -49,11 +43,7 @@ def is_archive(path: Path) -> bool:
 
 
 def list_members(archive: RawFile, suffixes: Sequence[str]) -> ArchiveContents:
-    """List the files of an archive.
-
-    Args:
-        archive: the archive itself.
-        suffixes: endings of raw files, in lower case.
+    """List the files of an archive; `suffixes` are endings of raw files, in lower case.
 
     Raises:
         SourceError: the archive is damaged.

@@ -30,9 +30,8 @@ POINT, COMMA = re.compile(rb"^[+-]?\d*\.\d+$"), re.compile(rb"^[+-]?\d*,\d+$")
 class TextForm:
     """The way in which a text differs from the plain form.
 
-    Args:
-        codec: codec of an encoding with two bytes for each character; None for UTF-8.
-        replacements: single bytes of the decoded text, and what replaces each.
+    `codec` is that of an encoding with two bytes for each character, None for UTF-8; `replacements` are single bytes of
+    the decoded text, and what replaces each.
     """
 
     codec: str | None

@@ -123,11 +123,7 @@ def _read_block(handle: BinaryIO, size: int, file: RawFile) -> bytes:
 def read_whole_lines(handle: BinaryIO, chunk_bytes: int, file: RawFile, *, heading_lines: int = 0) -> Iterator[bytes]:
     """Read an open file in chunks of whole lines; the last line may lack its newline.
 
-    Args:
-        handle: the open file.
-        chunk_bytes: approximate size of a chunk.
-        file: named in messages.
-        heading_lines: number of lines at the file's start that are chunks of their own.
+    The first `heading_lines` lines are chunks of their own.
 
     Raises:
         SourceError: a compressed file is damaged or cut short, or holds far more text than trajectories of its size.

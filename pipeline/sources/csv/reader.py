@@ -86,12 +86,9 @@ class Layout:
 
 @dataclass(frozen=True)
 class Chunk:
-    """The kept and the rejected rows of some consecutive lines.
+    """The kept rows of consecutive lines (wanted fields and `line`, Int64 from 1) and the others (REJECT_SCHEMA).
 
-    Args:
-        frame: kept rows with the wanted fields and `line` (Int64, from 1).
-        rejects: `line`, `reason`, `text` of the other rows.
-        rows_read: number of data lines, always the sum of the two.
+    `rows_read`, the number of data lines, is always the sum of the two.
     """
 
     frame: pl.DataFrame
@@ -112,14 +109,9 @@ def map_chunks(
     threads: int,
     chunk_bytes: int = CHUNK_BYTES,
 ) -> Iterator[Result]:
-    """Apply a function to a file's chunks in threads, and yield its results in order.
+    """Apply a function of a chunk's number, from 0, and the chunk in parsing threads; yield its results in order.
 
-    Args:
-        file: the file, compressed or not.
-        layout: layout of its lines.
-        work: function of a chunk's number, from 0, and the chunk; called in the thread that parsed it.
-        threads: number of chunks parsed and worked on at once; one more is held in memory.
-        chunk_bytes: approximate size of a chunk.
+    `threads` chunks are parsed and worked on at once; one more is held in memory.
 
     Raises:
         SourceError: a compressed file is damaged or cut short.

@@ -34,12 +34,7 @@ def is_table(head: bytes) -> bool:
 
 
 def read_as_csv(handle: BinaryIO, head: bytes, name: str) -> Iterator[bytes]:
-    """Yield the CSV text of a file's table.
-
-    Args:
-        handle: the open file, which can be rewound.
-        head: its first bytes.
-        name: name of the file for messages.
+    """Yield the CSV text of a file's table; the handle can be rewound, and `head` are its first bytes.
 
     Raises:
         NoTableError: the file is damaged or holds no such table.

@@ -22,11 +22,9 @@ class CspEntries:
     """The entries of one subset, (N,) each, sorted by track and frame.
 
     Args:
-        track_id: id of the track, increasing.
         frame: frame number, increasing within a track.
         x_ft: lateral position in ft (NGSIM's Local_X).
         y_ft: position along the road in ft (NGSIM's Local_Y).
-        lane: lane number; 1 is the driver's leftmost.
     """
 
     track_id: NDArray[np.int32]
@@ -48,9 +46,8 @@ class CspEntries:
 def to_csp_entries(clock: pl.DataFrame, *, last_lane: int | None) -> CspEntries:
     """Convert entries in metres to the script's.
 
-    Args:
-        clock: track_id, frame, x_m, y_m, lane (without nulls), sorted by track_id, frame; each pair once.
-        last_lane: highest lane; higher ones count as this one (the script's 6 on US-101). None = no limit.
+    The clock has track_id, frame, x_m, y_m, lane (without nulls) and is sorted by the first two; each pair once. Lanes
+    above `last_lane` count as it (the script's 6 on US-101).
 
     Raises:
         TracklakeError: single precision cannot represent an id or a frame.
@@ -88,12 +85,8 @@ def assign_recorded_ids(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl
     Vehicles that share an id in the source are one track again. If two of them are in the same frame, which the
     script's Dataset class cannot read, the one with the lower vehicle_id (seen first) is kept.
 
-    Args:
-        clock: vehicle_id, frame.
-        vehicles: vehicle_id, source_vehicle_id.
-
-    Returns:
-        The clock with track_id, sorted by track_id, frame; the number of dropped rows.
+    From vehicle_id, frame of the clock and vehicle_id, source_vehicle_id of the vehicles. Returns the clock with
+    track_id, sorted by track_id, frame, and the number of dropped rows.
     """
     names = vehicles.select("vehicle_id", track_id="source_vehicle_id")
     if names["vehicle_id"].equals(names["track_id"]):
@@ -110,13 +103,9 @@ def assign_run_ids(clock: pl.DataFrame, block: NDArray[np.int32], *, highest_id:
 
     The Dataset class counts rows, not frames: across a gap it would mistake a second for a tenth of one.
 
-    Args:
-        clock: vehicle_id, tick, segment, sorted by vehicle_id, tick.
-        block: (N,) block of the split; a new run begins where it changes.
-        highest_id: highest id of all vehicles, also of those not in the clock; unused ids are above it.
-
-    Returns:
-        The clock with track_id, sorted by track_id, tick.
+    The clock has vehicle_id, tick, segment, and is sorted by the first two; a new run begins where the (N,) block of
+    the split changes. Unused ids are above `highest_id`, that of all vehicles. Returns the clock with track_id, sorted
+    by track_id, tick.
     """
     vehicle, tick, segment = (clock[name].to_numpy() for name in ("vehicle_id", "tick", "segment"))
     new_vehicle = np.diff(vehicle, prepend=vehicle[:1] - 1) != 0

@@ -37,9 +37,6 @@ class OverwritingGrid:
 
     The entries of a subset are sorted by frame, lane and position, so that an origin's neighbors are next to it.
 
-    Args:
-        entries: entries of one subset.
-
     Raises:
         TracklakeError: frames and lanes do not fit 31 bits.
     """
@@ -106,8 +103,7 @@ class OverwritingGrid:
     ) -> Iterator[tuple[Integers, Rows, Singles]]:
         """Walk from each origin along a lane, one vehicle per step, until no origin has another within reach.
 
-        Yields:
-            Index of the origin in target, position of the neighbor in the sorted arrays, its dy.
+        Yields the index of the origin in target, the position of the neighbor in the sorted arrays, and its dy.
         """
         origin, other = np.arange(target.size), first
         while origin.size:
@@ -121,10 +117,8 @@ class OverwritingGrid:
 class ResolvedGrid:
     """The lake's grid, in which the nearest vehicle keeps a shared cell and the others move to the nearest free one.
 
-    Args:
-        positions: track_id, tick, x_m, lane of one subset, sorted by track_id, tick.
-        kept: (N,) origins whose grids can be filled.
-        part: (N,) part of each row; only rows of one part are neighbors.
+    `positions` have track_id, tick, x_m, lane of one subset, sorted by the first two; (N,) `kept` are origins whose
+    grids can be filled; only rows of one (N,) part are neighbors.
     """
 
     def __init__(self, positions: pl.DataFrame, kept: Flags, part: Parts) -> None:
@@ -156,13 +150,7 @@ class ResolvedGrid:
 
 
 def _find_origins(neighbors: pl.DataFrame, clock: pl.DataFrame, rows: Integers) -> Integers:
-    """Find the row of each neighbor's origin, (M,).
-
-    Args:
-        neighbors: vehicle_id and tick of the origin; neighbors of one origin are consecutive.
-        clock: vehicle_id, tick, sorted.
-        rows: (N,) row of each of the clock's entries.
-    """
+    """Find the row of each neighbor's origin, (M,), among the (N,) rows of a clock's sorted entries."""
     origin_key, clock_key = (
         join_key(frame["vehicle_id"].to_numpy(), frame["tick"].to_numpy()) for frame in (neighbors, clock)
     )

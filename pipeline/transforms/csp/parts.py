@@ -72,15 +72,9 @@ def assign_parts_by_split(
 ) -> tuple[Parts, NDArray[np.int32], Parts]:
     """Assign entries to parts by the lake's split, across which no vehicle, frame or history reaches.
 
-    Args:
-        clock: vehicle_id, tick.
-        blocks: rows of `splits` of this subset.
-        first_frame: first frame of the recording, at tick 0.
-        stride: source frames per tick.
-
-    Returns:
-        (N,) each: the part or NO_PART; the row of `blocks` or -1; the part before vehicles in two parts are left out,
-        of which only the entries in train are kept.
+    The clock has vehicle_id, tick; tick 0 is at `first_frame`, and `stride` source frames make a tick. Returns, (N,)
+    each: the part or NO_PART; the row of `blocks`, this subset's rows of `splits`, or -1; the part before vehicles in
+    two parts are left out, of which only the entries in train are kept.
     """
     vehicle = clock["vehicle_id"].to_numpy()
     frame = first_frame + clock["tick"].to_numpy() * stride
@@ -107,16 +101,12 @@ def assign_parts_by_split(
 
 
 def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, Flags]:
-    """Find the entries that the script's filter (preprocess_data.m, 'Filter edge cases') and --full-future drop.
+    """Find the entries that the script's filter ('Filter edge cases') and --full-future drop: (N,) flags by reason.
 
     The script keeps an entry at frame t if the 31st frame of its track is <= t and the last one > t + 1.
 
-    Args:
-        entries: entries of one subset.
-        full_future: whether a sample needs 50 rows after it.
-
-    Returns:
-        (N,) flags by reason; reasons may overlap.
+    The script keeps an entry at frame t if the 31st frame of its track is <= t and the last one > t + 1. With
+    `full_future` a sample needs 50 rows after it. Reasons may overlap.
     """
     row = np.arange(entries.height)
     first, last = entries.bound_tracks()
@@ -131,12 +121,7 @@ def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, Flags]:
 
 
 def keep_samples(part: Parts, drops: Mapping[str, Flags]) -> tuple[Flags, dict[str, list[int]]]:
-    """Keep the entries to which no reason applies, and count the others by reason and part.
-
-    Args:
-        part: (N,) part of each entry.
-        drops: (N,) flags by reason.
-    """
+    """Keep the entries to which no reason applies, and count the others by reason and part."""
     kept = np.ones(part.size, np.bool_)
     counts = {}
     for reason in REASONS:

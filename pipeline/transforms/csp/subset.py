@@ -51,8 +51,6 @@ class CspRecording:
 
     Args:
         dataset_id: row of `tracks`, from 1.
-        first_frame: first frame of the recording.
-        frame_rate_hz: frame rate of the source.
         last_lane: highest lane; higher ones count as this one. None = no limit.
         by_frame: whether the source's rows are sorted by frame and vehicle, not by vehicle and frame.
     """
@@ -66,13 +64,7 @@ class CspRecording:
 
 @dataclass(frozen=True)
 class CleanContext:
-    """The tables of a subset that `--clean` reads.
-
-    Args:
-        blocks: rows of `splits`.
-        vehicle_starts: vehicle_id, early.
-        missing_starts: rows of `missing_starts`.
-    """
+    """A subset's rows of `splits`, `vehicle_starts` (vehicle_id, early) and `missing_starts`, for `--clean`."""
 
     blocks: pl.DataFrame
     vehicle_starts: pl.DataFrame
@@ -85,10 +77,6 @@ class CspSubset:
 
     Args:
         dataset_id: row of `tracks`, from 1.
-        entries: all entries of `tracks`.
-        lateral: (N,) lateral code.
-        longitudinal: (N,) longitudinal code.
-        part: (N,) code of the part.
         kept: (N,) whether the entry is a sample.
         dropped: number of entries of each part that are no samples, by reason.
         left_out: number of entries that are in no file, by reason.
@@ -139,9 +127,7 @@ def put_on_csp_clock(tracks: pl.DataFrame, recorded: CspRecording) -> pl.DataFra
     A 10 Hz source keeps its entries and frame numbers. Any other is interpolated (`put_on_clock`), and its frames are
     ticks counted from 1.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, y_m, lane of one subset, sorted by vehicle_id, frame.
-        recorded: facts about the subset.
+    The tracks have vehicle_id, frame, x_m, y_m, lane of one subset and are sorted by the first two.
     """
     clock = put_on_clock(
         tracks, first_frame=recorded.first_frame, frame_rate_hz=recorded.frame_rate_hz, rate_hz=RATE_HZ
@@ -153,13 +139,9 @@ def put_on_csp_clock(tracks: pl.DataFrame, recorded: CspRecording) -> pl.DataFra
 def prepare_original_subset(
     clock: pl.DataFrame, vehicles: pl.DataFrame, recorded: CspRecording, *, full_future: bool = False
 ) -> CspSubset:
-    """Prepare a subset as the script does.
+    """Prepare a subset on its `put_on_csp_clock` (lane without nulls) as the script does.
 
-    Args:
-        clock: entries from `put_on_csp_clock`, lane without nulls.
-        vehicles: vehicle_id, source_vehicle_id.
-        recorded: facts about the subset.
-        full_future: whether a sample needs 50 rows after it.
+    `vehicles` have vehicle_id, source_vehicle_id; with `full_future` a sample needs 50 rows after it.
     """
     named, shared = assign_recorded_ids(clock, vehicles)
     named, zeros = _drop_id_zero(named)
@@ -177,11 +159,7 @@ def prepare_clean_subset(
 ) -> CspSubset:
     """Prepare a subset without late starts, gaps, overwritten neighbors and leaks, with the script's arithmetic.
 
-    Args:
-        clock: entries from `put_on_csp_clock`, lane without nulls.
-        context: the subset's split and late starts.
-        recorded: facts about the subset.
-        full_future: whether a sample needs 50 rows after it.
+    On its `put_on_csp_clock` (lane without nulls); with `full_future` a sample needs 50 rows after it.
     """
     stride = find_stride(frame_rate_hz=recorded.frame_rate_hz, rate_hz=RATE_HZ)
     clock, zeros = _drop_id_zero(clock.with_columns(track_id="vehicle_id"))
@@ -218,11 +196,7 @@ def prepare_clean_subset(
 
 
 def stack_tracks(subset: CspSubset, part: int) -> tuple[NDArray[np.int32], Integers, Singles]:
-    """Stack the tracks of a part for `tracks`.
-
-    Returns:
-        (V,) increasing ids; (V,) number of rows; (N, 3) frame, x, y of all tracks, one after the other.
-    """
+    """Stack the tracks of a part: (V,) increasing ids, (V,) lengths, and (N, 3) frame, x, y, track after track."""
     rows = np.flatnonzero(subset.part == part)
     entries = subset.entries
     ids, lengths = np.unique(entries.track_id[rows], return_counts=True)

@@ -36,12 +36,8 @@ def label_maneuvers(clock: pl.DataFrame, *, rate_hz: int) -> pl.DataFrame:
     - longitudinal: `brake` if mean speed ahead / mean speed behind < 0.8, else `normal`. An empty window on either
       side, or a history without forward progress (standing, or pushed backwards by noise), is `normal`.
 
-    Args:
-        clock: x_m, lane (without nulls), segment from `put_on_clock`.
-        rate_hz: rate of the clock.
-
-    Returns:
-        lateral_maneuver and longitudinal_maneuver (Enums) of every entry, in the clock's order.
+    The clock has x_m, lane (without nulls) and segment, from `put_on_clock`. Returns lateral_maneuver and
+    longitudinal_maneuver (Enums) of every entry, in its order.
 
     Raises:
         ValueError: a lane is null.

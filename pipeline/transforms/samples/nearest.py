@@ -25,13 +25,11 @@ class _Block:
     """The entries of some whole ticks, (E,) each, sorted by tick and x.
 
     Args:
-        tick: tick of the entry.
         x: position along the road in whole units.
         y: position across the road in whole units.
         rank: number of vehicles of the tick with a smaller id.
         first: index of the tick's first vehicle in `vehicle_id`.
         vehicle_id: vehicles sorted by tick and id; a vehicle's index is its tick's first plus its rank.
-        row: row of the clock.
     """
 
     tick: NDArray[np.int32]
@@ -44,19 +42,15 @@ class _Block:
 
 
 def find_nearest(clock: pl.DataFrame, k: int, origins: Flags | None = None) -> pl.Series:
-    """Find the k nearest vehicles around each origin, the nearest first (DESIGN section 7).
+    """Find the k >= 1 nearest vehicles around each origin, the nearest first (DESIGN section 7).
 
     The distance is sqrt(dx^2 + dy^2) between front centres at the same tick, in any lane or none; of two equally near
     vehicles the one with the smaller id comes first. Positions are compared to a tenth of a micrometre, distances to a
     billionth of a metre. If fewer than k other vehicles are on the road, all of them are listed.
 
-    Args:
-        clock: vehicle_id, tick, x_m, y_m: one row per (vehicle, tick), in any order.
-        k: number of vehicles, at least 1.
-        origins: (N,) flags of the clock's rows that are origins; None = all. Every row can be a neighbor.
-
-    Returns:
-        `nearest`, a list of vehicle ids (Int32) per origin, in the order of their rows.
+    The clock has vehicle_id, tick, x_m, y_m: one row per (vehicle, tick), in any order. `origins` are (N,) flags, None
+    = all; every row can be a neighbor. Returns `nearest`, a list of vehicle ids (Int32) per origin, in the order of
+    their rows.
 
     Raises:
         ValueError: k is less than 1.
@@ -135,9 +129,8 @@ def _compute_keys(block: _Block, own: Integers, width: int) -> tuple[Integers, I
     The bits of a non-negative float sort as the float does; the lowest bits of the squared distance are replaced by
     the id's rank.
 
-    Returns:
-        (B, 2 * width + 1) keys of the entries from `width` behind to `width` ahead; (B,) a lower bound of the keys of
-        entries farther behind or ahead, NO_VEHICLE if there are none.
+    Returns (B, 2 * width + 1) keys of the entries from `width` behind to `width` ahead, and (B,) a lower bound of the
+    keys of entries farther behind or ahead, NO_VEHICLE if there are none.
     """
     rank_mask = _mask_ranks(block)
     squared = _gather_windows(block.x, own, width)

@@ -42,10 +42,9 @@ NEIGHBOR_DTYPES: dict[str, pl.DataType] = {
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """The neighbors of all origins.
+    """The neighbors of all origins (NEIGHBOR_DTYPES), in the order of the origins' rows and then by cell.
 
     Args:
-        neighbors: NEIGHBOR_DTYPES, in the order of the origins' rows and then by cell.
         collisions: number of vehicles whose cell is taken by a nearer one; all but `crowded_out` move to another cell.
         crowded_out: number of vehicles dropped since their column has no free cell.
     """
@@ -64,9 +63,6 @@ class _Line:
     stretch on either side of a tick's lanes.
 
     Args:
-        stretch: length of a stretch in units.
-        location: (N,) sorted locations on the line in units.
-        vehicle_id: (N,) vehicle at each location.
         position: (N,) index on the line of each row of the clock.
         beside: (N, 2) index of the first entry within reach in the left and in the right lane.
         within: (N, 4) number of entries within reach: in the left lane, behind, ahead, in the right lane.
@@ -89,10 +85,8 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighbo
     again the nearest first, move to the nearest free cell of their column; of two equally near cells to the one
     towards which their dx points (ahead for dx = 0).
 
-    Args:
-        clock: vehicle_id, tick, x_m, lane: one row per (vehicle, tick), in any order. Entries without a lane neither
-            are nor have neighbors.
-        origins: (N,) flags of the clock's rows that are origins; None = all. Every row can be a neighbor.
+    The clock has vehicle_id, tick, x_m, lane: one row per (vehicle, tick), in any order. Entries without a lane neither
+    are nor have neighbors. `origins` are (N,) flags, None = all; every row can be a neighbor.
 
     Raises:
         TracklakeError: ticks, lanes and positions do not fit 64 bits.
@@ -137,8 +131,7 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighbo
 def count_collisions(clock: pl.DataFrame) -> int:
     """Count the vehicles whose cell is taken by a nearer one, in the grids of all entries.
 
-    Args:
-        clock: vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order.
+    The clock has vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order.
     """
     if clock.is_empty():
         return 0
@@ -209,8 +202,6 @@ class _Pairs:
     """Origins of a chunk with their neighbors, (P,) each, sorted by origin, column and dx.
 
     Args:
-        origin: index of the origin in the chunk.
-        column: column of the cell.
         row: row of the cell; -1 = crowded out.
         other: neighbor's index on the line.
         dx: distance along the road in units.
@@ -268,12 +259,8 @@ def _find_contested(pairs: _Pairs) -> Integers:
 def _resolve_collisions(pairs: _Pairs, contested: Integers, vehicle_id: NDArray[np.int32]) -> int:
     """Give every contested cell to its nearest vehicle, move the others in place, and count them.
 
-    Each round moves one vehicle per column, so there are at most 12 rounds.
-
-    Args:
-        pairs: pairs of a chunk; `row`, `other` and `dx` of contested ones are replaced, sorted by cell.
-        contested: (M,) indices of pairs: whole columns of origins' grids, one after the other.
-        vehicle_id: vehicle at each index on the line.
+    `row`, `other` and `dx` of the (M,) contested pairs, whole columns of origins' grids one after the other, are
+    replaced, sorted by cell. Each round moves one vehicle per column, so there are at most 12 rounds.
     """
     row, other, dx = pairs.row[contested], pairs.other[contested], pairs.dx[contested]
     column = pairs.origin[contested] * COLUMNS + pairs.column[contested]

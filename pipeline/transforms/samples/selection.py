@@ -44,14 +44,7 @@ PIECE_ROWS = 1 << 16
 
 @dataclass(frozen=True)
 class SampleTables:
-    """The tables of one subset's samples.
-
-    Args:
-        samples: schemas.SAMPLES.
-        sample_drops: schemas.SAMPLE_DROPS; with the samples they add up to the counts' `entries_on_clock`.
-        sample_counts: schemas.SAMPLE_COUNTS, one row.
-        neighbors: schemas.NEIGHBORS of the samples only.
-    """
+    """The tables of one subset's samples; samples and drops add up to the counts' `entries_on_clock`."""
 
     samples: pl.DataFrame
     sample_drops: pl.DataFrame
@@ -75,18 +68,9 @@ def draw_samples(
 ) -> SampleTables:
     """Keep or drop every entry on the protocol's clock, label the samples and find their neighbors (DESIGN section 7).
 
-    Args:
-        tracks: TRACK_COLUMNS of one subset, sorted by vehicle_id, frame.
-        vehicle_starts: vehicle_id, early, from `classify_starts`.
-        missing_starts: rows from `estimate_missing_starts`.
-        findings: vehicle_id, severity, first_frame, last_frame of the subset's findings, in any order.
-        protocol: recipe of the samples; its clock may not be faster than the source.
-        dataset: name of the dataset.
-        subset: name of the subset.
-        first_frame: first frame of the recording, at tick 0.
-        frame_rate_hz: frame rate of the source.
-        excluded: whether validation excludes the subset.
-        last_lane: highest lane; for maneuvers and neighbors, higher ones count as it. None = no limit.
+    `tracks` have TRACK_COLUMNS, sorted by vehicle_id, frame; `vehicle_starts` vehicle_id, early; `findings` vehicle_id,
+    severity, first_frame, last_frame, in any order. The protocol's clock, on which `first_frame` is tick 0, may not be
+    faster than the source. For maneuvers and neighbors, lanes above `last_lane` count as it.
     """
     rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     clock = put_on_clock(tracks.select(TRACK_COLUMNS), **rates)
@@ -164,21 +148,13 @@ def find_error_entries(
     frame_rate_hz: float,
     rate_hz: int,
 ) -> Flags:
-    """Find the entries whose own vehicle has a finding of severity error in their history or horizon.
+    """Find (N,) flags of entries whose vehicle has a finding of severity error in their history or horizon.
 
     The finding's frames must overlap those of the history and horizon, first and last included; a tick between two
     frames covers both.
 
-    Args:
-        clock: vehicle_id, tick.
-        findings: vehicle_id, severity, first_frame, last_frame.
-        protocol: recipe with the lengths of history and horizon.
-        first_frame: first frame of the recording, at tick 0.
-        frame_rate_hz: frame rate of the source.
-        rate_hz: rate of the clock.
-
-    Returns:
-        (N,) flags in the clock's order.
+    The clock has vehicle_id, tick, and tick 0 at `first_frame`; findings have vehicle_id, severity, first_frame,
+    last_frame.
     """
     errors = findings.filter(pl.col("severity") == "error")
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)

@@ -13,14 +13,6 @@ Result = TypeVar("Result")
 
 
 def map_in_threads(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
-    """Apply a function to every piece and return the results in the order of the pieces.
-
-    Args:
-        work: function of a piece; it must not change what other calls read.
-        pieces: small values such as the bounds of a slice.
-
-    Raises:
-        Exception: the first exception of `work`, in the order of the pieces.
-    """
+    """Apply a function to pieces, such as bounds of slices, and return its results in their order."""
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(work, pieces))

@@ -54,16 +54,11 @@ def allocate_flow_balanced(
     and the best of R descents about 12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No difference is
     below 0, so the difference found bounds its distance from the optimum.
 
-    Args:
-        subsets: one row per freeway subset that is not excluded, in any order: the columns of `splits.tables.COLUMNS`,
-            and `block` if a subset has several rows. `weight` is the number of kept samples (of entries, before samples
-            exist). A subset without vehicles_per_lane_s or with weight 0 counts for shares and coverage, not for
-            the moments.
-        split: name of the split in the tables.
-        train_share: share of the vehicles in train if there is no `val`.
-        validation: whether there is a third part, `val`.
-        seed: seed of the search's random starts; a dataset's result does not depend on other datasets.
-        restarts: number of random starts.
+    `subsets` have one row per freeway subset that is not excluded, in any order: the columns of
+    `splits.tables.COLUMNS`, and `block` if a subset has several rows. `weight` is the number of kept samples (of
+    entries, before samples exist). A subset without vehicles_per_lane_s or with weight 0 counts for shares and
+    coverage, not for the moments. With `validation` there is a third part, `val`. A dataset's result does not depend on
+    other datasets.
 
     Raises:
         ValueError: a column is missing, a subset (or block) has two rows, a count is null or negative, or a part
@@ -88,11 +83,7 @@ def tabulate_allocation(
 ) -> Allocation:
     """Build the tables of an allocation, and check by the given counts whether it is relaxed.
 
-    Args:
-        units: the columns of `splits.tables.COLUMNS`, `part`, and `block` if a subset has several rows.
-        split: name of the split in the tables.
-        train_share: share of the vehicles in train if there is no `val`.
-        validation: whether there is a third part, `val`.
+    `units` have the columns of `splits.tables.COLUMNS`, `part`, and `block` if a subset has several rows.
     """
     shares = find_shares(train_share, validation=validation)
     units = add_defaults(units).sort("dataset", "site", "direction", "subset", "block")

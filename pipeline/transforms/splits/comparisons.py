@@ -15,10 +15,8 @@ def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = 
     Ids are numbered in the order of appearance, so the parts overlap in time and vehicles on either side of a cut are
     neighbors. A part without vehicles has no row.
 
-    Args:
-        subsets: the columns of `splits.tables.COLUMNS`.
-        vehicles: dataset, subset, vehicle_id, weight (kept samples) of every vehicle of these subsets.
-        split: name of the split in the tables.
+    `subsets` have the columns of `splits.tables.COLUMNS`, `vehicles` dataset, subset, vehicle_id, weight (kept
+    samples).
 
     Source: Deo and Trivedi 2018, `preprocess_data.m`.
     """
@@ -54,12 +52,8 @@ def divide_by_recording(
 
     Shares are of recordings, rounded, but at least one of two recordings is in eval, and one of three in val.
 
-    Args:
-        subsets: the columns of `splits.tables.COLUMNS` and `recording`.
-        split: name of the split in the tables.
-        train_share: share of the recordings in train if there is no `val`.
-        validation: whether there is a third part, `val`.
-        seed: seed of the draw; a dataset's draw does not depend on other datasets.
+    `subsets` have the columns of `splits.tables.COLUMNS` and `recording`. A dataset's draw does not depend on other
+    datasets.
 
     Raises:
         ValueError: a part would have no share.

@@ -95,13 +95,7 @@ class Scores:
 
 
 def find_allocation(problem: Problem, random: np.random.Generator, restarts: int) -> Indices:
-    """Find the best allocation: the (n,) numbers of the subsets' parts.
-
-    Args:
-        problem: subsets to allocate.
-        random: generator of the search's starts; unused if all allocations are tried.
-        restarts: number of descents of the search.
-    """
+    """Find the best (n,) numbers of the subsets' parts, by trying all or by `restarts` random descents."""
     if problem.parts**problem.subsets <= EXHAUSTIVE_STATES:
         return _try_all(problem)
     return _search_locally(problem, random, restarts)

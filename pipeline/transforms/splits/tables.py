@@ -34,12 +34,7 @@ WHOLE: dict[str, pl.Expr] = {
 
 @dataclass(frozen=True)
 class Allocation:
-    """A split and the balance of its parts.
-
-    Args:
-        splits: rows of `schemas.splits.SPLITS`.
-        balance: rows of `schemas.splits.SPLIT_BALANCE`; a part without subsets has zeros.
-    """
+    """A split and the balance of its parts: rows of SPLITS and SPLIT_BALANCE; a part without subsets has zeros."""
 
     splits: pl.DataFrame
     balance: pl.DataFrame
@@ -54,13 +49,9 @@ class Allocation:
 def tabulate_units(
     units: pl.DataFrame, *, split: str, parts: Sequence[str], reasons: Mapping[str, str | None] | None = None
 ) -> Allocation:
-    """Build the tables of a split from its units.
+    """Build the tables of a split from its units: COLUMNS, `part`, and those of WHOLE if they are no whole subsets.
 
-    Args:
-        units: COLUMNS, `part`, and the columns of WHOLE if units are no whole subsets.
-        split: name of the split in the tables.
-        parts: names of all parts, in order.
-        reasons: description of broken constraints by dataset; None = none.
+    `parts` are the names of all parts, in order; `reasons` describe broken constraints by dataset.
     """
     # Sorted, so that the same units give the same sums to the last digit.
     units = add_defaults(units).sort("dataset", "subset", "block", "part")

@@ -47,13 +47,7 @@ def cut_blocks(subsets: pl.DataFrame, *, block_s: float, purge_s: float) -> pl.D
     block of its own if, after the purge, at least half a block is left; else it extends the last whole block. A subset
     shorter than a block is one block.
 
-    Args:
-        subsets: dataset, subset, first_frame, last_frame, frame_rate_hz.
-        block_s: length of a block in s, above 0.
-        purge_s: length of the purge between blocks in s.
-
-    Returns:
-        One row per block, the columns of `BLOCKS`, sorted by them.
+    `subsets` have dataset, subset, first_frame, last_frame, frame_rate_hz. Returns a row per block, sorted by BLOCKS.
     """
     block = (block_s * pl.col("frame_rate_hz") - ROUNDING_FRAMES).ceil().cast(pl.Int64)
     purge = (purge_s * pl.col("frame_rate_hz") - ROUNDING_FRAMES).ceil().cast(pl.Int64)
@@ -76,12 +70,7 @@ def cut_blocks(subsets: pl.DataFrame, *, block_s: float, purge_s: float) -> pl.D
 
 
 def find_visits(entries: pl.DataFrame, blocks: pl.DataFrame) -> pl.DataFrame:
-    """Count the entries of each vehicle in each block, VISITS sorted by key.
-
-    Args:
-        entries: vehicle_id and frame of one subset, in any order.
-        blocks: the subset's rows of `cut_blocks`.
-    """
+    """Count the entries (vehicle_id, frame) of each vehicle in each block of one subset, VISITS sorted by key."""
     return (
         entries.select(pl.col("vehicle_id"), pl.col("frame").cast(pl.Int32))
         .sort("frame")
@@ -99,13 +88,8 @@ def count_samples(
 ) -> pl.DataFrame:
     """Count each vehicle's samples in each block that holds their history and least future, WEIGHTS sorted by key.
 
-    Args:
-        samples: vehicle_id and tick of one subset's samples.
-        blocks: the subset's rows of `cut_blocks`.
-        stride: source frames per tick.
-        first_frame: frame of tick 0.
-        history: length of a sample's history in source frames.
-        future: length of a sample's least future in source frames.
+    `samples` have vehicle_id and tick of one subset; `stride` source frames make a tick, and tick 0 is at
+    `first_frame`. History and least future are in source frames.
     """
     at = first_frame + pl.col("tick") * stride
     return (
@@ -132,11 +116,7 @@ def describe_blocks(
 
     `vehicles_per_lane_s` is the block's own: vehicles with an entry in it / lanes / its length in s.
 
-    Args:
-        blocks: rows of `cut_blocks`.
-        subsets: dataset, subset, site, direction, lanes, frame_rate_hz.
-        visits: rows of `find_visits` of all subsets.
-        weights: rows of `count_samples` of all subsets.
+    `subsets` have dataset, subset, site, direction, lanes, frame_rate_hz; visits and weights are those of all subsets.
     """
     key = ["dataset", "subset", "block"]
     seconds = (pl.col("last_frame") - pl.col("first_frame") + 1) / pl.col("frame_rate_hz")
@@ -158,9 +138,7 @@ def find_left_out(visits: pl.DataFrame, splits: pl.DataFrame) -> pl.DataFrame:
 
     A vehicle in train and another part stays in train; one in val and eval is left out of both.
 
-    Args:
-        visits: rows of `find_visits` of all subsets.
-        splits: rows of `schemas.splits.SPLITS` of one split, whose blocks are those of the visits.
+    From `find_visits` of all subsets, and the rows of SPLITS of one split, whose blocks are those of the visits.
     """
     elsewhere = pl.col("entries").filter(pl.col("part") != PARTS[0]).sum()
     return (
@@ -184,12 +162,8 @@ def recount_blocks(
 
     A vehicle counts in the first of its blocks in a part, so that sums over blocks count none twice.
 
-    Args:
-        units: rows of `describe_blocks`.
-        splits: rows of `schemas.splits.SPLITS` of one split, one per block.
-        left_out: rows of `find_left_out` of this split.
-        visits: rows of `find_visits` of all subsets.
-        weights: rows of `count_samples` of all subsets.
+    `units` are rows of `describe_blocks`, `splits` of SPLITS (one per block), `left_out` of `find_left_out`; visits and
+    weights are those of all subsets.
     """
     vehicle, key = ["dataset", "subset", "vehicle_id"], ["dataset", "subset", "block"]
     parts = splits.select(*key, "part")

@@ -48,17 +48,9 @@ def assess_starts(
 ) -> pl.DataFrame:
     """Measure coverage and excess of each estimator per start position, on tracks cut on purpose.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
-        vehicle_starts: vehicle_id, fully_tracked, from `classify_starts`.
-        dataset: name of the dataset.
-        subset: name of the subset.
-        cutoff_m: cut-off of the whole tracks from `classify_starts`; None = no assessment.
-        first_frame: first frame of the recording.
-        frame_rate_hz: frame rate of the source.
-
-    Returns:
-        Rows of `start_assessments`; a position that no fully tracked vehicle reaches has none.
+    `tracks` have vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by the first two; `vehicle_starts`
+    vehicle_id, fully_tracked. Without a cut-off (that of the whole tracks) there is no assessment. Returns rows of
+    `start_assessments`; a position that no fully tracked vehicle reaches has none.
     """
     cut = cut_and_estimate(
         tracks, vehicle_starts, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=frame_rate_hz
@@ -134,10 +126,6 @@ class _WholeTracks:
     """The tracks of a subset before they are cut.
 
     Args:
-        references: fully tracked vehicles.
-        cutoff_m: cut-off of the subset.
-        first_frame: first frame of the recording.
-        frame_rate_hz: frame rate of the source.
         entries: number of entries of all vehicles of the subset.
         speeds_mps: sum of the speeds of all entries.
         speeds_before_mps: sum of the speeds of all earlier rows of the references, for each row.

@@ -30,17 +30,16 @@ ERRORS = 2.0
 class Cut:
     """B tracks cut at one position, and the drives of R fully tracked vehicles, of which a track's own is unknown.
 
+    Unknown lanes are NaN.
+
     Args:
         start_frame: (B,) frame of the first entry left.
         speed_mps: (B,) speed of that entry.
-        lane: (B,) lane of that entry; NaN = unknown.
         by_mean_speed: (B,) frames from the cut-off to the start at the subset's mean speed.
         known: (B, R) whether the reference is another vehicle and reaches the start.
         frames: (B, R) frames from the cut-off to the start; 0 if not known.
         speeds_mps: (B, R) speed of the reference's entry nearest to the start.
-        lanes: (B, R) lane of that entry.
         passed_frame: (B, R) frame at which the reference crossed the start.
-        frame_rate_hz: frame rate of the source.
     """
 
     start_frame: Integers

@@ -38,11 +38,7 @@ ROUNDING_M = 1e-6
 def find_cutoff(start_x_m: Floats) -> float | None:
     """Find the first c = 0, 2, 4 ... m with at least half of the starts at or before it and none in (c, c + 2].
 
-    Args:
-        start_x_m: first positions of the eligible tracks.
-
-    Returns:
-        c in m; None if there are no starts.
+    `start_x_m` are the first positions of the eligible tracks; None if there are none.
     """
     if not start_x_m.size:
         return None
@@ -68,16 +64,8 @@ def classify_starts(
     If no track is eligible there is no cut-off, and no vehicle is late, fully tracked or early. A vehicle without a
     lane is not on a ramp. For early vehicles see `_find_first_arrival`.
 
-    Args:
-        vehicles: vehicle_id, first_frame, last_frame, entries, start_x_m, end_x_m, start_lane of one subset.
-        dataset: name of the dataset.
-        subset: name of the subset.
-        first_frame: first frame of the recording.
-        frame_rate_hz: frame rate of the source.
-        on_ramp_lanes: lanes that are on-ramps.
-
-    Returns:
-        `vehicle_starts` (a row per vehicle) and `start_cutoffs` (one row).
+    `vehicles` have vehicle_id, first_frame, last_frame, entries, start_x_m, end_x_m, start_lane of one subset. Returns
+    `vehicle_starts` (a row per vehicle) and `start_cutoffs` (one row).
     """
     after_s = (pl.col("first_frame") - first_frame) / frame_rate_hz
     on_ramp = pl.col("start_lane").is_in(list(on_ramp_lanes)).fill_null(value=False)
@@ -155,17 +143,9 @@ def estimate_missing_starts(
     speed is not positive, all frames since the recording's first count as missing. If all references have the same
     speed the slope is 0; r2 is null if their frames do not vary.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
-        vehicle_starts: vehicle_id, starts_late, fully_tracked, from `classify_starts`.
-        dataset: name of the dataset.
-        subset: name of the subset.
-        cutoff_m: cut-off from `classify_starts`; None = no late starts.
-        first_frame: first frame of the recording.
-        frame_rate_hz: frame rate of the source.
-
-    Returns:
-        Rows of `missing_starts`.
+    `tracks` have vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by the first two; `vehicle_starts`
+    vehicle_id, starts_late, fully_tracked. Without a cut-off there are no late starts. Returns rows of
+    `missing_starts`.
     """
     late = vehicle_starts.filter("starts_late").select("vehicle_id")
     if cutoff_m is None or late.is_empty():
@@ -210,11 +190,9 @@ def _estimate_start(references: References, start: Mapping[str, Any], by_mean_sp
 
 
 def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
-    """Fit frames = b0 + b1 * speed by ordinary least squares.
+    """Fit frames = b0 + b1 * speed by ordinary least squares: intercept_frames (b0), slope_frames_per_mps (b1), r2.
 
-    Returns:
-        intercept_frames (b0), slope_frames_per_mps (b1; 0 if the speeds do not vary), r2 (None if the frames do not
-        vary).
+    The slope is 0 if the speeds do not vary; r2 is None if the frames do not.
     """
     frames_vary = float(np.ptp(frames)) > 0
     if not frames_vary or float(np.ptp(speed_mps)) == 0:  # else rounding errors of the mean would give a slope
@@ -237,22 +215,14 @@ def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
 def find_would_be_neighbors(
     clock: pl.DataFrame, missing_starts: pl.DataFrame, *, first_frame: int, frame_rate_hz: float, rate_hz: int
 ) -> Flags:
-    """Find the entries on the clock that have a missing vehicle near them (DESIGN section 6, point 4).
+    """Find (N,) flags of entries on the clock that have a missing vehicle near them (DESIGN section 6, point 4).
 
     In its window the missing vehicle drives at constant speed from the cut-off (at first_missing_frame) to its first
     position (at start_frame), in its first lane. An entry with abs(dx) <= 40 m and abs(lane difference) <= 1 is a
     would-be neighbor; if either lane is unknown, abs(dx) decides alone. A tick between the window's last frame and
     start_frame belongs to the window, since the vehicle has no entry there.
 
-    Args:
-        clock: tick, x_m, lane from `put_on_clock`.
-        missing_starts: rows of the same subset.
-        first_frame: first frame of the recording, at tick 0.
-        frame_rate_hz: frame rate of the source.
-        rate_hz: rate of the clock.
-
-    Returns:
-        (N,) flags in the clock's order.
+    The clock has tick (0 at `first_frame`), x_m, lane, from `put_on_clock`; `missing_starts` are of the same subset.
     """
     near = np.zeros(clock.height, np.bool_)
     if missing_starts.is_empty() or clock.is_empty():

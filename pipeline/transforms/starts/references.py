@@ -12,15 +12,11 @@ from tracklake.schemas.arrays import Floats, Integers, find_run_starts
 class References:
     """The (N,) entries of R fully tracked vehicles, one vehicle after the other; a row is an index of an entry.
 
+    `first` and `last` are rows of the vehicles.
+
     Args:
-        vehicle_id: (R,) id of the vehicle.
-        frame: (N,) frame number.
-        x_m: (N,) position along the road.
         farthest_m: (N,) running maximum of x_m within a track.
-        speed_mps: (N,) recorded speed.
         lane: (N,) lane; NaN = unknown.
-        first: (R,) first row of the vehicle.
-        last: (R,) last row of the vehicle.
         left_cutoff: (R,) frame of the first crossing of the cut-off; NaN if it is never reached.
     """
 
@@ -36,13 +32,7 @@ class References:
 
     @classmethod
     def from_tracks(cls, tracks: pl.DataFrame, vehicle_starts: pl.DataFrame, cutoff_m: float) -> "References":
-        """Select the fully tracked vehicles.
-
-        Args:
-            tracks: vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by vehicle_id, frame.
-            vehicle_starts: vehicle_id, fully_tracked.
-            cutoff_m: position where their tracks should begin.
-        """
+        """Select the fully tracked vehicles among tracks sorted by vehicle_id, frame (with x_m, lane, speed_mps)."""
         wanted = vehicle_starts.filter("fully_tracked").select("vehicle_id")
         entries = tracks.join(wanted, on="vehicle_id", how="semi", maintain_order="left").with_columns(
             farthest_m=pl.col("x_m").cum_max().over("vehicle_id")
@@ -92,10 +82,8 @@ class References:
     def find_crossings(self, first: Integers, after: Integers, x_m: float | Floats) -> tuple[Floats, Integers]:
         """Find first crossings of x_m: the interpolated frame and the row of the nearer entry (the earlier of equals).
 
-        Args:
-            first: first rows of the tracks.
-            after: first rows at or past x_m, from `find_row`.
-            x_m: position, broadcast against both.
+        `first` are first rows of the tracks, `after` first rows at or past x_m, from `find_row`; x_m is broadcast
+        against both.
         """
         before = np.maximum(after - 1, first)  # the same entry where a track starts on x_m exactly
         step_m = self.x_m[after] - self.x_m[before]

@@ -102,20 +102,12 @@ def build_subset_tensors(
     border: runs are cut there, and samples whose history or least future is cut and neighbors in another block are left
     out. A subset that is one block is not changed.
 
-    Args:
-        clock: vehicle_id, tick, x_m, y_m, lane (null becomes 0), speed_mps, segment (a gap-free stretch of a track) of
-            the subset's entries on the protocol's clock, sorted by (vehicle_id, tick).
-        samples: protocol, vehicle_id, tick and the maneuvers; other protocols' rows are skipped.
-        neighbors: protocol, vehicle_id, tick, cell, neighbor_id; other protocols' rows are skipped.
-        blocks: the split's rows of `schemas.splits.SPLITS` for this subset, which do not overlap.
-        vehicles: vehicle_id, length_m, width_m of every vehicle of the clock.
-        findings: vehicle_id, severity, first_frame, last_frame, in any order.
-        first_frame: first frame of the subset, at tick 0.
-        frame_rate_hz: frame rate of the source. A tick between two frames is in a block only if both frames are.
-        protocol: protocol of the clock, samples and neighbors.
-        storage: storage of positions, one of `schemas.tensors.POSITION_STORAGES`.
-        left_out: ids of vehicles (`schemas.splits.SPLIT_LEFT_OUT`) whose entries outside `train` are in no part.
-        drop_cut: whether samples outside `train` with a neighbor in another block or in no part are left out, too.
+    `clock` has vehicle_id, tick, x_m, y_m, lane (null becomes 0), speed_mps, segment, sorted by the first two; samples
+    have protocol, vehicle_id, tick and the maneuvers; neighbors protocol, vehicle_id, tick, cell, neighbor_id (rows of
+    other protocols are skipped); vehicles vehicle_id, length_m, width_m; findings vehicle_id, severity, first_frame,
+    last_frame. `blocks` are the split's rows of SPLITS for this subset. A tick between two frames is in a block only if
+    both are. Entries of vehicles in `left_out` are in no part but train. With `drop_cut`, samples outside train with a
+    neighbor in another block or in no part are left out, too.
 
     Raises:
         ValueError: blocks overlap; the clock is not sorted; samples or neighbors do not fit the clock (they were made
@@ -151,14 +143,9 @@ class _KeptEntries:
     """The (N,) entries of the whole clock, and those that blocks of the split keep.
 
     Args:
-        vehicle_id: (N,) vehicle of the entry.
-        tick: (N,) tick of the entry.
         block: (N,) row of the split's blocks; -1 = none.
         is_kept: (N,) whether the entry is in a block.
         new_row: (N,) number of the row among the kept ones.
-        part_of_block: code of each block's part.
-        whole_runs: runs of the whole clock.
-        runs: runs cut at the blocks' borders.
     """
 
     vehicle_id: Integers
@@ -281,10 +268,7 @@ def join_after(arrays: Arrays, before: Mapping[str, int], subset_index: int) -> 
 
     Row, sample and pair numbers are shifted; the first value of offsets is left out, except in the first subset.
 
-    Args:
-        arrays: arrays of `build_subset_tensors`.
-        before: sizes of all previous subsets by letter.
-        subset_index: number of previous subsets.
+    `before` are the sizes of all previous subsets by letter, `subset_index` is their number.
 
     Raises:
         TracklakeError: there are too many rows, samples or pairs for their numbers.

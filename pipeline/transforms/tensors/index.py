@@ -14,12 +14,7 @@ from tracklake.schemas.tensors import NOMINAL_LANE_M, TENSORS_VERSION
 
 
 def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[str, Any]:
-    """Describe a subset by `schemas.tensors.SUBSET_KEYS`.
-
-    Args:
-        facts: dataset, subset, origin, frame_rate_hz, lane_markings_m (null = unknown).
-        tensors: tensors of the subset.
-    """
+    """Describe a subset by `schemas.tensors.SUBSET_KEYS`; without lane_markings_m its lanes count."""
     markings = facts["lane_markings_m"]
     last_lane = len(markings) - 1 if markings else tensors.last_lane
     return {
@@ -48,17 +43,9 @@ def describe_tensors(
 ) -> dict[str, Any]:
     """Describe the tensors by `schemas.tensors.INDEX_KEYS`.
 
-    Args:
-        subsets: descriptions from `describe_subset`, in the order of `run_subset`.
-        splits: the split's rows of `schemas.splits.SPLITS`, by which an evaluation proves that a model was trained on
-            other data.
-        protocol: protocol of the samples.
-        storage: storage of positions.
-        sizes: sizes of all arrays by letter.
-        samples_by_part: number of samples in the order of PARTS.
-        max_error_m: largest rounding error of positions: along, across.
-        squared_error_m2: sums of the squared rounding errors: along, across.
-        split_recipe: digest, parameters, left_out_vehicles; None = unknown.
+    `subsets` are descriptions from `describe_subset`, in the order of `run_subset`; `splits` the split's rows of
+    SPLITS, by which an evaluation proves that a model was trained on other data; sizes are by letter, errors along and
+    across; `split_recipe` has digest, parameters, left_out_vehicles.
     """
     split = splits["split"].unique().sort()
     return {

@@ -33,13 +33,7 @@ class Stored:
 
 
 def store_positions(x_m: Floats, y_m: Floats, *, storage: str, where: str) -> Stored:
-    """Round positions to their storage and measure the error.
-
-    Args:
-        x_m: (N,) positions along the direction of travel.
-        y_m: (N,) positions across it.
-        storage: one of `schemas.tensors.POSITION_STORAGES`.
-        where: name of the subset in messages.
+    """Round (N,) positions along the direction of travel and across it to one of POSITION_STORAGES; measure the error.
 
     Raises:
         TracklakeError: a position lies farther from the median than int16 reaches in the storage's steps.

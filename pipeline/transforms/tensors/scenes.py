@@ -25,13 +25,7 @@ class Scenes:
 
 
 def find_scenes(tick: Integers, block: Integers, sample: Integers) -> Scenes:
-    """Gather rows by block and tick; scenes without samples are left out.
-
-    Args:
-        tick: (N,) ticks of rows sorted by (vehicle_id, tick), 0 to 2**31 - 1.
-        block: (N,) block of the split, 0 or more.
-        sample: (N,) number of the row's sample; -1 = none.
-    """
+    """Gather rows sorted by (vehicle_id, tick) by block and tick; scenes without samples (-1 = none) are left out."""
     scene = (block << 32) | tick
     row = np.argsort(scene, kind="stable")
     start = find_run_starts(scene[row])

@@ -9,15 +9,9 @@ from tracklake.schemas.columns import SEVERITIES
 
 
 def find_sizes(vehicles: pl.DataFrame, vehicle_id: Integers, *, where: str) -> tuple[Singles, Singles]:
-    """Look up lengths and widths of vehicles.
+    """Look up (R,) lengths and (R,) widths of vehicles, in m; NaN = unknown.
 
-    Args:
-        vehicles: vehicle_id (unique), length_m, width_m (null = unknown), in any order.
-        vehicle_id: (R,) ids of the vehicles.
-        where: name of the subset in messages.
-
-    Returns:
-        (R,) lengths and (R,) widths in m; NaN = unknown.
+    `vehicles` have vehicle_id (unique), length_m, width_m (null = unknown), in any order.
 
     Raises:
         ValueError: a vehicle is not among `vehicles`.
@@ -44,21 +38,13 @@ def mark_findings(
     frame_rate_hz: float,
     rate_hz: int,
 ) -> Bytes:
-    """Mark every tick with the worst severity of the vehicle's own findings.
+    """Mark every tick with the worst severity of the vehicle's own findings: 1 + position in SEVERITIES; 0 = none.
 
     A tick stands for the frames after the previous tick up to its own, so no frame of a 25 Hz source is skipped. A
     tick between two frames covers both: the later one counts there, and again at the next tick.
 
-    Args:
-        vehicle_id: (N,) vehicles of entries on the clock, sorted by (vehicle_id, tick).
-        tick: (N,) ticks of the entries.
-        findings: vehicle_id, severity, first_frame, last_frame, in any order; they may overlap.
-        first_frame: first frame of the subset, at tick 0.
-        frame_rate_hz: frame rate of the source.
-        rate_hz: rate of the clock.
-
-    Returns:
-        (N,) 1 + position in SEVERITIES, 1 being the worst; 0 = no finding.
+    The (N,) entries are sorted by (vehicle_id, tick), with tick 0 at `first_frame`; findings have vehicle_id, severity,
+    first_frame, last_frame, in any order, and may overlap.
     """
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
     ends = join_key(vehicle_id, first_frame - (-tick * stride.numerator // stride.denominator))

@@ -38,12 +38,7 @@ class Moves:
 
     Args:
         group: number of the group; entries of different groups are never one vehicle.
-        frame: frame number.
-        x_m: position along the road.
-        y_m: position across the road.
-        speed_mps: speed along the road.
         announced: number of frames that the vehicle announces; 0 = unknown.
-        frame_rate_hz: frame rate of the source.
         one_way: whether no vehicle drives against x_m, so that an entry farther back is another vehicle's. On streets
             vehicles leave the subset and come back: there this holds only after an absence longer than announced.
     """

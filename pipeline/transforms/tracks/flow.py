@@ -9,14 +9,8 @@ def compute_flow(tracks: pl.DataFrame, *, lanes: int | None, rate_hz: float, sec
     An entry drives its recorded speed for 1 / frame rate, as in the macro `flow_density`, whose lanes 1 to `lanes` have
     this mean over the whole recording.
 
-    Args:
-        tracks: x_m, lane, speed_mps of one subset.
-        lanes: number of main lanes, which are lane 1 to `lanes`; None where unknown.
-        rate_hz: frame rate.
-        seconds: length of the recording.
-
-    Returns:
-        The flow; None where the lanes or the section's length are unknown.
+    `tracks` have x_m, lane, speed_mps of one subset; `seconds` is the length of the recording. None where the lanes or
+    the section's length are unknown.
     """
     if lanes is None:
         return None

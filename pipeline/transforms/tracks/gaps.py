@@ -14,11 +14,9 @@ NO_LEADER = -1
 def add_gaps(tracks: pl.DataFrame, vehicles: pl.DataFrame, *, use_recorded_headway: bool) -> pl.DataFrame:
     """Add gap_m: the leader's front - the leader's length - the own front, rounded to 1 mm.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, leader_id, headway_recorded_m of one subset, sorted by the first two.
-        vehicles: vehicle_id, length_m; if the leader's length is unknown, so is the gap.
-        use_recorded_headway: whether the gap is the recorded headway (front to front) - the leader's length if the
-            leader has no entry at that frame.
+    `tracks` have vehicle_id, frame, x_m, leader_id, headway_recorded_m of one subset, sorted by the first two. Without
+    a known length_m of the leader there is no gap. With `use_recorded_headway` a leader without an entry at that frame
+    has a gap of the recorded headway (front to front) - its length.
     """
     ids, frames, x_m = (tracks[name].to_numpy() for name in ("vehicle_id", "frame", "x_m"))
     leader = tracks["leader_id"].fill_null(NO_LEADER).to_numpy()

@@ -20,12 +20,8 @@ def find_headings(
     It is the direction of the velocity, averaged over the entries within 0.1 s before and after; frame gaps are not
     bridged. Below 2 m/s, and where a vehicle drives backwards, its last heading holds; before the first one it is 0.
 
-    Args:
-        vehicle: (N,) sorted.
-        frame: (N,) increasing within a vehicle.
-        forward_mps: (N,) velocity in the direction of travel.
-        right_mps: (N,) velocity to the driver's right.
-        rate_hz: frame rate.
+    All arrays are (N,): `vehicle` sorted, `frame` increasing within a vehicle, velocities in the direction of travel
+    and to the driver's right.
     """
     count = len(vehicle)
     if not count:

@@ -18,12 +18,7 @@ FILLED = "filled_"
 
 @dataclass(frozen=True)
 class Identified:
-    """Entries with a vehicle_id that is unique within the subset.
-
-    Args:
-        entries: given entries with vehicle_id, leader_id and follower_id (null = none), sorted by vehicle_id, frame.
-        ids_split: number of source ids that stood for more than one vehicle.
-    """
+    """Entries with vehicle_id, leader_id, follower_id (null = none), sorted by vehicle_id, frame; and ids split."""
 
     entries: pl.DataFrame
     ids_split: int

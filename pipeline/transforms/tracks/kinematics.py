@@ -43,9 +43,7 @@ def add_kinematics(tracks: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     position is interpolated linearly. The acceleration is the same difference of that speed, which equals
     (x(t + 0.2 s) - 2 x(t) + x(t - 0.2 s)) / (0.2 s)^2. At 10 Hz both pairs are equal by definition.
 
-    Args:
-        tracks: vehicle_id, frame, x_m, sorted by the first two.
-        rate_hz: frame rate of the source.
+    `tracks` have vehicle_id, frame, x_m, and are sorted by the first two.
     """
     step = rate_hz / CLOCK_HZ
     tracks = tracks.with_columns(central_difference("x_m", rate_hz).alias("speed_cd_mps")).with_columns(

@@ -27,16 +27,9 @@ def orient_highd(
     carriageway vehicles drive right and the driver's right is down; on the upper one they drive left and it is up. The
     front centre lies half a length from the middle in the direction of the heading.
 
-    Args:
-        entries: id, frame, x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId of one carriageway, as in
-            highD, sorted by id, frame.
-        direction: UPPER or LOWER.
-        upper_m: y of the upper carriageway's lane markings in m, from the top.
-        lower_m: y of the lower carriageway's lane markings in m, from the top.
-        rate_hz: frame rate.
-
-    Returns:
-        The entries with x_m and y_m, to 1 mm, heading_rad, lane, speed_mps, accel_mps2, lateral_speed_mps.
+    The entries have id, frame, x, y, width, height, xVelocity, yVelocity, xAcceleration, laneId of the carriageway, as
+    in highD, sorted by id, frame; lane markings are y in m, from the top. Adds x_m and y_m, to 1 mm, heading_rad, lane,
+    speed_mps, accel_mps2, lateral_speed_mps.
     """
     upper_lanes, sign = len(upper_m) - 1, -1 if direction == UPPER else 1
     entries = entries.with_columns(
@@ -64,18 +57,13 @@ def orient_highd(
 
 
 def orient_ngsim(entries: pl.DataFrame, direction: int | None) -> pl.DataFrame:
-    """Turn NGSIM's coordinates into the canonical frame.
+    """Add x_m, y_m, speed_mps and accel_mps2 to Local_X, Local_Y (feet, front centre), v_Vel, v_Acc of one subset.
 
     Freeways keep Local_X and Local_Y. On arterials x_m is measured along the direction of travel, from the first
     recorded point if travel runs against the axis; y_m for north and south from the street's centre line, for the
     crossing streets from the leftmost recorded point.
 
-    Args:
-        entries: Local_X, Local_Y (feet, front centre), v_Vel, v_Acc of one subset.
-        direction: EAST, NORTH, WEST or SOUTH; None on a freeway.
-
-    Returns:
-        The entries with x_m, y_m, speed_mps, accel_mps2.
+    `direction` is EAST, NORTH, WEST or SOUTH; None on a freeway.
     """
     lateral, along = pl.col("Local_X") * FOOT_M, pl.col("Local_Y") * FOOT_M
     x_m, y_m = {
