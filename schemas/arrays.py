@@ -11,15 +11,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 def expand_ranges(first: Integers, count: Integers) -> tuple[Integers, Integers]:
-    """Write ranges of consecutive numbers out, one after the other.
-
-    Args:
-        first: first number of each range, (R,).
-        count: length of each range, (R,); may be 0.
-
-    Returns:
-        The numbers, (N,), and for each of them which range it belongs to, (N,).
-    """
+    """Write (R,) ranges of `count` consecutive numbers out: the (N,) numbers, and which range each belongs to."""
     owner = np.repeat(np.arange(len(count)), count)
     before = np.cumsum(count) - count
     return np.arange(len(owner)) + np.repeat(first - before, count), owner

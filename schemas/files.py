@@ -23,11 +23,7 @@ def name_unfinished(target: Path) -> Path:
 
 
 def write_file(target: Path, content: bytes | Callable[[BinaryIO], object]) -> None:
-    """Write a file beside its target, sync it and rename it; on an error what stood there before stays.
-
-    Args:
-        target: path of the file; its folder exists.
-        content: bytes, or a function that writes them to an open binary stream.
+    """Write bytes, or what a function writes to a stream, beside a target and rename it; on an error nothing changes.
 
     Raises:
         FileAccessError: the folder is missing or full, or may not be written to.

@@ -20,11 +20,7 @@ def summarise_origins(origins: Iterable[str]) -> DataOrigin:
 
 
 def describe_synthetic(origins: Mapping[str, str]) -> str | None:
-    """Describe what of some data is synthetic; None where all was recorded.
-
-    Args:
-        origins: `subsets.origin` by the subset's name.
-    """
+    """Describe what is synthetic, by `subsets.origin` by name; None where all was recorded."""
     synthetic = sorted(name for name, origin in origins.items() if origin == "synthetic")
     if not synthetic:
         return None

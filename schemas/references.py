@@ -150,12 +150,7 @@ REFERENCES = (
 
 
 def link_references(text: str, page: str = "references.md") -> str:
-    """Turn the names of references in a Markdown text into links to their entries.
-
-    Args:
-        text: Markdown that cites references by name.
-        page: address of docs/references.md from the text's page.
-    """
+    """Turn the names of references in a Markdown text into links to their entries on docs/references.md."""
     for reference in REFERENCES:
         text = text.replace(reference.name, f"[{reference.name}]({page}#{reference.anchor})")
     return text

@@ -11,12 +11,7 @@ direction, surrogates (bytes of file names that are no UTF-8), line and paragrap
 
 
 def make_visible(text: str, *, keep: str = "") -> str:
-    r"""Write invisible characters as escapes, `\x1b` for instance.
-
-    Args:
-        text: any text.
-        keep: characters left as they are, such as line ends.
-    """
+    r"""Write invisible characters as escapes, `\x1b` for instance, but for those to keep, such as line ends."""
     if text.isprintable():
         return text
     return "".join(

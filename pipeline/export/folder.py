@@ -17,11 +17,6 @@ class ExportError(TracklakeError):
 def refuse_taken(out: Path, names: Sequence[str], *, force: bool) -> None:
     """Refuse a folder where the export would overwrite something, before any work is done.
 
-    Args:
-        out: folder of the export; it may hold other files.
-        names: names of the files.
-        force: whether existing files of these names may be replaced.
-
     Raises:
         ExportError: the folder is a file, cannot be written to, or holds one of the names.
         LakeError: the folder lies in a lake.
@@ -46,11 +41,6 @@ def write_files(out: Path, names: Sequence[str], write: Callable[[Path], None]) 
 
     A new folder appears with all files at once. In an existing folder, which may hold other files or be a disk of its
     own, the files are renamed one after the other; if that fails, the previous files are restored.
-
-    Args:
-        out: folder of the export, created if missing.
-        names: names of the files that `write` makes.
-        write: function that writes the files into a given folder.
 
     Raises:
         FileAccessError: the disk is full, or rights are missing.

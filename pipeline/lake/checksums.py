@@ -28,12 +28,7 @@ _GUARD = threading.Lock()
 
 
 def hash_file(path: Path, *, again: bool = False) -> str:
-    """Return the sha256 of a file's bytes.
-
-    Args:
-        path: path of the file.
-        again: whether to read it even if this process has read or written it before.
-    """
+    """Return the sha256 of a file's bytes; what this process has read or written before is only read if `again`."""
     status = path.stat()
     key = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
     if again or key not in _KNOWN:

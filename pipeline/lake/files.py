@@ -60,17 +60,8 @@ def write_table(
 ) -> list[LakeFile]:
     """Validate a frame and put it into the lake under its own name; nothing is visible before it is complete.
 
-    Args:
-        root: the lake's folder.
-        table: declaration of the table.
-        frame: all the table's columns, in order.
-        values: values of the partition columns.
-        fingerprint: digest that is part of the name; a whole file of that name came from the same inputs and is kept,
-            unless a rebuild made it void (see `find_free_path`).
-        where: name of the recording, for messages.
-
-    Returns:
-        The file, or nothing for a frame of no rows (a table without files is an empty table).
+    A whole file with this fingerprint in its name came from the same inputs and is kept, unless a rebuild made it void
+    (see `find_free_path`). A frame of no rows gives no file: a table without files is an empty table.
 
     Raises:
         schemas.StructureError: the frame breaks the table's structural rules.
@@ -140,16 +131,10 @@ def find_free_path(root: Path, path: str) -> str:
 
 
 def write_folder(root: Path, path: str, write: Callable[[Path], None]) -> list[LakeFile]:
-    """Put a whole folder of files into the lake at once.
+    """Put a whole folder of files into the lake at once; returns them and the listing of them that is added.
 
-    Args:
-        root: the lake's folder.
-        path: path of the folder, relative to the lake; it carries the fingerprint. A whole folder there is kept, unless
-            a rebuild made it void; `find_free_path` returns the path of the one that is then made.
-        write: fills the folder it is given.
-
-    Returns:
-        Its files, and the listing of them that is added.
+    `path` is relative to the lake and carries the fingerprint. A whole folder there is kept, unless a rebuild made it
+    void; `find_free_path` returns the path of the one that is then made.
     """
     target = root / find_free_path(root, path)
     if not _is_whole(root, target):
@@ -215,13 +200,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 
 def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.LazyFrame:
-    """Return the live rows of a table, with its partition columns, lazily.
-
-    Args:
-        root: the lake's folder.
-        manifest: live files of the lake.
-        table: what to read.
-        values: values of partition columns, to read only those files (`dataset="highd", subset="01-upper"`).
+    """Return the live rows of a table lazily, with its partition columns; `values` of these select the files to read.
 
     Raises:
         ValueError: the table is not partitioned by a column of `values`.

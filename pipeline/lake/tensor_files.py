@@ -25,19 +25,11 @@ def write_tensors(
     storage: str,
     split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write a tensor folder; no more than one subset is held in memory at a time.
+    """Write a tensor folder and return its index; no more than one subset is held in memory at a time.
 
-    Args:
-        folder: exists and is empty; the lake makes it visible, whole, afterwards.
-        subsets: facts (dataset, subset, origin, frame_rate_hz, lane_markings_m) and tensors of each, in the split's
-            order.
-        splits: the split's rows of `schemas.splits.SPLITS`.
-        protocol: of the samples.
-        storage: of positions, one of `schemas.tensors.POSITION_STORAGES`, as `subsets` were built.
-        split_recipe: what the split is made by: digest, parameters, left_out_vehicles; None: not known.
-
-    Returns:
-        What `index.json` holds.
+    The folder is empty; the lake makes it visible afterwards. `subsets` are facts (dataset, subset, origin,
+    frame_rate_hz, lane_markings_m) and tensors of each, in the split's order; `split_recipe` has digest, parameters,
+    left_out_vehicles.
 
     Raises:
         ValueError: an array is missing, not of the declared dtype or shape, or there are too many rows.

@@ -117,11 +117,8 @@ class Writer:
 def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     """Lock a lake (making it where there is none) and yield its writer; the catalog is rebuilt at the end.
 
-    The lock is the kernel's: it goes with the process, however that ends, and is not inherited by children.
-
-    Args:
-        root: the lake.
-        rebuild: begin with nothing live, whatever schema version the lake is of; see `rebuild.start_rebuild`.
+    The lock is the kernel's: it goes with the process, however that ends, and is not inherited by children. With
+    `rebuild` nothing is live at first, whatever schema version the lake is of.
 
     Raises:
         LakeLockedError: another process holds the lock.
@@ -213,9 +210,7 @@ def _open_writer(root: Path, *, rebuild: bool) -> Writer:
 def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:
     """Refuse a place that is no lake and no place for one, before anything is written there.
 
-    Args:
-        root: the place.
-        rebuild: whether a lake of another schema version will do.
+    For a rebuild a lake of another schema version will do.
 
     Raises:
         LakeError: a file, a folder of other things, a manifest that is not ours, or one of another schema version.

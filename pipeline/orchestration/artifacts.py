@@ -27,12 +27,10 @@ MAX_NAME_CHARS = 40
 
 @dataclass(frozen=True)
 class FigureTable:
-    """A table of the report's figures.
+    """A table of the report's figures: plain values by heading, and what a row means.
 
-    Args:
-        key: lowercase letters, digits and dashes; the same in every run over this lake, another in another lake.
-        description: meaning of a row.
-        rows: plain values by heading.
+    The key has lowercase letters, digits and dashes; it is the same in every run over this lake, another in another
+    lake.
     """
 
     key: str
@@ -42,14 +40,7 @@ class FigureTable:
 
 @dataclass(frozen=True)
 class ReportLink:
-    """A link to the report's page.
-
-    Args:
-        key: as that of a table.
-        description: meaning of the link.
-        address: file URI of the page.
-        text: words shown instead of the address.
-    """
+    """A link to the report's page: its key as that of a table, meaning, file URI, and words shown instead of that."""
 
     key: str
     description: str
@@ -59,9 +50,6 @@ class ReportLink:
 
 def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
     """Return the tables of reports/quality.json and the link to reports/index.html.
-
-    Args:
-        root: a lake with a report.
 
     Raises:
         OSError: the lake has no report.
@@ -90,13 +78,7 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
 
 
 def tabulate_messages(root: Path, lake_id: str, result: RunResult) -> FigureTable:
-    """Return a table of a run's failures, refusals and notes, with the level that each has in the run's log.
-
-    Args:
-        root: folder of the lake.
-        lake_id: id of the lake.
-        result: result of the run.
-    """
+    """Return a table of a run's failures, refusals and notes, with the level that each has in the run's log."""
     kinds = (
         ("failed", "ERROR", result.failed),
         ("refused", "WARNING", result.refused),

@@ -23,11 +23,8 @@ ONE_AT_A_TIME = ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLi
 def serve_deployments(lake: Path, source: Path | None, cron: str | None, interval_s: float | None) -> None:
     """Serve the flows as deployments until interrupted; runs are started from Prefect's UI, CLI or a schedule.
 
-    Args:
-        lake: folder of the lake that runs work on unless told otherwise.
-        source: file or folder that runs read unless told otherwise.
-        cron: times at which the whole pipeline runs on the source.
-        interval_s: time between two such runs, in seconds.
+    Runs work on this lake and source unless told otherwise; by cron, or at an interval in seconds, the whole pipeline
+    runs.
 
     Raises:
         UsageError: the cron expression cannot be read.

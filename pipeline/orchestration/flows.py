@@ -218,12 +218,7 @@ def run_stage(stage: str, lake: str, settings: SettingsChanges | None = None) ->
 
 
 def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
-    """Run a request as the flow that fits it, with none of Prefect's lines on the terminal.
-
-    Args:
-        request: what the user asked for.
-        plan: what was found out for it already; None: the flow finds it out.
-    """
+    """Run a request as the flow that fits it, with none of Prefect's lines on the terminal; it plans where needed."""
     parameters: dict[str, Any] = {"lake": request.lake, "settings": request.settings}
     chosen: Any = run_stage
     if INGEST in request.steps:

@@ -103,8 +103,6 @@ class RunResult:
         built: recordings (or 1 for a stage over the whole lake) made, by step.
         refused: messages about files and recordings that could not be used.
         failed: messages about work that broke off unexpectedly.
-        notes: what the user should know about what was made.
-        skipped: files of the source that are no raw data.
         removed: recordings (`dataset/recording`) whose tables were removed.
     """
 
@@ -121,8 +119,6 @@ class IngestPlan:
     """The changes that a source means for the lake.
 
     Args:
-        manifest: the lake that the source was compared with.
-        jobs: work that is not done.
         conflicts: messages about recordings that would lose rows of other files.
         missing: commits whose files once stood in the source and are missing from it now.
         superseded: commits that a new version of their file makes void.

@@ -87,11 +87,7 @@ def require_server() -> None:
 
 
 def _start_embedded() -> tuple[str, list[str]]:
-    """Start a server in this process, on a temporary database where Prefect's own cannot be used.
-
-    Returns:
-        Its address, and notes.
-    """
+    """Start a server, on a temporary database where Prefect's own cannot be used; returns its address, and notes."""
     fault = find_home_fault()
     if fault is not None:
         return _embed_server(), [_explain_temporary(fault)]

@@ -171,13 +171,7 @@ def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: Ru
 def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[RunResult, Manifest]:
     """Run every requested stage whose outputs are missing or stale; once again if files turn out to be damaged.
 
-    Args:
-        request: what the user asked for.
-        plan: what was found out for it.
-        lock_timeout_s: longest wait for another process that writes to the lake, in seconds.
-
-    Returns:
-        What was done, and the lake as it is then.
+    Returns what was done, and the lake as it is then.
     """
     result = RunResult()
     manifest = _work_once(request, plan, result, lock_timeout_s)

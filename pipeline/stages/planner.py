@@ -13,14 +13,7 @@ from tracklake.pipeline.stages.stage import INGEST, Job, Stage, StageError, Stag
 
 
 class Planner:
-    """What the stages have to do, as a lake stands.
-
-    Args:
-        root: the lake's folder.
-        manifest: live files of the lake.
-        settings: what the user set.
-        stages: the declared stages.
-    """
+    """What the stages have to do, as a lake stands."""
 
     def __init__(self, root: Path, manifest: Manifest, settings: Settings, stages: Sequence[Stage] = STAGES) -> None:
         self._root = root

@@ -17,10 +17,7 @@ class LakeReader:
     """The live tables of a lake.
 
     Args:
-        root: the lake's folder.
-        manifest: live files of the lake.
         after: stages whose tables may be read; None for all.
-        job: the work that the tables are read for.
         partition: values of the partition columns of what is read and made; none for the whole lake.
     """
 

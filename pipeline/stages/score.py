@@ -48,15 +48,9 @@ def finished_runs(root: Path) -> list[Path]:
 
 
 def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Return the scores of the runs that were made from the tensors that are live now.
+    """Return the scores of runs made from the live tensors, by model: {model, part, rows: [{seconds, rmse_m, n}]}.
 
-    Args:
-        root: the lake's folder.
-        manifest: live files of the lake.
-        skip: called with a message for each run that is damaged or of another version.
-
-    Returns:
-        {model, part, rows: [{seconds, rmse_m, n}]}, sorted by model.
+    `skip` is called with a message for each run that is damaged or of another version.
     """
     from tracklake.training.data.checks import read_index
     from tracklake.training.runs.run_folder import StaleRunError, read_config

@@ -61,10 +61,9 @@ def find_training_split(manifest: Manifest, settings: Settings) -> str:
 
 
 def _choose_training_split(made: dict[SplitRecipe, SplitResult], settings: Settings) -> tuple[str, list[str]]:
-    """Choose the split that tensors are made of: without a setting, one in which something is left to evaluate on.
+    """Choose the split that tensors are made of, and a note where it is not the protocol's.
 
-    Returns:
-        Its name, and a note where it is not the protocol's.
+    Without a setting it is one in which something is left to evaluate on.
     """
     wanted = settings.get_protocol().split
     able = [recipe.name for recipe, split in made.items() if _can_evaluate(split)]
@@ -84,8 +83,7 @@ def _can_evaluate(split: SplitResult) -> bool:
 def gather_subsets(reader: LakeReader, protocol: Protocol) -> pl.DataFrame:
     """Return the freeway subsets that are not excluded, with the number of their samples.
 
-    Returns:
-        What `allocate_flow_balanced` reads, and recording, lanes, frame_rate_hz.
+    They have what `allocate_flow_balanced` reads, and recording, lanes, frame_rate_hz.
     """
     kept = (
         reader.scan(SAMPLES)

@@ -41,13 +41,7 @@ SHARED_COLUMNS = {
 
 @dataclass(frozen=True)
 class Leakage:
-    """Figures of what the parts of one split share.
-
-    Args:
-        leakage: rows of `schemas.split_leakage.SPLIT_LEAKAGE`.
-        context: rows of SPLIT_CONTEXT.
-        shifts: rows of SPLIT_SHIFTS.
-    """
+    """Figures of what the parts of one split share: rows of SPLIT_LEAKAGE, SPLIT_CONTEXT and SPLIT_SHIFTS."""
 
     leakage: pl.DataFrame
     context: pl.DataFrame
@@ -56,8 +50,7 @@ class Leakage:
     def find_leaks(self, window_s: float) -> list[str]:
         """Return what the parts share, one sentence per pair of parts that shares anything.
 
-        Args:
-            window_s: history and future; parts that are nearer in time than this see the same moments.
+        Parts nearer in time than `window_s`, history and future, see the same moments.
         """
         found_leaks = []
         for row in self.leakage.iter_rows(named=True):
@@ -108,14 +101,9 @@ def measure_leakage(
 ) -> Leakage:
     """Count what the parts of one split share.
 
-    Args:
-        connection: with the views tracks, samples and neighbors.
-        splits: its rows of `schemas.splits.SPLITS`.
-        left_out: its rows of `SPLIT_LEFT_OUT`.
-        subsets: dataset, subset, frame_rate_hz, subset_first_frame, vehicles_per_lane_s.
-        recipe: what the split is made by.
-        protocol: whose samples and neighbors are counted.
-        rates: dataset, subset, block, vehicles_per_lane_s, where a block's is not that of its subset.
+    The connection has the views tracks, samples and neighbors; `subsets` have dataset, subset, frame_rate_hz,
+    subset_first_frame, vehicles_per_lane_s; `rates` dataset, subset, block, vehicles_per_lane_s, where a block's is not
+    that of its subset. Samples and neighbors are the protocol's.
     """
     frames = _locate_blocks(splits, subsets, recipe, rates)
     present = {str(name): set(rows["part"]) for (name,), rows in splits.group_by("dataset")}

@@ -26,13 +26,10 @@ from tracklake.schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCE
 
 @dataclass(frozen=True)
 class SplitInputs:
-    """The tables and subsets that splits are made from.
+    """The reader of the lake's tables, the subsets to split, and the protocol whose samples count.
 
-    Args:
-        reader: tables of the lake.
-        subsets: the freeway subsets that are not excluded: the columns of `splits.tables.COLUMNS`, and recording,
-            lanes, frame_rate_hz.
-        protocol: the protocol whose samples count.
+    Subsets are the freeway ones not excluded: the columns of `splits.tables.COLUMNS`, and recording, lanes,
+    frame_rate_hz.
     """
 
     reader: LakeReader
@@ -42,13 +39,7 @@ class SplitInputs:
 
 @dataclass(frozen=True)
 class SplitResult:
-    """A split as tables.
-
-    Args:
-        allocation: its rows of `splits` and `split_balance`.
-        left_out: its rows of `split_left_out`.
-        rates: dataset, subset, block, vehicles_per_lane_s, where blocks have one of their own; else None.
-    """
+    """A split as tables: `splits` and `split_balance`, `split_left_out`, and rates of blocks with their own."""
 
     allocation: Allocation
     left_out: pl.DataFrame

@@ -31,7 +31,6 @@ class Job:
 
     Args:
         key: key of the commit that it makes: `stage/dataset/recording`, or `stage`.
-        fingerprint: digest of its inputs, settings and code version.
         built_from: what the fingerprint was made of, for the manifest.
         inputs: what the build function needs: dataset and subsets, or an ingested recording's files.
     """
@@ -60,7 +59,6 @@ class StageResult:
         tables: frames by table; they are validated and written by the planner.
         files: files that the build function wrote into the lake itself, by folder (tensors, reports, models).
         info: small facts that later stages and commands read from the manifest.
-        notes: sentences for the user.
     """
 
     tables: Mapping[Table, pl.DataFrame] = field(default_factory=dict)
@@ -119,13 +117,6 @@ def make_job(key: str, *, version_of_stage: int, made_of: Mapping[str, Any], inp
 
 
 def make_commit(job: Job, files: dict[str, list[LakeFile]], info: dict[str, Any], started: float) -> Commit:
-    """Return the commit of a job's files, with the seconds that it took.
-
-    Args:
-        job: the work that was done.
-        files: the files it made, by table.
-        info: small facts that later stages and commands read.
-        started: `time.perf_counter()` when the work began, in seconds.
-    """
+    """Return the commit of a job's files, with the seconds since `started`, a value of `time.perf_counter()`."""
     timed = {**info, "seconds": round(time.perf_counter() - started, 3)}
     return Commit(key=job.key, fingerprint=job.fingerprint, files=files, built_from=job.built_from, info=timed)

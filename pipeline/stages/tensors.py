@@ -103,16 +103,7 @@ def build_subset(
     *,
     drop_cut: bool,
 ) -> SubsetTensors:
-    """Read a subset's tables and build its arrays.
-
-    Args:
-        reader: tables of the subset.
-        blocks: the split's rows for it.
-        left_out: its vehicles that the split leaves out of all parts but `train`.
-        protocol: the protocol of the samples.
-        storage: how positions are stored.
-        drop_cut: whether samples outside train with a neighbor that is cut off are left out.
-    """
+    """Read a subset's tables and build its arrays; see `build_subset_tensors`."""
     return build_subset_tensors(
         put_on_clock(reader.table(TRACKS, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
         reader.table(SAMPLES, *SAMPLE_COLUMNS),

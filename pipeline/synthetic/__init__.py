@@ -24,14 +24,7 @@ __all__ = ["ALL_FORMATS", "DEFAULT_FORMATS", "DEFAULT_MINUTES", "SampleSummary",
 
 @dataclass(frozen=True)
 class SampleSummary:
-    """The result of writing a sample.
-
-    Args:
-        files: paths of all files.
-        rows: number of data lines in the files of tracks, damaged ones included.
-        recordings: number of continuous recordings; a highD recording has two subsets.
-        seconds: duration of the generation.
-    """
+    """The result of writing a sample: its files, data lines of tracks with damaged ones, recordings, and time."""
 
     files: tuple[Path, ...]
     rows: int
@@ -49,14 +42,10 @@ def write_sample(
 ) -> SampleSummary:
     """Write a sample: raw files, `truth.parquet` and a README.
 
-    The folder appears whole or not at all: the files are written to a hidden folder, which is renamed.
-
-    Args:
-        out: folder of the sample: missing, empty, or holding only an earlier sample, which is replaced.
-        formats: some of `ALL_FORMATS`.
-        minutes: unit of the recordings' length, which is 0.4 to 1.9 times that.
-        seed: seed of all random numbers; the same seed, formats and minutes give the same bytes.
-        progress: function that is called with a description of each step.
+    The folder appears whole or not at all: the files are written to a hidden folder, which is renamed. Some of
+    ALL_FORMATS are written into `out`, which is missing, empty, or holds only an earlier sample, which is replaced.
+    Recordings last 0.4 to 1.9 times `minutes`; the same seed, formats and minutes give the same bytes. `progress` is
+    called with a description of each step.
 
     Raises:
         UsageError: an argument is invalid, or `out` holds other files.

@@ -15,11 +15,8 @@ DUPLICATES = 6
 class LineDefect:
     """One line inserted into a file.
 
-    Args:
-        name: duplicate_row, truncated_line, word_in_number, wrong_field_count, empty_line, nul_byte,
-            repeated_header, open_quote.
-        line: number of the line in the file, from 1.
-        text: text of the line that it was made from.
+    `name` is duplicate_row, truncated_line, word_in_number, wrong_field_count, empty_line, nul_byte, repeated_header or
+    open_quote; `line` is the line's number in the file, from 1.
     """
 
     name: str
@@ -29,13 +26,9 @@ class LineDefect:
 
 @dataclass(frozen=True)
 class Dialect:
-    """The dialect of a file that is damaged.
+    """The dialect of a file that is damaged; a separator of None means runs of blanks.
 
-    Args:
-        header: whether the first line names the columns.
-        separator: character between fields; None = runs of blanks.
-        number_field: index of a field that must be a number.
-        quotes: whether fields may be quoted, so that a line can end inside a quote.
+    `number_field` is the index of a field that must be a number; with `quotes` a line can end inside a quote.
     """
 
     header: bool

@@ -40,11 +40,9 @@ ROLLING_MPS = 1.6
 class Injected:
     """Damaged tracks and their defects.
 
-    Args:
-        tracks: damaged tracks with the columns `lost` (Boolean): entries that others name as their leader but that are
-            missing from the file; `leader_skipped` (Boolean): the leader's leader is recorded as the leader;
-            `headway_error` (Float64): error of the recorded headway in m.
-        defects: all injected defects.
+    `lost` (Boolean) are entries that others name as their leader but that are missing from the file; `leader_skipped`
+    (Boolean): the leader's leader is recorded as the leader; `headway_error` (Float64): that of the recorded headway in
+    m.
     """
 
     tracks: pl.DataFrame
@@ -60,15 +58,10 @@ def inject_defects(
     unseen_leaders: bool,
     random: np.random.Generator,
 ) -> Injected:
-    """Damage the tracks of one subset.
+    """Damage the tracks of one subset, which are sorted by vehicle, frame, without gaps.
 
-    Args:
-        tracks: tracks sorted by vehicle, frame, without gaps.
-        plan: number of each defect.
-        rate_hz: frame rate.
-        on_ramp_lane: lane whose vehicles begin in mid-section and so cannot start late.
-        unseen_leaders: whether one overlap is with a leader that misses frames (for formats that record its headway).
-        random: generator of random numbers.
+    Vehicles of `on_ramp_lane` begin in mid-section and so cannot start late. With `unseen_leaders` one overlap is with
+    a leader that misses frames, for formats that record its headway.
     """
     work = _copy_tracks(tracks, rate_hz, random)
     injectors: tuple[tuple[Injector, int], ...] = (

@@ -73,7 +73,6 @@ class Surface:
     """The road and the camera of a subset.
 
     Args:
-        rate_hz: frame rate, 10 or 25 Hz.
         markings: y of the lane markings, leftmost first; empty = unknown.
         headway_stands_in: whether a recorded headway gives the gap to a leader without an entry in the frame.
     """

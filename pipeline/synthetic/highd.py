@@ -62,16 +62,9 @@ def build_markings(lanes: int, lane_width_m: float) -> Markings:
 
 
 def build_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_m: float) -> pl.DataFrame:
-    """Build one carriageway's rows of the tracks file, in image coordinates.
+    """Build the 25 columns of one carriageway's rows in image coordinates, rounded as in the file, sorted by id, frame.
 
-    Args:
-        tracks: tracks of the generator, `lost` entries included; x from the entrance in the direction of travel.
-        markings: lane markings of the site.
-        upper: whether it is the upper carriageway, which drives left.
-        window_m: length of the window in m.
-
-    Returns:
-        The file's 25 columns, rounded as in the file, lost entries removed, sorted by id, frame.
+    The generator's tracks have x from the entrance in the direction of travel; `lost` entries are removed.
     """
     lanes = len(markings.upper) - 1
     sign = -1.0 if upper else 1.0
@@ -163,14 +156,7 @@ def describe_tracks(rows: pl.DataFrame, classes: Mapping[int, str], *, driving_d
 
 
 def build_recording(scenario: HighdScenario, upper: pl.DataFrame, lower: pl.DataFrame, *, frames: int) -> HighdFiles:
-    """Build the three files of one recording.
-
-    Args:
-        scenario: names, site and time.
-        upper: tracks of the carriageway that drives left, with the column `lost`.
-        lower: tracks of the other carriageway; no vehicle is in both.
-        frames: length of the recording in frames.
-    """
+    """Build a recording's files from its carriageways; their tracks have the column `lost` and share no vehicle."""
     markings = build_markings(scenario.road.lanes, scenario.road.lane_width_m)
     window = scenario.road.window_m
     rows, meta = [], []

@@ -37,11 +37,9 @@ class Surroundings:
 
 
 def find_surroundings(tracks: pl.DataFrame) -> Surroundings:
-    """Find the vehicles around each row.
+    """Find the vehicles around each row, by vehicle, frame, lane, x (the front, in the direction of travel) and length.
 
-    Args:
-        tracks: columns vehicle, frame, lane, x, length; x is the front, increasing in the direction of travel.
-            Positions are compared to three decimals, so that equal positions of a file are equal here.
+    Positions are compared to three decimals, so that equal positions of a file are equal here.
     """
     frame, lane, vehicle = (tracks[name].to_numpy().astype(np.int64) for name in ("frame", "lane", "vehicle"))
     front, rear = (np.rint(tracks.select(place).to_series().to_numpy() * 1000).astype(np.int64) for place in ENDS)

@@ -59,9 +59,7 @@ def name_recording(start_time: str) -> str:
 def build_rows(tracks: pl.DataFrame, start_time: str) -> pl.DataFrame:
     """Build a recording's 18 columns, in feet, rounded as in the files, sorted by Vehicle_ID, Frame_ID.
 
-    Args:
-        tracks: tracks of the generator; `lost` entries are removed.
-        start_time: local time of frame 1, `HH:MM`.
+    `lost` entries are removed; `start_time` is the local time of frame 1, `HH:MM`.
     """
     x_ft, y_ft, length_ft, width_ft, speed, accel = (
         tracks[name].to_numpy() / FOOT_M for name in ("x", "y", "length", "width", "speed", "accel")

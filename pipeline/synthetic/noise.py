@@ -21,14 +21,7 @@ LEAST_ACCEL_MPS2 = 0.02
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations; position noise is smooth over about half a second, as that of a tracker is.
-
-    Args:
-        along_m: noise of the position along the road.
-        across_m: noise of the position across the road.
-        speed_mps: noise of the recorded speed.
-        accel_mps2: noise of the recorded acceleration.
-    """
+    """Standard deviations; position noise is smooth over about half a second, as that of a tracker is."""
 
     along_m: float
     across_m: float

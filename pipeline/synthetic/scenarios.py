@@ -18,11 +18,7 @@ class Road:
     """A straight carriageway; x runs in the direction of travel from the recorded window's entrance.
 
     Args:
-        lanes: main lanes.
-        lane_width_m: of each of them.
-        window_m: length of the recorded window.
         rate_hz: frames per second, which is also the simulation's clock.
-        limit_mps: speed limit.
         ramp: an on-ramp joins: its lane (main lanes + 2) ends in an auxiliary lane (main lanes + 1).
     """
 
@@ -69,11 +65,9 @@ class Traffic:
 
     Args:
         arrivals: vehicles per main lane and second.
-        trucks: their share.
         bottleneck_mps: speed in the zone behind the window that holds the traffic up; None = free flow.
         pulsing: for 15 of every 40 s that zone admits hardly any vehicles, which causes waves of standing traffic.
         ramp_arrivals: vehicles per second on the on-ramp, where there is one.
-        plan: the defects of this subset.
     """
 
     arrivals: float
@@ -94,14 +88,7 @@ class HighdScenario:
     """One recording over two carriageways.
 
     Args:
-        recording: two digits.
-        location_id: of the site.
-        road: each carriageway.
         share: its length in units of `minutes`.
-        month: `MM.YYYY`.
-        start_time: `HH:MM`.
-        upper: traffic driving left.
-        lower: traffic driving right.
         exponent: write the duration as a careless printf would (`5.400000e+01`), as some published files do.
         damaged: insert duplicates and malformed lines into the tracks file.
     """
@@ -120,14 +107,7 @@ class HighdScenario:
 
 @dataclass(frozen=True)
 class NgsimScenario:
-    """One recording of the freeway.
-
-    Args:
-        start_time: local time of frame 1 on 2005-06-15, `HH:MM`.
-        first_vehicle_id: ids count from here.
-        share: its length in units of `minutes`.
-        traffic: traffic of the recording.
-    """
+    """One recording of the freeway from `start_time` (`HH:MM`) on 2005-06-15, which lasts `share` * minutes."""
 
     start_time: str
     first_vehicle_id: int

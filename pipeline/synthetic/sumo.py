@@ -31,16 +31,7 @@ MERGE_M = 80.0
 
 @dataclass(frozen=True)
 class VehicleType:
-    """One kind of vehicle: name, class (NGSIM's code), size, weight among its class, and driver model.
-
-    Args:
-        name: identifier in SUMO's output.
-        v_class: 1 motorcycle, 2 car, 3 truck.
-        length_m: along the direction of travel.
-        width_m: across it.
-        weight: how frequent among the vehicles of its class.
-        model: attributes of SUMO's vType (intelligent driver model).
-    """
+    """A kind of vehicle: NGSIM's class, size, weight among its class, and attributes of SUMO's vType (driver model)."""
 
     name: str
     v_class: int
@@ -209,18 +200,9 @@ def write_demand(folder: Path, road: Road, traffic: Traffic, seconds: float) -> 
 
 
 def simulate(home: Path, folder: Path, road: Road, traffic: Traffic, *, frames: int, seed: int) -> pl.DataFrame:
-    """Simulate one carriageway and return the tracks in its window.
+    """Simulate frames of one carriageway, with SUMO's files in an empty folder; return the tracks in its window.
 
-    Args:
-        home: folder of SUMO.
-        folder: empty folder for its files.
-        road: carriageway to simulate.
-        traffic: traffic on it.
-        frames: number of frames to record.
-        seed: seed of the simulation.
-
-    Returns:
-        TRACK_SCHEMA; vehicles count from 1 in order of (first frame, foremost first).
+    Returns TRACK_SCHEMA; vehicles count from 1 in order of (first frame, foremost first).
     """
     write_network(home, folder, road, traffic)
     seconds = traffic.warm_up_s + frames / road.rate_hz

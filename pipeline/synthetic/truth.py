@@ -168,13 +168,7 @@ def _read_rows(path: Path, recording: str, found: Found) -> dict[tuple[int, int]
 def find_headings(
     velocities: dict[tuple[int, int], tuple[float, float]], direction: dict[int, int], rate_hz: float
 ) -> dict[tuple[int, int], float]:
-    """Find where vehicles point, rad to the right of the road, one entry after the other.
-
-    Args:
-        velocities: x and y velocity in the image by vehicle and frame.
-        direction: drivingDirection by vehicle; 1 drives left.
-        rate_hz: frame rate.
-    """
+    """Find where vehicles point, rad to the right of the road, by their velocities, one entry after the other."""
     headings: dict[tuple[int, int], float] = {}
     last: dict[int, float] = {}
     for vehicle, frame in sorted(velocities):
@@ -193,13 +187,7 @@ def find_headings(
 
 
 def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
-    """Read an NGSIM file back.
-
-    Args:
-        path: path of an 18-column text, 18-column CSV or 25-column CSV.
-        recordings: names of recordings by Global_Time - 100 * Frame_ID.
-        found: contents so far, to which the file's are added.
-    """
+    """Read an NGSIM file back; `recordings` are names by Global_Time - 100 * Frame_ID."""
     lines = _lines(path)
     header = lines[0].startswith("Vehicle_ID")
     fields = lines[0].count(",") + 1 if header else 18

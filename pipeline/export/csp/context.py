@@ -29,12 +29,6 @@ def read_context(
     The files have three parts. The lake's split (setting `split`) is used if it has a validation part; else a split is
     planned with `validation_part = true`.
 
-    Args:
-        settings: settings with the lake, protocol and split.
-        manifest: live files of the lake.
-        subsets: dataset and subset of each subset.
-        notes: messages for the user; new ones are appended.
-
     Raises:
         StageError: validation, repair, samples or the split has not run, or its inputs have changed.
         ExportError: the parts of the split share data.

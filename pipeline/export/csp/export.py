@@ -52,12 +52,6 @@ _NEEDS = "A sample needs lanes, 3.0 s of track before it and 0.2 s after; DESIGN
 def export_csp(settings: Settings, out: Path, options: CspOptions, *, force: bool = False) -> CspExport:
     """Write the three .mat files of a lake's freeway subsets and a card that describes them.
 
-    Args:
-        settings: settings with the lake and, for --clean, protocol and split.
-        out: folder of the files.
-        options: options of the export.
-        force: whether existing files are replaced.
-
     Raises:
         LakeMissingError: the lake does not exist.
         ExportError: nothing can be exported, or not to this folder, or it is too large for the format.

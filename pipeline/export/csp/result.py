@@ -41,15 +41,11 @@ class CspExport:
     """The result of an export.
 
     Args:
-        out: folder of the files.
-        options: options of the export.
-        files: counts of each file, one per part.
         datasets: id, dataset, subset, recording and origin of each row of `tracks` that is not empty.
         left_out: entries that are in no file, by reason.
         overwritten: neighbors lost because a later row had the same cell (without --clean).
         collisions: neighbors whose cell was taken (with --clean); all but `crowded_out` moved to another cell.
         crowded_out: neighbors for which no cell was free.
-        notes: messages for the user.
     """
 
     out: Path

@@ -63,14 +63,7 @@ history, future, known = train["history"], train["future"], train["future_mask"]
 
 
 def write_card(path: Path, export: WindowsExport, folder: TensorFolder, facts: pl.DataFrame) -> None:
-    """Write the card; the same export gives the same bytes.
-
-    Args:
-        path: path of the card.
-        export: the export that it describes.
-        folder: tensors that were exported.
-        facts: facts of the subsets from `pipeline.export.windows.export.read_facts`.
-    """
+    """Write the card, with facts of the subsets from `read_facts`; the same export gives the same bytes."""
     command = f"tracklake export {'windows' if export.format == 'parquet' else 'npz'}"
     lines = [
         f"# Trajectory windows: protocol {folder.protocol.name}, split {folder.split}",

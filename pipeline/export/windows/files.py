@@ -21,14 +21,7 @@ AXES = ("x_m", "y_m")
 
 
 class ParquetWindows:
-    """Writer of one Parquet file: a row per sample, with lists of positions and neighbors.
-
-    Args:
-        path: path of the file.
-        folder: tensors that are exported.
-        samples: unused; see `NpzWindows`.
-        neighbors: unused; see `NpzWindows`.
-    """
+    """Writer of one Parquet file: a row per sample, with lists of positions and neighbors."""
 
     def __init__(self, path: Path, folder: TensorFolder, samples: int, neighbors: int) -> None:
         del samples, neighbors
@@ -110,14 +103,7 @@ def _build_lists(values: Singles, known: Flags | None = None) -> pa.FixedSizeLis
 
 
 class NpzWindows:
-    """Writer of one `.npz`: each array is spooled to a file, then added to the archive uncompressed.
-
-    Args:
-        path: path of the file.
-        folder: tensors that are exported.
-        samples: total number of samples.
-        neighbors: total number of neighbors.
-    """
+    """Writer of one `.npz`: each array is spooled to a file, then added to the archive uncompressed."""
 
     def __init__(self, path: Path, folder: TensorFolder, samples: int, neighbors: int) -> None:
         self.path, self.folder, self.sizes = path, folder, {"S": samples, "K": neighbors}

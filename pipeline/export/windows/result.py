@@ -14,17 +14,9 @@ Format = Literal["parquet", "npz"]
 
 @dataclass(frozen=True)
 class WindowsExport:
-    """The result of an export.
+    """The result of an export: numbers of samples and neighbors by part, names of the files, licences as notes.
 
-    Args:
-        out: folder of the files.
-        format: format of the files.
-        absolute: whether positions are those on the carriageway.
-        samples: number of samples by part.
-        neighbors: number of neighbors by part.
-        files: names of the files.
-        notes: licences of the datasets.
-        synthetic: description of what is synthetic; None where all was recorded.
+    `synthetic` describes what is synthetic; None where all was recorded.
     """
 
     out: Path
@@ -43,15 +35,9 @@ class WindowsExport:
 
 @dataclass(frozen=True)
 class Windows:
-    """Samples as exported: a batch, and the ids of its samples and neighbors.
+    """Samples as exported: a batch of B samples with K neighbors, the samples' facts (B,), and the neighbors' ids (K,).
 
-    Args:
-        batch: B samples with K neighbors.
-        subset: (B,) position in the index's `subsets`.
-        vehicle_id: (B,) vehicle of the sample.
-        tick: (B,) tick of the sample.
-        lane: (B,) lane at the tick; 0 = unknown.
-        neighbor_id: (K,) vehicle_id of each neighbor.
+    `subset` is the position in the index's `subsets`; the unknown lane is 0.
     """
 
     batch: Batch
