@@ -15,6 +15,7 @@ import polars as pl
 
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
 from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation
+from tracklake.schemas.split_recipes import FLOW_BALANCED, SplitRecipe
 
 SUBSETS = 117
 SITES = {"1": 60, "2": 10, "3": 10, "4": 8, "5": 7, "6": 5}
@@ -60,7 +61,7 @@ def main() -> None:
         for seed in range(seeds):
             subsets = draw_subsets(seed)
             begun = time.process_time()
-            allocation = allocate_flow_balanced(subsets, validation=validation)
+            allocation = allocate_flow_balanced(subsets, SplitRecipe(FLOW_BALANCED, validation=validation))
             seconds = time.process_time() - begun
             mean, std = differ(allocation)
             worst = max(worst, mean + std)

@@ -34,26 +34,8 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
 """Splits that claim that nothing of one part is reachable from another."""
 
-
 VALIDATION_SHARE = 0.1
 """Share of the part `val`, 0 to 1."""
-
-
-def find_shares(train_share: float, *, validation: bool) -> dict[str, int]:
-    """Return the shares of the parts in thousandths, as whole numbers, so that they compare exactly.
-
-    Args:
-        train_share: what trains where there is no part `val`.
-        validation: whether there is one; it is taken from what trains (0.8: 0.7, 0.1 and 0.2).
-
-    Raises:
-        ValueError: a part would have nothing.
-    """
-    val = round(1000 * VALIDATION_SHARE) if validation else 0
-    shares = {"train": round(1000 * train_share) - val, "val": val, "eval": 1000 - round(1000 * train_share)}
-    if min(shares["train"], shares["eval"]) <= 0:
-        raise ValueError(f"expected a share above {val / 1000:g} and below 1 to train, got {train_share:g}")
-    return {part: share for part, share in shares.items() if part != "val" or validation}
 
 
 @dataclass(frozen=True)
@@ -85,6 +67,20 @@ class SplitRecipe:
     history_s: float = 3.0
     horizon_s: float = 5.0
     min_future_s: float = 0.2
+
+    @property
+    def shares(self) -> dict[str, int]:
+        """Shares of the parts in thousandths, as whole numbers, so that they compare exactly.
+
+        Raises:
+            ValueError: a part would have nothing.
+        """
+        val = round(1000 * VALIDATION_SHARE) if self.validation else 0
+        trains = round(1000 * self.train_share)
+        shares = {"train": trains - val, "val": val, "eval": 1000 - trains}
+        if min(shares["train"], shares["eval"]) <= 0:
+            raise ValueError(f"expected a share above {val / 1000:g} and below 1 to train, got {self.train_share:g}")
+        return {part: share for part, share in shares.items() if part != "val" or self.validation}
 
     @property
     def claims_no_leakage(self) -> bool:

@@ -28,6 +28,7 @@ from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanc
 from tracklake.pipeline.transforms.splits.tables import Allocation
 from tracklake.schemas.files import write_output
 from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.split_recipes import FLOW_BALANCED, SplitRecipe
 
 FORMATS = ("table", "csv", "json")
 
@@ -94,12 +95,9 @@ def _plan_split(
     subsets = announced.subsets.filter(~pl.col("subset").is_in(exclude))
     if subsets.is_empty():
         raise SourceError(f"{folder}: no recording whose metadata can be used, so there is nothing to plan.")
-    allocation = allocate_flow_balanced(
-        subsets,
-        train_share=settings.get_protocol().train_share,
-        validation=settings.validation_part,
-        seed=settings.split_seed,
-    )
+    trained = settings.get_protocol().train_share
+    recipe = SplitRecipe(FLOW_BALANCED, trained, settings.validation_part, settings.split_seed)
+    allocation = allocate_flow_balanced(subsets, recipe)
     parts = subsets.join(allocation.splits.select("dataset", "subset", "part"), on=["dataset", "subset"])
     terminal.print_origin(describe_synthetic(dict(subsets.select("subset", "origin").iter_rows())))
     parts = parts.select(SHOWN).sort("dataset", "subset")

@@ -65,8 +65,8 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     return Canonical(found, log, rejects, completeness.table, completeness.notes)
 
 
-def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:
-    """Read recordingMeta and tracksMeta among a recording's files by kind; tracks are not read.
+def read_metadata(files: Sequence[RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:
+    """Read recordingMeta and tracksMeta, a recording's first two files.
 
     Returns the row of recordingMeta, lanes by driving direction, and the rows of tracksMeta, one per vehicle.
 
@@ -74,7 +74,7 @@ def read_metadata(files: Mapping[str, RawFile], recording: str) -> tuple[dict[st
         SourceError: a file cannot be read or belongs to another recording.
     """
     meta, vehicles = HIGHD_FORMAT.read_metadata(files, recording)
-    markings = _read_markings(meta, files[RECORDING])
+    markings = _read_markings(meta, files[0])
     return meta, {direction: len(marked) - 1 for direction, marked in markings.items()}, vehicles
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from tracklake.pipeline.sources.highd import CARRIAGEWAYS, FIRST_FRAME, HIGHD_FORMAT, find_origin, read_metadata
-from tracklake.pipeline.sources.levelx import RECORDING, VEHICLES
-from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.pipeline.sources.source import RawFile, SourceError, Unit
 from tracklake.pipeline.transforms.splits.tables import COLUMNS
 
 
@@ -29,39 +28,27 @@ def announce_subsets(files: Sequence[RawFile]) -> Announcement:
     Raises:
         SourceError: none of them is a recordingMeta or tracksMeta file.
     """
-    wanted = [file for file in files if HIGHD_FORMAT.find_kind(file) in (RECORDING, VEHICLES)]
-    if not wanted:
+    grouping = HIGHD_FORMAT.group_metadata(files)
+    if not grouping.units and not grouping.refusals:
         raise SourceError(
             "no metadata of highD there. Expected NN_recordingMeta.csv and NN_tracksMeta.csv with the headers as "
             f"shipped, got {len(files)} other file(s) of highD. Give the folder with the downloads, unpacked or not."
         )
-    sets, refusals = HIGHD_FORMAT.gather_sets(wanted, lambda file: file.folder)
     rows: list[dict[str, object]] = []
-    seen: set[str] = set()
-    for (_, digits), found in sorted(sets, key=lambda each: each[0][::-1]):
-        recording = f"{int(digits):02d}"
-        missing = [f"{digits}_{kind}.csv" for kind in (RECORDING, VEHICLES) if kind not in found]
-        present = ", ".join(file.name for file in found.values())
-        if missing:
-            refusals.append(
-                f"recording {recording}: {missing[0]} missing beside {present}. A plan needs both files in one folder; "
-                "put the missing one there and run again."
-            )
-        elif recording in seen:
-            refusals.append(f"recording {recording}: a second set of files ({present}); the first was used.")
-        else:
-            try:
-                rows += _describe_carriageways(found, recording)
-                seen.add(recording)
-            except SourceError as damage:
-                refusals.append(str(damage))
+    refusals = list(grouping.refusals)
+    for unit in grouping.units:
+        try:
+            rows += _describe_carriageways(unit)
+        except SourceError as damage:
+            refusals.append(str(damage))
     schema = {**COLUMNS, "recording": pl.String, "origin": pl.String, "lanes": pl.Int64, "seconds": pl.Float64}
     return Announcement(pl.DataFrame(rows, schema=schema), tuple(refusals))
 
 
-def _describe_carriageways(files: dict[str, RawFile], recording: str) -> list[dict[str, object]]:
+def _describe_carriageways(unit: Unit) -> list[dict[str, object]]:
     """Describe the carriageways of a recording, a row each."""
-    meta, lanes, vehicles = read_metadata(files, recording)
+    recording = str(unit.recording)
+    meta, lanes, vehicles = read_metadata(unit.files, recording)
     rows: list[dict[str, object]] = []
     for direction, side in CARRIAGEWAYS.items():
         own = vehicles.filter(pl.col("drivingDirection") == direction)

@@ -86,30 +86,42 @@ class LevelxFormat:
         three archives of one file each are a recording too. Of two files of one kind, the one named as shipped is
         used and the other refused.
         """
-        sets, refusals = self.gather_sets(files, lambda file: file.folder)
+        sets, refusals = self._gather_sets(files, lambda file: file.folder)
         scattered = [file for _, found in sets if len(found) < len(KINDS) for file in found.values()]
-        beside, more_refusals = self.gather_sets(scattered, lambda file: str(file.path.parent))
+        beside, more_refusals = self._gather_sets(scattered, lambda file: str(file.path.parent))
         sets = [*(each for each in sets if len(each[1]) == len(KINDS)), *beside]
-        refusals += more_refusals
-        units: list[Unit] = []
+        grouping = self._group_sets(sets, KINDS, f"A {self.title} recording needs its three files in one folder")
+        return Grouping(grouping.units, (*refusals, *more_refusals, *grouping.refusals))
+
+    def group_metadata(self, files: Sequence[RawFile]) -> Grouping:
+        """Gather each recording's recordingMeta and tracksMeta, to plan with; other files are left out."""
+        wanted = [file for file in files if self.find_kind(file) in KINDS[:2]]
+        sets, refusals = self._gather_sets(wanted, lambda file: file.folder)
+        grouping = self._group_sets(sets, KINDS[:2], "A plan needs both files in one folder")
+        return Grouping(grouping.units, (*refusals, *grouping.refusals))
+
+    def _group_sets(self, sets: Sequence[FileSet], kinds: Sequence[str], need: str) -> Grouping:
+        """Make a unit of each recording's set of files; incomplete and second ones are refused."""
+        units: dict[str, Unit] = {}
+        refusals = []
         for (_, digits), found in sorted(sets, key=lambda each: each[0][::-1]):
             recording = f"{int(digits):02d}"
-            missing = [f"{digits}_{kind}.csv" for kind in KINDS if kind not in found]
+            missing = [f"{digits}_{kind}.csv" for kind in kinds if kind not in found]
             present = ", ".join(file.name for file in found.values())
             if missing:
                 refusals.append(
-                    f"recording {recording}: {' and '.join(missing)} missing beside {present}. A {self.title} "
-                    "recording needs its three files in one folder; put the missing one there and run again."
+                    f"recording {recording}: {' and '.join(missing)} missing beside {present}. {need}; put the missing "
+                    "one there and run again."
                 )
-            elif any(unit.recording == recording for unit in units):
+            elif recording in units:
                 refusals.append(
                     f"recording {recording}: a second set of files ({present}); the first was used. Remove one of them."
                 )
             else:
-                units.append(Unit(tuple(found[kind] for kind in KINDS), recording))
-        return Grouping(tuple(units), tuple(refusals))
+                units[recording] = Unit(tuple(found[kind] for kind in kinds), recording)
+        return Grouping(tuple(units.values()), tuple(refusals))
 
-    def gather_sets(
+    def _gather_sets(
         self, files: Sequence[RawFile], folder_of: Callable[[RawFile], str]
     ) -> tuple[list[FileSet], list[str]]:
         """Gather files by folder and number, then by kind; also return messages about files that fit nowhere."""
@@ -165,14 +177,14 @@ class LevelxFormat:
         dropped = ((known_again, DUPLICATE), (again, DUPLICATE), (conflicts, CONFLICT), (unknown, UNKNOWN_VEHICLE))
         return LevelxRecording(meta, known, rejected, rows_parsed, dropped), entries
 
-    def read_metadata(self, files: Mapping[str, RawFile], recording: str) -> tuple[dict[str, Any], pl.DataFrame]:
-        """Read the row of recordingMeta, and the rows of tracksMeta, one per vehicle, from files by kind.
+    def read_metadata(self, files: Sequence[RawFile], recording: str) -> tuple[dict[str, Any], pl.DataFrame]:
+        """Read the row of recordingMeta, and the rows of tracksMeta, one per vehicle: a recording's first two files.
 
         Raises:
             SourceError: a file cannot be read or belongs to another recording.
         """
-        meta = self._check_meta(self._read(files[RECORDING]), files[RECORDING], recording)
-        vehicles, _ = self._split_vehicles(self._read(files[VEHICLES]).frame, files[VEHICLES])
+        meta = self._check_meta(self._read(files[0]), files[0], recording)
+        vehicles, _ = self._split_vehicles(self._read(files[1]).frame, files[1])
         return meta, vehicles
 
     def build_layout(self, kind: str) -> Layout:

@@ -52,15 +52,7 @@ def make_split(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
 
 
 def _make_flow_balanced(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
-    allocation = allocate_flow_balanced(
-        inputs.subsets,
-        split=recipe.name,
-        train_share=recipe.train_share,
-        validation=recipe.validation,
-        seed=recipe.seed,
-        restarts=recipe.restarts,
-    )
-    return SplitResult(allocation, SPLIT_LEFT_OUT.empty())
+    return SplitResult(allocate_flow_balanced(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty())
 
 
 def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
@@ -84,20 +76,11 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
         )
     seen, sampled = pl.concat(visits), pl.concat(weights)
     units = describe_blocks(blocks, inputs.subsets, seen, sampled)
-    allocation = allocate_flow_balanced(
-        units,
-        split=recipe.name,
-        train_share=recipe.train_share,
-        validation=recipe.validation,
-        seed=recipe.seed,
-        restarts=recipe.restarts,
-    )
+    allocation = allocate_flow_balanced(units, recipe)
     left_out = find_left_out(seen, allocation.splits)
     # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
-    written = tabulate_allocation(
-        recounted, split=recipe.name, train_share=recipe.train_share, validation=recipe.validation
-    )
+    written = tabulate_allocation(recounted, recipe)
     return SplitResult(written, left_out, units.select("dataset", "subset", "block", "vehicles_per_lane_s"))
 
 
@@ -117,18 +100,11 @@ def _make_csp(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
         .collect()
         .sort("dataset", "subset", "vehicle_id")
     )
-    return SplitResult(divide_by_id(inputs.subsets, vehicles, split=recipe.name), SPLIT_LEFT_OUT.empty())
+    return SplitResult(divide_by_id(inputs.subsets, vehicles, recipe), SPLIT_LEFT_OUT.empty())
 
 
 def _make_by_recording(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
-    allocation = divide_by_recording(
-        inputs.subsets,
-        split=recipe.name,
-        train_share=recipe.train_share,
-        validation=recipe.validation,
-        seed=recipe.seed,
-    )
-    return SplitResult(allocation, SPLIT_LEFT_OUT.empty())
+    return SplitResult(divide_by_recording(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty())
 
 
 _MAKERS: dict[str, Callable[[SplitRecipe, SplitInputs], SplitResult]] = {

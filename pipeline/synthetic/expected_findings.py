@@ -155,36 +155,12 @@ class Scenery:
         return (self.entries[key[0], key[1] - low].accel + self.entries[key[0], key[1] - high].accel) / 2
 
 
-def breaks_negative_headway(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks negative_headway."""
-    gap = scene.gap(key)
-    return gap is not None and gap < 0
-
-
-def breaks_negative_headway_recorded(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks negative_headway_recorded."""
-    gap = scene.recorded_gap(key)
-    return gap is not None and gap < 0
-
-
-def breaks_high_acceleration(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks high_acceleration."""
-    return scene.entries[key].accel > HIGH_ACCELERATION_MPS2
-
-
-def breaks_low_constant_speed(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks low_constant_speed."""
+def _breaks_low_constant_speed(scene: Scenery, key: Key) -> bool:
     entry = scene.entries[key]
     return 0 < entry.speed <= LOW_SPEED_MPS and entry.accel == 0
 
 
-def breaks_backward(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks backward."""
-    return scene.entries[key].speed < 0
-
-
-def breaks_position_jump(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks position_jump."""
+def _breaks_position_jump(scene: Scenery, key: Key) -> bool:
     before, now = scene.near(key, -1), scene.entries[key]
     if before is None:
         return False
@@ -192,12 +168,7 @@ def breaks_position_jump(scene: Scenery, key: Key) -> bool:
     return round(abs(now.front - before.front - way), 6) > JUMP_M
 
 
-def breaks_frame_gap(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks frame_gap: the frame before is missing, and there are earlier ones."""
-    return scene.near(key, -1) is None and scene.first_frames[key[0]] < key[1]
-
-
-def breaks_overlap(scene: Scenery, key: Key) -> bool:
+def _breaks_overlap(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks overlap: no side of a box parts the two; they meet by half a millimetre or more."""
     own, keys = scene.entries[key], scene.in_frame[key[1]]
     for step in (-1, 1):
@@ -223,7 +194,7 @@ def _reach_into(one: Entry, other: Entry) -> float:
     return min(depths)
 
 
-def breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
+def _breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks speed_mismatch: against the positions 0.1 s before and after."""
     steps = (1,) if scene.surface.rate_hz == 10 else (2, 3)
     if any(scene.near(key, step) is None for step in range(-steps[-1], steps[-1] + 1)):
@@ -233,13 +204,12 @@ def breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
     return round(abs(scene.entries[key].speed - (ahead - behind) / 0.2), 4) > SPEED_DIFFERENCE_MPS
 
 
-def breaks_high_jerk(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks high_jerk."""
+def _breaks_high_jerk(scene: Scenery, key: Key) -> bool:
     before = scene.past_accel(key, 1)
     return before is not None and round(abs(scene.entries[key].accel - before) / 0.1, 3) > HIGH_JERK_MPS3
 
 
-def breaks_jerk_flicker(scene: Scenery, key: Key) -> bool:
+def _breaks_jerk_flicker(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks jerk_flicker: more than one change of sign among the jerks of the last second."""
     accels = [scene.past_accel(key, tenths) for tenths in range(10, -1, -1)]
     signs = []
@@ -249,7 +219,7 @@ def breaks_jerk_flicker(scene: Scenery, key: Key) -> bool:
     return sum(before != now for before, now in pairwise(signs)) > 1
 
 
-def breaks_lane_flicker(scene: Scenery, key: Key) -> bool:
+def _breaks_lane_flicker(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks lane_flicker: the lanes before and after its stay are the same, and it is short."""
     if scene.lane_changes.get(key[0], 0) < 2:
         return False
@@ -264,7 +234,7 @@ def breaks_lane_flicker(scene: Scenery, key: Key) -> bool:
     return None not in around and around[0] == around[1] and stay / scene.surface.rate_hz <= FLICKER_S
 
 
-def breaks_leader_mismatch(scene: Scenery, key: Key) -> bool:
+def _breaks_leader_mismatch(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks leader_mismatch, with positions in tenths of a millimetre."""
     own = scene.entries[key]
     place = round(own.front * 10000)
@@ -280,21 +250,19 @@ def breaks_leader_mismatch(scene: Scenery, key: Key) -> bool:
     return leader.lane != own.lane or ahead < 0 or (nearest is not None and ahead > nearest)
 
 
-def breaks_headway_mismatch(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks headway_mismatch."""
+def _breaks_headway_mismatch(scene: Scenery, key: Key) -> bool:
     gap, recorded = scene.gap(key), scene.recorded_gap(key)
     return gap is not None and recorded is not None and round(abs(recorded - gap), 3) > HEADWAY_DIFFERENCE_M
 
 
-def breaks_implausible_size(scene: Scenery, key: Key) -> bool:
-    """Test whether an entry breaks implausible_size."""
+def _breaks_implausible_size(scene: Scenery, key: Key) -> bool:
     entry = scene.entries[key]
     shortest, longest, narrowest, widest = SIZES_M[entry.kind]
     inside = shortest <= round(entry.length, 4) <= longest and narrowest <= round(entry.width, 4) <= widest
     return not inside
 
 
-def breaks_outside_lane(scene: Scenery, key: Key) -> bool:
+def _breaks_outside_lane(scene: Scenery, key: Key) -> bool:
     """Test whether an entry breaks outside_lane, where markings are known."""
     entry, markings = scene.entries[key], scene.surface.markings
     if not 1 <= entry.lane < len(markings):
@@ -305,22 +273,23 @@ def breaks_outside_lane(scene: Scenery, key: Key) -> bool:
 
 
 RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {
-    "negative_headway": breaks_negative_headway,
-    "negative_headway_recorded": breaks_negative_headway_recorded,
-    "high_acceleration": breaks_high_acceleration,
-    "low_constant_speed": breaks_low_constant_speed,
-    "backward": breaks_backward,
-    "position_jump": breaks_position_jump,
-    "frame_gap": breaks_frame_gap,
-    "overlap": breaks_overlap,
-    "speed_mismatch": breaks_speed_mismatch,
-    "high_jerk": breaks_high_jerk,
-    "jerk_flicker": breaks_jerk_flicker,
-    "lane_flicker": breaks_lane_flicker,
-    "leader_mismatch": breaks_leader_mismatch,
-    "headway_mismatch": breaks_headway_mismatch,
-    "implausible_size": breaks_implausible_size,
-    "outside_lane": breaks_outside_lane,
+    "negative_headway": lambda scene, key: (scene.gap(key) or 0) < 0,
+    "negative_headway_recorded": lambda scene, key: (scene.recorded_gap(key) or 0) < 0,
+    "high_acceleration": lambda scene, key: scene.entries[key].accel > HIGH_ACCELERATION_MPS2,
+    "low_constant_speed": _breaks_low_constant_speed,
+    "backward": lambda scene, key: scene.entries[key].speed < 0,
+    "position_jump": _breaks_position_jump,
+    # The frame before is missing, and there are earlier ones.
+    "frame_gap": lambda scene, key: scene.near(key, -1) is None and scene.first_frames[key[0]] < key[1],
+    "overlap": _breaks_overlap,
+    "speed_mismatch": _breaks_speed_mismatch,
+    "high_jerk": _breaks_high_jerk,
+    "jerk_flicker": _breaks_jerk_flicker,
+    "lane_flicker": _breaks_lane_flicker,
+    "leader_mismatch": _breaks_leader_mismatch,
+    "headway_mismatch": _breaks_headway_mismatch,
+    "implausible_size": _breaks_implausible_size,
+    "outside_lane": _breaks_outside_lane,
 }
 """Functions that test whether an entry breaks a rule, by the rule's name."""
 

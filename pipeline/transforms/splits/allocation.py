@@ -19,18 +19,10 @@ from tracklake.pipeline.transforms.splits.search import (
     sum_facts,
 )
 from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation, add_defaults, tabulate_units
-from tracklake.schemas.split_recipes import find_shares
+from tracklake.schemas.split_recipes import SplitRecipe
 
 
-def allocate_flow_balanced(
-    subsets: pl.DataFrame,
-    *,
-    split: str = "flow-balanced",
-    train_share: float = 0.8,
-    validation: bool = False,
-    seed: int = 0,
-    restarts: int = 200,
-) -> Allocation:
+def allocate_flow_balanced(subsets: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
     """Divide the subsets of each dataset into train and eval (and val) of alike traffic.
 
     Constraints, the most important first: train and eval each hold a subset with samples; each (site, direction) with
@@ -67,31 +59,28 @@ def allocate_flow_balanced(
     Source: DESIGN section 8.
     """
     table = _check_subsets(subsets)
-    shares = find_shares(train_share, validation=validation)
+    shares = recipe.shares
     allocated = [table.with_columns(part=pl.lit(None, pl.String)).clear()]
     for (dataset,), rows in sorted(table.group_by("dataset"), key=lambda item: str(item[0][0])):
-        part = find_allocation(
-            _build_problem(rows, shares), np.random.default_rng([seed, *str(dataset).encode()]), restarts
-        )
+        random = np.random.default_rng([recipe.seed, *str(dataset).encode()])
+        part = find_allocation(_build_problem(rows, shares), random, recipe.restarts)
         names = pl.Series("part", [list(shares)[position] for position in part], dtype=pl.String)
         allocated.append(rows.with_columns(names))
-    return tabulate_allocation(pl.concat(allocated), split=split, train_share=train_share, validation=validation)
+    return tabulate_allocation(pl.concat(allocated), recipe)
 
 
-def tabulate_allocation(
-    units: pl.DataFrame, *, split: str, train_share: float = 0.8, validation: bool = False
-) -> Allocation:
+def tabulate_allocation(units: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
     """Build the tables of an allocation, and check by the given counts whether it is relaxed.
 
     `units` have the columns of `splits.tables.COLUMNS`, `part`, and `block` if a subset has several rows.
     """
-    shares = find_shares(train_share, validation=validation)
+    shares = recipe.shares
     units = add_defaults(units).sort("dataset", "site", "direction", "subset", "block")
     reasons: dict[str, str | None] = {}
     for (dataset,), rows in units.group_by("dataset"):
         part = rows["part"].replace_strict(list(shares), range(len(shares)), return_dtype=pl.Int64).to_numpy()
         reasons[str(dataset)] = _describe_broken(rows, _build_problem(rows, shares), part.astype(np.intp), shares)
-    return tabulate_units(units, split=split, parts=list(shares), reasons=reasons)
+    return tabulate_units(units, split=recipe.name, parts=list(shares), reasons=reasons)
 
 
 def _check_subsets(subsets: pl.DataFrame) -> pl.DataFrame:

@@ -6,10 +6,10 @@ import polars as pl
 from tracklake.pipeline.transforms.csp.parts import assign_parts_by_id
 from tracklake.pipeline.transforms.splits.tables import Allocation, tabulate_units
 from tracklake.schemas.columns import PARTS
-from tracklake.schemas.split_recipes import find_shares
+from tracklake.schemas.split_recipes import SplitRecipe
 
 
-def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = "csp-2018") -> Allocation:
+def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
     """Cut each subset at 70 and 80 % of its highest vehicle id, as conv-social-pooling's preprocessing does.
 
     Ids are numbered in the order of appearance, so the parts overlap in time and vehicles on either side of a cut are
@@ -37,17 +37,10 @@ def divide_by_id(subsets: pl.DataFrame, vehicles: pl.DataFrame, *, split: str = 
         )
         whole = subsets.filter((pl.col("dataset") == dataset) & (pl.col("subset") == subset))
         units.append(whole.drop("vehicles", "weight").join(ranges, how="cross"))
-    return tabulate_units(pl.concat(units, how="diagonal_relaxed"), split=split, parts=PARTS)
+    return tabulate_units(pl.concat(units, how="diagonal_relaxed"), split=recipe.name, parts=PARTS)
 
 
-def divide_by_recording(
-    subsets: pl.DataFrame,
-    *,
-    split: str = "by-recording-random",
-    train_share: float = 0.8,
-    validation: bool = False,
-    seed: int = 0,
-) -> Allocation:
+def divide_by_recording(subsets: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
     """Assign recordings to parts at random, each with all its subsets, by the shares of the flow-balanced split.
 
     Shares are of recordings, rounded, but at least one of two recordings is in eval, and one of three in val.
@@ -58,11 +51,11 @@ def divide_by_recording(
     Raises:
         ValueError: a part would have no share.
     """
-    shares = find_shares(train_share, validation=validation)
+    shares = recipe.shares
     drawn = [pl.DataFrame(schema={"dataset": pl.String, "recording": pl.String, "part": pl.String})]
     for (dataset,), rows in subsets.group_by("dataset"):
         names = rows["recording"].unique().sort()
-        order = np.random.default_rng([seed, *str(dataset).encode()]).permutation(len(names))
+        order = np.random.default_rng([recipe.seed, *str(dataset).encode()]).permutation(len(names))
         parts: list[str] = []
         for part in reversed(shares):  # eval first; train gets the rest
             wanted = max(1, round(len(names) * shares[part] / 1000)) if part != "train" else len(names)
@@ -71,4 +64,4 @@ def divide_by_recording(
             pl.DataFrame({"recording": names.gather(order), "part": parts}).with_columns(dataset=pl.lit(dataset))
         )
     units = subsets.join(pl.concat(drawn, how="diagonal"), on=["dataset", "recording"])
-    return tabulate_units(units, split=split, parts=list(shares))
+    return tabulate_units(units, split=recipe.name, parts=list(shares))

@@ -9,33 +9,13 @@ import polars as pl
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.splits import SPLIT_LEFT_OUT
 
-BLOCKS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "dataset": pl.String,
-    "subset": pl.String,
-    "block": pl.Int32,
-    "first_frame": pl.Int32,
-    "last_frame": pl.Int32,
-}
+_BLOCK: dict[str, pl.DataType | type[pl.DataType]] = {"dataset": pl.String, "subset": pl.String, "block": pl.Int32}
+BLOCKS = {**_BLOCK, "first_frame": pl.Int32, "last_frame": pl.Int32}
 """Columns of `cut_blocks`."""
-
-VISITS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "dataset": pl.String,
-    "subset": pl.String,
-    "block": pl.Int32,
-    "vehicle_id": pl.Int32,
-    "entries": pl.Int64,
-}
+VISITS = {**_BLOCK, "vehicle_id": pl.Int32, "entries": pl.Int64}
 """Columns of `find_visits`."""
-
-WEIGHTS: dict[str, pl.DataType | type[pl.DataType]] = {
-    "dataset": pl.String,
-    "subset": pl.String,
-    "block": pl.Int32,
-    "vehicle_id": pl.Int32,
-    "weight": pl.Int64,
-}
+WEIGHTS = {**_BLOCK, "vehicle_id": pl.Int32, "weight": pl.Int64}
 """Columns of `count_samples`."""
-
 ROUNDING_FRAMES = 1e-6
 """Tolerance of frame numbers, since positions between frames are floating-point."""
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.splits.comparisons import divide_by_id, divide_by_recording
 from tracklake.pipeline.transforms.splits.tables import COLUMNS
+from tracklake.schemas.split_recipes import SplitRecipe
 from tracklake.schemas.splits import SPLIT_BALANCE, SPLITS
 
 
@@ -25,7 +26,7 @@ def vehicles(name, ids, weight=10):
 
 def test_the_highest_id_decides_and_not_the_count():
     # Of 10, up to 7 train and up to 8 are val, who is there: ids 1, 2, 8 and 10 leave half of the four to train.
-    found = divide_by_id(table(("highd", "a", "01", 4, 0.3)), vehicles("a", [1, 2, 8, 10]))
+    found = divide_by_id(table(("highd", "a", "01", 4, 0.3)), vehicles("a", [1, 2, 8, 10]), SplitRecipe("csp-2018"))
     assert found.splits.rows() == [
         ("csp-2018", "highd", "a", 0, 1, 100, 1, 2, "train"),
         ("csp-2018", "highd", "a", 1, 1, 100, 8, 8, "val"),
@@ -48,7 +49,7 @@ def test_the_highest_id_decides_and_not_the_count():
 @given(ids=st.lists(st.one_of(st.integers(1, 300), st.just(2**31 - 1)), min_size=1, max_size=40, unique=True))
 def test_ids_stand_in_the_part_of_their_share_of_the_highest(ids):
     ids = sorted(ids)
-    found = divide_by_id(table(("highd", "a", "01", len(ids), 0.3)), vehicles("a", ids))
+    found = divide_by_id(table(("highd", "a", "01", len(ids), 0.3)), vehicles("a", ids), SplitRecipe("csp-2018"))
     SPLITS.validate(found.splits, where="test")
     rows = found.splits.select("first_vehicle_id", "last_vehicle_id", "part").rows()
     for vehicle in ids:
@@ -61,7 +62,7 @@ def test_ids_stand_in_the_part_of_their_share_of_the_highest(ids):
 
 
 def test_no_vehicles_give_no_rows():
-    found = divide_by_id(table(), vehicles("a", []))
+    found = divide_by_id(table(), vehicles("a", []), SplitRecipe("csp-2018"))
     assert found.splits.equals(SPLITS.empty())
     assert found.balance.equals(SPLIT_BALANCE.empty())
 
@@ -104,7 +105,7 @@ def test_another_share_trains(recordings, validation, counts):
 
 def check_draw(recordings, counts, *, validation, **share):
     subsets = table(*carriageways(recordings))
-    found = divide_by_recording(subsets, validation=validation, **share)
+    found = divide_by_recording(subsets, SplitRecipe("by-recording-random", validation=validation, **share))
     SPLITS.validate(found.splits, where="test")
     SPLIT_BALANCE.validate(found.balance, where="test")
     parts = found.splits.with_columns(recording=pl.col("subset").str.head(2))
@@ -115,10 +116,12 @@ def check_draw(recordings, counts, *, validation, **share):
 
 def test_the_draw_repeats_by_seed_and_ignores_row_order_and_other_datasets():
     subsets = table(*carriageways(20))
-    once = divide_by_recording(subsets, seed=4)
-    again = divide_by_recording(subsets.reverse(), seed=4)
-    beside = divide_by_recording(pl.concat([table(*carriageways(5, "ngsim")), subsets]), seed=4)
+    once = divide_by_recording(subsets, SplitRecipe("by-recording-random", seed=4))
+    again = divide_by_recording(subsets.reverse(), SplitRecipe("by-recording-random", seed=4))
+    beside = divide_by_recording(
+        pl.concat([table(*carriageways(5, "ngsim")), subsets]), SplitRecipe("by-recording-random", seed=4)
+    )
     assert once.splits.equals(again.splits)
     assert once.splits.equals(beside.splits.filter(pl.col("dataset") == "highd"))
-    assert not once.splits.equals(divide_by_recording(subsets, seed=5).splits)
-    assert divide_by_recording(table()).splits.equals(SPLITS.empty())
+    assert not once.splits.equals(divide_by_recording(subsets, SplitRecipe("by-recording-random", seed=5)).splits)
+    assert divide_by_recording(table(), SplitRecipe("by-recording-random")).splits.equals(SPLITS.empty())

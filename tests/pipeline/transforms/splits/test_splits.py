@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
 from tracklake.pipeline.transforms.splits.tables import COLUMNS
+from tracklake.schemas.split_recipes import FLOW_BALANCED, SplitRecipe
 from tracklake.schemas.splits import SPLIT_BALANCE, SPLITS
+
+
+def allocate(subsets, split=FLOW_BALANCED, **parameters):
+    return allocate_flow_balanced(subsets, SplitRecipe(split, **parameters))
 
 
 def table(rows):
@@ -88,7 +93,7 @@ SUBSETS = st.lists(
 )
 def test_small_allocations_are_the_best_of_all(rows, wanted):
     asked, shares = wanted
-    chosen = parts_of(allocate_flow_balanced(table(rows), **asked))
+    chosen = parts_of(allocate(table(rows), **asked))
     got = judge(rows, [chosen[row[0]] for row in rows], shares)
     every = [judge(rows, parts, shares) for parts in itertools.product(shares, repeat=len(rows))]
     best = min(every, key=lambda verdict: verdict[:3])
@@ -104,7 +109,7 @@ def test_small_allocations_are_the_best_of_all(rows, wanted):
 def test_search_and_exhaustion_find_the_optimum_of_a_literal_enumeration(monkeypatch, subsets, validation, states):
     monkeypatch.setattr("tracklake.pipeline.transforms.splits.search.EXHAUSTIVE_STATES", states)
     rows = like_highd(subsets=subsets, seed=5)
-    chosen = parts_of(allocate_flow_balanced(table(rows), validation=validation))
+    chosen = parts_of(allocate(table(rows), validation=validation))
     got = judge(rows, [chosen[row[0]] for row in rows], SHARES[validation])
     every = (judge(rows, parts, SHARES[validation]) for parts in itertools.product(SHARES[validation], repeat=subsets))
     best = min(verdict[:3] for verdict in every)
@@ -117,9 +122,9 @@ def test_search_and_exhaustion_find_the_optimum_of_a_literal_enumeration(monkeyp
 def test_row_order_does_not_matter(rows, seed):
     shuffled = rows.copy()
     random.Random(seed).shuffle(shuffled)
-    wanted = allocate_flow_balanced(table(rows))
+    wanted = allocate(table(rows))
     frames = table(rows).select("subset", "first_frame", "last_frame")
-    got = allocate_flow_balanced(table(shuffled).drop("first_frame", "last_frame").join(frames, on="subset"))
+    got = allocate(table(shuffled).drop("first_frame", "last_frame").join(frames, on="subset"))
     assert got.splits.equals(wanted.splits)
     assert got.balance.equals(wanted.balance)
 
@@ -142,7 +147,7 @@ def like_highd(subsets=117, seed=1):
 def test_highd_sized_allocation_meets_every_constraint_and_balances_flow(validation):
     rows = like_highd()
     start = time.process_time()
-    allocation = allocate_flow_balanced(table(rows), validation=validation)
+    allocation = allocate(table(rows), validation=validation)
     assert time.process_time() - start < 10.0
     chosen = parts_of(allocation)
     broken, miss, difference, _ = judge(rows, [chosen[row[0]] for row in rows], SHARES[validation])
@@ -154,9 +159,9 @@ def test_highd_sized_allocation_meets_every_constraint_and_balances_flow(validat
 
 def test_the_search_comes_near_the_exhaustive_optimum_where_it_can_be_known(monkeypatch):
     rows = like_highd(subsets=16)
-    exhaustive = parts_of(allocate_flow_balanced(table(rows)))
+    exhaustive = parts_of(allocate(table(rows)))
     monkeypatch.setattr("tracklake.pipeline.transforms.splits.search.EXHAUSTIVE_STATES", 1)
-    searched = parts_of(allocate_flow_balanced(table(rows)))
+    searched = parts_of(allocate(table(rows)))
     verdicts = [judge(rows, [chosen[row[0]] for row in rows], SHARES[False]) for chosen in (exhaustive, searched)]
     assert verdicts[1][:2] == verdicts[0][:2]
     assert verdicts[0][2] - 1e-8 <= verdicts[1][2] <= verdicts[0][2] + 1e-3
@@ -168,7 +173,7 @@ def test_the_search_breaks_no_constraint_that_can_be_met(rows, validation):
     shares = SHARES[validation]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tracklake.pipeline.transforms.splits.search.EXHAUSTIVE_STATES", 0)
-        chosen = parts_of(allocate_flow_balanced(table(rows), validation=validation, restarts=20))
+        chosen = parts_of(allocate(table(rows), validation=validation, restarts=20))
     got = judge(rows, [chosen[row[0]] for row in rows], shares)
     best = min(judge(rows, parts, shares)[:2] for parts in itertools.product(shares, repeat=len(rows)))
     assert got[:2] == best
@@ -176,10 +181,10 @@ def test_the_search_breaks_no_constraint_that_can_be_met(rows, validation):
 
 def test_the_search_repeats_by_seed_and_ignores_row_order_and_other_datasets():
     rows = like_highd(subsets=30)
-    once = allocate_flow_balanced(table(rows), seed=3, restarts=5)
-    again = allocate_flow_balanced(table(rows).sample(fraction=1.0, shuffle=True, seed=8), seed=3, restarts=5)
+    once = allocate(table(rows), seed=3, restarts=5)
+    again = allocate(table(rows).sample(fraction=1.0, shuffle=True, seed=8), seed=3, restarts=5)
     other = table(rows[:4]).with_columns(dataset=pl.lit("ngsim"))
-    beside = allocate_flow_balanced(pl.concat([other, table(rows)]), seed=3, restarts=5)
+    beside = allocate(pl.concat([other, table(rows)]), seed=3, restarts=5)
     assert once.splits.equals(again.splits)
     assert once.splits.equals(beside.splits.filter(pl.col("dataset") == "highd"))
     assert once.balance.equals(beside.balance.filter(pl.col("dataset") == "highd"))
@@ -192,7 +197,7 @@ def test_tables_keep_their_schemas_and_the_balance_adds_up():
         ("b", "S", "lower", 400, 30, 0.4),
         ("c", "T", "upper", 200, 5, 0.35),
     ]
-    allocation = allocate_flow_balanced(table(rows), split="mine")
+    allocation = allocate(table(rows), split="mine")
     SPLITS.validate(allocation.splits, where="test")
     SPLIT_BALANCE.validate(allocation.balance, where="test")
     assert allocation.splits.rows() == [
@@ -220,7 +225,7 @@ def test_six_ngsim_recordings_keep_coverage_and_miss_the_share_least():
         for site, counts in vehicles.items()
         for position, count in enumerate(counts)
     ]
-    allocation = allocate_flow_balanced(table(rows))
+    allocation = allocate(table(rows))
     chosen = parts_of(allocation)
     assert {subset for subset, part in chosen.items() if part == "eval"} == {"us-101-2", "i-80-2"}
     assert allocation.relaxations == {
@@ -230,7 +235,7 @@ def test_six_ngsim_recordings_keep_coverage_and_miss_the_share_least():
 
 
 def test_one_subset_trains_and_says_so():
-    allocation = allocate_flow_balanced(table([("a", "S", "upper", 10, 100, 0.3)]))
+    allocation = allocate(table([("a", "S", "upper", 10, 100, 0.3)]))
     assert parts_of(allocation) == {"a": "train"}
     SPLIT_BALANCE.validate(allocation.balance, where="test")
     evaluation, train = allocation.balance.rows(named=True)
@@ -243,12 +248,12 @@ def test_one_subset_trains_and_says_so():
 def test_two_subsets_of_two_directions_still_give_an_evaluation_part():
     # By shares alone both would train (0.2 away rather than 0.3 away); an empty evaluation weighs more.
     rows = [("a", "S", "upper", 60, 100, 0.3), ("b", "S", "lower", 40, 100, 0.3)]
-    assert parts_of(allocate_flow_balanced(table(rows))) == {"a": "train", "b": "eval"}
+    assert parts_of(allocate(table(rows))) == {"a": "train", "b": "eval"}
 
 
 def test_a_subset_without_flow_counts_for_shares_and_not_for_flow():
     rows = [("a", "S", "upper", 800, 10, 0.3), ("b", "S", "lower", 100, 10, 0.3), ("c", "T", "upper", 100, 10, None)]
-    allocation = allocate_flow_balanced(table(rows))
+    allocation = allocate(table(rows))
     assert parts_of(allocation) == {"a": "train", "b": "eval", "c": "eval"}
     assert allocation.balance["vehicles_per_lane_s_mean"].to_list() == pytest.approx([0.3, 0.3])
     assert allocation.balance["samples"].to_list() == [20, 10]
@@ -257,15 +262,15 @@ def test_a_subset_without_flow_counts_for_shares_and_not_for_flow():
 def test_blocks_are_allocated_as_subsets_are():
     frame = table([("a", "S", "upper", 80, 10, 0.3), ("b", "S", "upper", 20, 10, 0.3)])
     blocks = frame.with_columns(subset=pl.lit("a"), block=pl.Series([0, 1]))
-    allocation = allocate_flow_balanced(blocks)
+    allocation = allocate(blocks)
     assert allocation.splits.select("subset", "block", "part").rows() == [("a", 0, "train"), ("a", 1, "eval")]
     assert allocation.balance["subsets"].to_list() == [1, 1]
     with pytest.raises(ValueError, match="has more than one row"):
-        allocate_flow_balanced(blocks.with_columns(block=0))
+        allocate(blocks.with_columns(block=0))
 
 
 def test_no_subsets_give_empty_tables():
-    allocation = allocate_flow_balanced(table([]))
+    allocation = allocate(table([]))
     assert allocation.splits.equals(SPLITS.empty())
     assert allocation.balance.equals(SPLIT_BALANCE.empty())
 
@@ -281,19 +286,19 @@ def test_no_subsets_give_empty_tables():
 )
 def test_bad_input_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        allocate_flow_balanced(change(table([("a", "S", "upper", 10, 100, 0.3)])))
+        allocate(change(table([("a", "S", "upper", 10, 100, 0.3)])))
 
 
 def test_shares_are_said_where_they_are_missed():
     rows = [(name, "S", "upper", vehicles, 10, 0.3) for name, vehicles in (("a", 80), ("b", 20))]
-    assert allocate_flow_balanced(table(rows)).relaxations == {}
+    assert allocate(table(rows)).relaxations == {}
     reported = (
         "train holds 0.800 of the vehicles instead of 0.700 +- 0.005; eval holds 0.200 of the vehicles instead of 0.300"
     )
-    assert allocate_flow_balanced(table(rows), train_share=0.7).relaxations["highd"].startswith(reported)
+    assert allocate(table(rows), train_share=0.7).relaxations["highd"].startswith(reported)
 
 
 @pytest.mark.parametrize(("share", "validation"), [(1.0, False), (0.0, False), (0.1, True), (1.2, True)])
 def test_parts_without_a_share_are_refused(share, validation):
     with pytest.raises(ValueError, match=rf"below 1 to train, got {share:g}"):
-        allocate_flow_balanced(table([]), train_share=share, validation=validation)
+        allocate(table([]), train_share=share, validation=validation)

@@ -19,6 +19,7 @@ from tracklake.pipeline.transforms.splits.time_blocks import (
     find_visits,
     recount_blocks,
 )
+from tracklake.schemas.split_recipes import SplitRecipe
 from tracklake.schemas.splits import SPLIT_LEFT_OUT, SPLITS
 
 ENTRY = {"vehicle_id": pl.Int32, "tick": pl.Int32}
@@ -108,7 +109,7 @@ def test_vehicles_in_two_parts_are_those_that_a_loop_finds(seed, validation):
         assert (row["vehicles"], row["weight"]) == (count, 0)
         assert row["vehicles_per_lane_s"] == pytest.approx(count / 2 / seconds)
 
-    splits = allocate_flow_balanced(units, split="time-blocks", validation=validation, restarts=3).splits
+    splits = allocate_flow_balanced(units, SplitRecipe("time-blocks", validation=validation, restarts=3)).splits
     SPLITS.validate(splits, where="test")
     part = {(row["subset"], row["block"]): row["part"] for row in splits.iter_rows(named=True)}
     found = find_left_out(visits, splits)
@@ -132,7 +133,7 @@ def test_a_subset_cut_into_blocks_may_stand_in_several_parts():
     )
     visits = pl.concat(find_visits(frames.filter(subset=name), blocks.filter(subset=name)) for name in ("a", "b"))
     weights = blocks.select("dataset", "subset", "block", weight=pl.lit(10, pl.Int64))
-    allocation = allocate_flow_balanced(describe_blocks(blocks, known, visits, weights), split="time-blocks")
+    allocation = allocate_flow_balanced(describe_blocks(blocks, known, visits, weights), SplitRecipe("time-blocks"))
     assert allocation.splits.group_by("subset").agg(pl.col("part").n_unique())["part"].max() == 2
     assert allocation.splits.height == blocks.height
     assert allocation.balance["subsets"].to_list() == [2, 2]
@@ -182,7 +183,7 @@ def test_parts_count_vehicles_once_and_no_samples_of_those_left_out():
     found = recount_blocks(units, splits, left_out, visits, weights)
     expected = [("train", 1, 1), ("train", 1, 2 + 4), ("val", 0, 0), ("eval", 1, 64), ("eval", 0, 128)]
     assert found.select("part", "vehicles", "weight").rows() == expected
-    allocation = tabulate_allocation(found, split="time-blocks", validation=True)
+    allocation = tabulate_allocation(found, SplitRecipe("time-blocks", validation=True))
     columns = ("part", "vehicles", "vehicle_share", "samples")
     assert {row[0]: row[1:] for row in allocation.balance.select(columns).iter_rows()} == {
         "train": (2, 2 / 3, 7), "val": (0, 0.0, 0), "eval": (1, 1 / 3, 192),
