@@ -56,6 +56,7 @@ docs: install
 	$(BIN)/python -m tracklake.schemas.quality_markdown > docs/quality_json.md
 	$(BIN)/python -m tracklake.training.models.markdown > docs/models.md
 	$(BIN)/python -m tracklake.quality_reports.rules.markdown > docs/rules.md
+	$(BIN)/python -m tracklake.quality_reports.gates.markdown > docs/check.md
 
 clean:
 	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

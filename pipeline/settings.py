@@ -1,25 +1,77 @@
-"""Settings: `tracklake.toml`, then the environment (`TRACKLAKE_*`), then flags."""
+"""Settings: files `tracklake.toml`, then the environment (`TRACKLAKE_*`), then options; and where each came from."""
 
 import os
-from dataclasses import replace
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
-from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
 
+from tracklake.schemas.errors import UsageError
+from tracklake.schemas.files import SETTINGS_FILE
 from tracklake.schemas.protocols import CSP, PROTOCOLS, Protocol
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
+from tracklake.schemas.text import suggest_name
 
+PREFIX = "TRACKLAKE_"
+"""Beginning of the names of environment variables that are settings."""
+DEBUG = "TRACKLAKE_DEBUG"
+"""Environment variable: if set to 1, every error shows its traceback, as with the option --debug."""
+ENVIRONMENT, OPTION = "environment", "option"
+"""Names of the sources of values that are variables, and that are given to a command or function."""
 PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split")
 """Names of the settings that replace a protocol's own values."""
+
+Key = tuple[str, ...]
+"""Name of a setting, and with a table of settings such as `thresholds` the name in it."""
+
+
+class SettingError(UsageError, ValueError):
+    """A setting is unknown, out of its bounds or cannot be read; the message names where it stands."""
+
+
+@dataclass(frozen=True)
+class SettingSource:
+    """A place that settings come from.
+
+    Args:
+        name: path of a file, `environment`, or `option`.
+        values: settings by name, as they are given.
+        lines: number of the line of each setting in a file.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    lines: Mapping[Key, int]
+
+    def locate(self, key: Key) -> str:
+        """Return where a setting stands: file and line, variable, or `option`."""
+        if self.name == ENVIRONMENT:
+            names = (PREFIX + "__".join(part).upper() for part in (key, key[:1]))
+            return next((name for name in names if name in map(str.upper, os.environ)), self.name)
+        return f"{self.name}:{self.lines[key]}" if key in self.lines else self.name
 
 
 class Settings(BaseSettings):
     """All settings of the pipeline; each is part of the fingerprints of the tables that it influences."""
 
     model_config = SettingsConfigDict(
-        env_prefix="TRACKLAKE_", env_nested_delimiter="__", toml_file="tracklake.toml", extra="forbid", frozen=True
+        env_prefix=PREFIX,
+        env_nested_delimiter="__",
+        env_ignore_empty=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
     )
 
     lake: Path = Field(Path("lake"), description="folder of the lake")
@@ -43,7 +95,7 @@ class Settings(BaseSettings):
     max_backward_share: float = Field(
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"
     )
-    on_ramp_lanes: dict[str, list[int]] = Field(
+    on_ramp_lanes: dict[str, list[Annotated[int, Field(ge=1)]]] = Field(
         default_factory=dict, description="lanes that are on-ramps by site, where the source does not state them"
     )
     protocol: str = Field(CSP.name, description="name of the protocol")
@@ -78,6 +130,28 @@ class Settings(BaseSettings):
         False, description="time-blocks: samples of val and eval with a neighbor that is cut off are left out"
     )
 
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401  (settings are of several types)
+        """Read the settings from files and environment, with these options on top.
+
+        Raises:
+            SettingError: a setting is unknown, out of its bounds or cannot be read.
+        """
+        sources = read_sources(options)
+        try:
+            super().__init__(**merge_sources(sources))
+        except ValidationError as error:
+            problems = [
+                (tuple(map(str, each["loc"])), _describe_problem(each), each["input"]) for each in error.errors()
+            ]
+            raise _make_error(problems, sources) from error
+        if self.thresholds:  # the rules' modules are imported only where some are set
+            from tracklake.quality_reports.rules.registry import RULES, find_threshold_faults
+
+            faults = find_threshold_faults(RULES, self.thresholds).items()
+            if faults:
+                found = [(("thresholds", name), fault, self.thresholds[name]) for name, fault in faults]
+                raise _make_error(found, sources)
+
     @classmethod
     def settings_customise_sources(
         cls,
@@ -87,15 +161,15 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Order the sources: flags override the environment, which overrides the file."""
-        del dotenv_settings, file_secret_settings
-        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+        """Leave pydantic only what `read_sources` has found."""
+        del settings_cls, env_settings, dotenv_settings, file_secret_settings
+        return (init_settings,)
 
     @field_validator("protocol")
     @classmethod
     def _check_protocol(cls, name: str) -> str:
         if name not in PROTOCOLS:
-            raise ValueError(f"expected one of {', '.join(PROTOCOLS)}")
+            raise ValueError(suggest_name(name, PROTOCOLS))
         return name
 
     @field_validator("min_future_s")
@@ -154,3 +228,150 @@ class Settings(BaseSettings):
             for name in SPLIT_NAMES
             if name in self.splits
         ]
+
+
+def read_sources(options: Mapping[str, Any]) -> list[SettingSource]:
+    """Read all places that settings come from, the weakest first.
+
+    Those are the first tracklake.toml in the working folder or one above it, that of the lake's folder, the
+    environment, and the options.
+
+    Raises:
+        SettingError: a file or variable cannot be read, or the lake's own file names a lake.
+    """
+    try:
+        variables = EnvSettingsSource(Settings)()
+    except SettingsError as error:
+        field = next(iter(re.findall(r'field "(\w+)"', str(error))), "*")
+        raise SettingError(
+            f"{PREFIX}{field.upper()}: expected JSON, got {os.environ.get(PREFIX + field.upper())!r}"
+        ) from error
+    found = find_file()
+    sources = [] if found is None else [_read_file(found)]
+    sources += [SettingSource(ENVIRONMENT, variables, {}), SettingSource(OPTION, options, {})]
+    lake = merge_sources(sources).get("lake", Settings.model_fields["lake"].default)
+    own = Path(lake) / SETTINGS_FILE if isinstance(lake, str | Path) else Path(SETTINGS_FILE)
+    if _is_file(own) and not (found is not None and own.samefile(found)):
+        of_lake = _read_file(own)
+        if "lake" in of_lake.values:
+            raise SettingError(f"{of_lake.locate(('lake',))}: a lake's own file names no lake; remove the line")
+        sources.insert(-2, of_lake)
+    return sources
+
+
+def list_files(lake: Path) -> list[str]:
+    """Return the paths of the files of settings that hold for a lake."""
+    return [source.name for source in read_sources({"lake": lake}) if source.name not in (ENVIRONMENT, OPTION)]
+
+
+def find_file() -> Path | None:
+    """Return the first tracklake.toml in the working folder or one above it."""
+    try:
+        here = Path.cwd()
+    except OSError:  # the working folder was deleted
+        return None
+    if _is_file(Path(SETTINGS_FILE)):
+        return Path(SETTINGS_FILE)
+    return next((folder / SETTINGS_FILE for folder in here.parents if _is_file(folder / SETTINGS_FILE)), None)
+
+
+def _is_file(path: Path) -> bool:
+    return os.path.isfile(path)  # noqa: PTH113  (that of Path raises an error in a folder without rights)
+
+
+def merge_sources(sources: Sequence[SettingSource]) -> dict[str, Any]:
+    """Return the values of all sources, of which later ones win; tables such as `thresholds` are joined."""
+    merged: dict[str, Any] = {}
+    for source in sources:
+        for name, value in source.values.items():
+            before = merged.get(name)
+            is_table = isinstance(value, Mapping) and isinstance(before, Mapping)
+            merged[name] = {**(before or {}), **value} if is_table else value
+    return merged
+
+
+def list_keys(values: Mapping[str, Any]) -> Iterator[Key]:
+    """Yield the keys of settings, and instead of that of a table those in it."""
+    for name, value in values.items():
+        yield from ((name, inner) for inner in value) if isinstance(value, Mapping) else [(name,)]
+
+
+def find_unknown_variables() -> list[str]:
+    """Return messages about environment variables that look like settings and are none.
+
+    They are no errors: others may set them, as Kubernetes does for a service called tracklake.
+    """
+    known = {f"{PREFIX}{name.upper()}": field for name, field in Settings.model_fields.items()}
+    tables = tuple(f"{name}__" for name, field in known.items() if field.default_factory is dict)
+    messages = []
+    for name in sorted(os.environ):
+        upper = name.upper()
+        if upper.startswith(PREFIX) and upper not in (*known, DEBUG) and not upper.startswith(tables):
+            hint = suggest_name(upper, known)
+            hint = hint if hint.endswith("?") else "`tracklake config` lists the settings"
+            messages.append(f"{name}: no setting has this name, so it has no effect; {hint}")
+    return messages
+
+
+def _read_file(path: Path) -> SettingSource:
+    """Read a file of settings; relative paths in it are relative to its folder."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise SettingError(f"{path}: {error}") from error
+    for name in ("lake", "columns"):
+        if isinstance(values.get(name), str):
+            values[name] = str(path.parent / values[name])
+    return SettingSource(str(path), values, _find_lines(text))
+
+
+def _find_lines(text: str) -> dict[Key, int]:
+    """Return the line on which each setting of a TOML text begins: where the text up to its end first has it."""
+    lines = text.splitlines()
+    found: dict[Key, int] = {}
+    begin = 1
+    for end in range(1, len(lines) + 1):
+        try:
+            values = tomllib.loads("\n".join(lines[:end]))
+        except tomllib.TOMLDecodeError:
+            continue  # within a value of several lines
+        found |= {key: begin for key in list_keys(values) if key not in found}
+        begin = end + 1
+    return found
+
+
+def _describe_problem(problem: Any) -> str:  # noqa: ANN401  (a TypedDict that pydantic keeps private)
+    """Return what was expected where pydantic found something else."""
+    if problem["type"] == "extra_forbidden":
+        return f"unknown setting; {suggest_name(str(problem['loc'][0]), Settings.model_fields)}"
+    field = Settings.model_fields.get(str(problem["loc"][0]))
+    words = {"ge": "{:g} or more", "gt": "more than {:g}", "le": "{:g} or less"}
+    limits = [(name, getattr(each, name, None)) for each in (field.metadata if field else []) for name in words]
+    bounds = [words[name].format(limit) for name, limit in limits if isinstance(limit, int | float)]
+    if bounds and {*problem.get("ctx", {})} & {*words}:
+        return f"expected {' and '.join(bounds)}"
+    return re.sub(
+        r"^(Value error, |Input should be )", lambda match: "" if "error" in match[0] else "expected ", problem["msg"]
+    )
+
+
+def _make_error(problems: Sequence[tuple[Key, str, object]], sources: Sequence[SettingSource]) -> SettingError:
+    """Return the error about some settings: where each stands, its name, what was expected and what was found."""
+    lines = []
+    for key, expected, got in problems:
+        where = locate_setting(key, sources)
+        place = "" if where in (OPTION, None) else f"{where}: "
+        lines.append(f"{place}setting {'.'.join(key)}: {expected}" + ("" if expected[-1] == "?" else f", got {got!r}"))
+    return SettingError("\n".join(lines))
+
+
+def locate_setting(key: Key, sources: Sequence[SettingSource]) -> str | None:
+    """Return where the value in force of a setting stands; None: nowhere, so that it is the default."""
+    found = (
+        source.locate(part)
+        for part in (key[:2], key[:1])
+        for source in reversed(sources)
+        if part in list_keys(source.values)
+    )
+    return next(found, None)

@@ -203,7 +203,7 @@ def collect(
     subsets = _query_rows(connection, "subsets", SubsetFacts)
     scored = _query_rows(connection, "subset_scores", SubsetScores)
     completeness = _query_rows(connection, "completeness", Completeness)
-    checked = _collect_rules(connection, rules, provenance.get("thresholds") or {})
+    checked = collect_rules(connection, rules, provenance.get("thresholds") or {})
     return {
         "schema": QUALITY_SCHEMA,
         "headline": _query_rows(connection, "headline", Headline)[0],
@@ -247,7 +247,7 @@ def collect_subsets(
     """Gather the numbers of the overview that subsets' pages show as well; the arguments are those of `collect`."""
     return {
         "subsets": _query_rows(connection, "subsets", SubsetFacts),
-        "rules": _collect_rules(connection, rules, provenance.get("thresholds") or {}),
+        "rules": collect_rules(connection, rules, provenance.get("thresholds") or {}),
         "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
         "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
         "starts": _query_rows(connection, "starts", SubsetStarts),
@@ -292,9 +292,7 @@ def _collect_splits(connection: Connection) -> Splits:
     }
 
 
-def _collect_rules(
-    connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]
-) -> list[RuleFindings]:
+def collect_rules(connection: Connection, rules: Sequence[Rule], thresholds: Mapping[str, float]) -> list[RuleFindings]:
     """Gather each rule's declaration and its findings in the whole lake, per dataset and per subset."""
     rows = query(connection, "findings", {"rules": [rule.name for rule in rules]})
     extremes = {rule.name: "least" if rule.extreme == "min" else "greatest" for rule in rules}

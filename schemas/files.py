@@ -11,6 +11,8 @@ from typing import BinaryIO
 
 from tracklake.schemas.errors import FileAccessError, explain_file_errors
 
+SETTINGS_FILE = "tracklake.toml"
+"""Name of a file of settings, in a working folder or in a lake."""
 _UNFINISHED = re.compile(r"\..+\.[0-9a-f]{32}\.tmp(\.wal)?")
 """Names of files that are not whole yet; DuckDB writes its log beside a database."""
 MAX_LINKS = 40

@@ -1,8 +1,10 @@
-"""Texts from files, shown safely: control characters as escapes, paths quoted for a shell."""
+"""Texts for messages: control characters as escapes, paths quoted for a shell, names that were meant."""
 
 import os
 import shlex
 import unicodedata
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 INVISIBLE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -27,3 +29,10 @@ def quote_shell(argument: str | Path) -> str:
         return shlex.quote(text)
     plain = (chr(byte) if 32 <= byte < 127 and byte not in b"\\'" else f"\\x{byte:02x}" for byte in os.fsencode(text))
     return f"$'{''.join(plain)}'"
+
+
+def suggest_name(name: str, known: Iterable[str]) -> str:
+    """Return a question after the known name that is most like an unknown one; where none is, a list of all."""
+    by_folded = {each.casefold(): each for each in known}
+    near = get_close_matches(name.casefold(), by_folded, n=1)
+    return f"did you mean {by_folded[near[0]]}?" if near else f"expected one of {', '.join(by_folded.values())}"

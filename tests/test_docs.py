@@ -10,6 +10,7 @@ import pytest
 from lake_sources import SAMPLE
 from simulated import simulate_once
 
+from tracklake.quality_reports.gates.markdown import write_gates
 from tracklake.quality_reports.rules.markdown import write_rules
 from tracklake.quality_reports.rules.registry import RULES
 from tracklake.schemas import TABLES
@@ -72,6 +73,10 @@ def test_the_page_of_rules_is_current():
     for rule in RULES:
         assert f"## {rule.name}\n" in page
         assert all(f"`{threshold.name}` = " in page for threshold in rule.thresholds)
+
+
+def test_the_page_of_gates_is_current():
+    assert (ROOT / "docs" / "check.md").read_text() == write_gates(), "run `make docs`"
 
 
 def test_the_page_of_models_is_current():

@@ -3,12 +3,14 @@
 import os
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from tracklake.pipeline.cli.logs import choose_file, choose_verbose
 from tracklake.pipeline.cli.streams import guard_streams
 from tracklake.training.runs.memory import keep_freed_memory
 
@@ -22,7 +24,9 @@ COMMANDS = {
     "split": "Divide the subsets into train and eval.",
     "tensors": "Write the split as flat arrays.",
     "report": "Write the quality report.",
-    "check": "Compare every live file with its checksum; what is damaged is made again by the next run.",
+    "check": 'Compare every file with its checksum, and judge quality gates such as "error_share > 0.05".',
+    "info": "Show a lake's recordings, stages, what is stale and why, and sizes on disk.",
+    "config": "Show the settings in force, and where each comes from.",
     "sql": "Query the tables with SQL, read-only, from anywhere.",
     "train": "Train a model on the split's training part and evaluate it once on the evaluation part.",
     "evaluate": "Score runs and models at each horizon, beside published figures.",
@@ -36,8 +40,8 @@ COMMANDS = {
 
 MODULES = {"validate": "stage", "samples": "stage", "tensors": "stage"}
 """Modules of the commands that have none of their own."""
-
-
+DIAGNOSIS = "Diagnosis"
+"""Title of the options that every command takes, on its help page."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as that of a program that the signal ended."""
 
@@ -72,7 +76,58 @@ def load_command(name: str) -> Any:  # noqa: ANN401  (see LazyGroup)
         alone = typer.Typer(add_completion=False)
         alone.command(name)(target)
         target = alone
-    return get_command(target)
+    built = get_command(target)
+    common = typer.Typer(add_completion=False)
+    common.command()(_read_common_options)
+    for each in (built, *getattr(built, "commands", {}).values()):
+        each.params += [parameter for parameter in get_command(common).params if parameter.name != "help"]
+    return built
+
+
+def _choose_debugging(debug: bool) -> None:
+    """Show tracebacks, also in worker processes."""
+    if debug:
+        os.environ["TRACKLAKE_DEBUG"] = "1"
+
+
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        "-v",
+        callback=choose_verbose,
+        expose_value=False,
+        rich_help_panel=DIAGNOSIS,
+        help="Print each step with its time on stderr, instead of progress bars.",
+    ),
+]
+LogFileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--log-file",
+        metavar="FILE",
+        callback=choose_file,
+        expose_value=False,
+        rich_help_panel=DIAGNOSIS,
+        help="Append each step with its time, and tracebacks, to this file.",
+    ),
+]
+DebugOption = Annotated[
+    bool,
+    typer.Option(
+        "--debug",
+        callback=_choose_debugging,
+        expose_value=False,
+        rich_help_panel=DIAGNOSIS,
+        help="Show the traceback of every error (or TRACKLAKE_DEBUG=1).",
+    ),
+]
+
+
+def _read_common_options(
+    verbose: VerboseOption = False, log_file: LogFileOption = None, debug: DebugOption = False
+) -> None:
+    """Stand for the options that every command takes; their callbacks do what they ask."""
 
 
 app = typer.Typer(
@@ -80,22 +135,22 @@ app = typer.Typer(
     name="tracklake",
     help="Highway trajectory recordings (NGSIM, highD) to a Parquet lake, quality reports, splits and tensors.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
-    epilog="Exit codes: 0 done, 1 failed, 2 usage, 3 done but some recordings were refused, 130 interrupted.",
+    epilog="Exit codes: 0 done, 1 failed, 2 usage, 3 done but some recordings were refused, 4 a quality gate failed, "
+    "130 interrupted.",
 )
 
 
 @app.callback(invoke_without_command=True)
 def _read_global_options(
     show_version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show the traceback of every error (or TRACKLAKE_DEBUG=1).")
-    ] = False,
+    verbose: VerboseOption = False,
+    log_file: LogFileOption = None,
+    debug: DebugOption = False,
 ) -> None:
-    if debug:
-        os.environ["TRACKLAKE_DEBUG"] = "1"
+    del verbose, log_file, debug  # their callbacks have done what they ask
     if show_version:
         typer.echo(f"tracklake {version('tracklake')}")
         raise typer.Exit

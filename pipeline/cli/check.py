@@ -1,12 +1,21 @@
-"""`tracklake check`: every file of the lake compared with its checksum."""
+"""`tracklake check`: every file of the lake compared with its checksum, and quality gates."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from tracklake.pipeline.cli.command import FAILED, command, read_settings
+from tracklake.pipeline.cli.command import FAILED, GATE_FAILED, command, read_settings
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.gates import (
+    describe_gate,
+    find_outdated,
+    judge_gates,
+    list_metrics,
+    show_gates,
+    write_junit,
+)
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
 from tracklake.pipeline.lake import (
     DamagedFile,
@@ -16,41 +25,93 @@ from tracklake.pipeline.lake import (
     is_settled,
     load,
     open_for_writing,
+    refuse_lake,
 )
 from tracklake.pipeline.lake.live_folders import find_false_copies
+from tracklake.quality_reports.gates.gate import parse_gate
 from tracklake.schemas.text import quote_shell
 
 
-def check(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOption = False) -> None:
-    """Compare every live file with its checksum; what is damaged is made again by the next run.
+def check(
+    lake: LakeOption = None,
+    fail_on: Annotated[
+        list[str] | None,
+        typer.Option("--fail-on", metavar="GATE", help="Also fail (exit code 4) where this holds; repeatable."),
+    ] = None,
+    with_checksums: Annotated[
+        bool, typer.Option("--checksums/--no-checksums", help="Compare the files, or judge the gates only.")
+    ] = True,
+    junit: Annotated[
+        Path | None, typer.Option("--junit", metavar="FILE", help="Also write the result as JUnit XML.")
+    ] = None,
+    with_metrics: Annotated[
+        bool, typer.Option("--list-metrics", help="List what a gate can compare, and do nothing else.")
+    ] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Compare every file with its checksum, and judge quality gates such as "error_share > 0.05".
 
-    The catalog and the folders of tables are brought up to date where they do not agree with the manifest.
+    Damaged files are made again by the next run. Catalog and folders are brought up to date where they are not.
+
+    A gate compares metrics of each subset with values; `and` joins comparisons, and `per recording`, `per dataset` or
+    `per lake` at its end judges those. It fails where all hold, where a value is not known, and where nothing is
+    judged (docs/check.md).
     """
     with command(quiet=quiet, json=json) as terminal:
-        root = read_settings(lake=lake).lake
-        manifest = load(root)
-        copies = find_false_copies(root, manifest)
-        for name in copies:
-            terminal.print_problem(
-                f"{root / name}: not the bytes of the live file, of which it is a copy", label="damaged"
-            )
-        if copies or not is_settled(root, manifest):
-            outcome = "are up to date again" if _mend(root, terminal, copies=copies) else "were left so"
-            terminal.print_line(f"catalog and folders did not agree with the manifest, and {outcome}")
-        manifest = load(root)
-        damaged = find_damaged_files(root, manifest)
-        files = [file for commit in manifest.commits.values() for file in commit.all_files if file.sha256 is not None]
-        size = sum(file.bytes for file in files)
-        for file in damaged:
-            terminal.print_problem(f"{root / file.path}: {file.reason}", label="damaged")
-        terminal.print_json(
-            {"lake": root, "files": len(files), "bytes": size, "damaged": [f._asdict() for f in damaged]}
-        )
+        if with_metrics:
+            list_metrics(terminal)
+            return
+        gates = [parse_gate(text) for text in fail_on or ()]
+        if not with_checksums and not gates:
+            raise typer.BadParameter("--no-checksums leaves only gates to judge, and no --fail-on gives one")
+        refuse_lake(junit)
+        settings = read_settings(lake=lake)
+        root = settings.lake
+        record: dict[str, Any] = {"lake": root}
+        damaged = _check_files(root, terminal, record) if with_checksums else None
+        results = [] if damaged else judge_gates(root, gates) if gates else []
+        if gates:
+            outdated = find_outdated(settings, load(root))
+            for stage in outdated:
+                terminal.print_problem(
+                    f"{stage} is not up to date: gates are judged on what it made last", label="note"
+                )
+            show_gates(terminal, results)
+            record |= {"outdated": outdated, "gates": [describe_gate(result) for result in results]}
+        if junit is not None:
+            write_junit(junit, results, damaged)
+        terminal.print_json(record)
         if damaged:
-            _mend(root, terminal, damaged)
-            terminal.print_problem(f"{len(damaged)} of {len(files):,} files are damaged. {_advise(root, manifest)}")
             raise typer.Exit(FAILED)
+        not_passed = [result for result in results if result.state != "passed"]
+        if not_passed:
+            terminal.print_problem(f"{len(not_passed)} of {len(gates)} gates did not pass", label="failed")
+            raise typer.Exit(GATE_FAILED)
+
+
+def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list[DamagedFile]:
+    """Compare every live file with its checksum, mend what can be mended, and return what is damaged."""
+    manifest = load(root)
+    copies = find_false_copies(root, manifest)
+    for name in copies:
+        terminal.print_problem(f"{root / name}: not the bytes of the live file, of which it is a copy", label="damaged")
+    if copies or not is_settled(root, manifest):
+        outcome = "are up to date again" if _mend(root, terminal, copies=copies) else "were left so"
+        terminal.print_line(f"catalog and folders did not agree with the manifest, and {outcome}")
+    manifest = load(root)
+    damaged = find_damaged_files(root, manifest)
+    files = [file for commit in manifest.commits.values() for file in commit.all_files if file.sha256 is not None]
+    size = sum(file.bytes for file in files)
+    for file in damaged:
+        terminal.print_problem(f"{root / file.path}: {file.reason}", label="damaged")
+    record |= {"files": len(files), "bytes": size, "damaged": [file._asdict() for file in damaged]}
+    if damaged:
+        _mend(root, terminal, damaged)
+        terminal.print_problem(f"{len(damaged)} of {len(files):,} files are damaged. {_advise(root, manifest)}")
+    else:
         terminal.print_line(f"{len(files):,} files ({size / 1e6:,.1f} MB): all as they were written")
+    return damaged
 
 
 def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), copies: Sequence[str] = ()) -> bool:

@@ -1,40 +1,46 @@
 """The frame of every command: its terminal, its settings, its errors and exit codes."""
 
+import logging
 import os
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tomllib import TOMLDecodeError
 from typing import Any
 
 import typer
-from pydantic import ValidationError
-from pydantic_settings import SettingsError
 
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.settings import Settings
-from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
+from tracklake.pipeline.cli.logs import LOG, open_log
+from tracklake.pipeline.settings import DEBUG, Settings, find_unknown_variables, read_sources
+from tracklake.schemas.errors import TracklakeError, describe_bug
 from tracklake.schemas.text import make_visible
 
-DONE, FAILED, USAGE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 130
-"""Exit codes: done, failed, wrong usage, done but for refused recordings, and interrupted by Ctrl-C."""
-
-DEBUG = "TRACKLAKE_DEBUG"
-"""Environment variable: if set to 1, every error shows its traceback, as with the option --debug."""
+DONE, FAILED, USAGE, REFUSED, GATE_FAILED, INTERRUPTED = 0, 1, 2, 3, 4, 130
+"""Exit codes: done, failed, wrong usage, done but for refused recordings, a gate not passed, interrupted by Ctrl-C."""
 
 
 @contextmanager
 def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
-    """Give a command its terminal, and turn errors into messages and exit codes.
+    """Give a command its terminal and its log, and turn errors into messages and exit codes.
 
     An error that the user can mend becomes one message. A bug shows its traceback and asks for a report.
     """
     terminal = Terminal(quiet=quiet, as_json=json)
-    try:
+    with ExitStack() as log, _explain_errors(terminal):
+        log.enter_context(open_log())
+        for message in () if quiet else find_unknown_variables():
+            terminal.print_problem(message, label="warning")
         yield terminal
         sys.stdout.flush()  # what fails here would otherwise fail at exit
+
+
+@contextmanager
+def _explain_errors(terminal: Terminal) -> Iterator[None]:
+    """Turn the errors of a command into messages and exit codes."""
+    try:
+        yield
     except typer.TyperException as misuse:
         misuse.message = make_visible(misuse.message, keep="\n")
         raise
@@ -43,14 +49,6 @@ def command(*, quiet: bool = False, json: bool = False) -> Iterator[Terminal]:
     except TracklakeError as error:
         _show_traceback_if_debugging(error)
         raise report_failure(terminal, str(error), error.exit_code) from None
-    except ValidationError as error:
-        _show_traceback_if_debugging(error)
-        for problem in error.errors():
-            where = ".".join(str(part) for part in problem["loc"])
-            terminal.print_problem(
-                f"setting {where}: {problem['msg']}; got {problem['input']!r}. See `tracklake.toml` and TRACKLAKE_*."
-            )
-        raise report_failure(terminal, "the settings are not valid", USAGE) from None
     except BrokenPipeError:
         # The reader of our output has closed it; without this, Python would report the broken pipe again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -76,6 +74,7 @@ def _report_bug(terminal: Terminal, bug: Exception) -> typer.Exit:
 
 
 def _show_traceback_if_debugging(error: BaseException) -> None:
+    LOG.debug("the error was raised here", exc_info=error, extra={"shown": True})
     if os.environ.get(DEBUG, "0") not in ("", "0"):
         sys.stderr.write(make_visible("".join(traceback.format_exception(error)), keep="\n"))
 
@@ -95,17 +94,17 @@ def read_settings(
     columns: Path | None = None,
     recording: str | None = None,
 ) -> Settings:
-    """Read the settings from file and environment, with the given flags on top.
+    """Read the settings from files and environment, with the given flags on top.
 
     Raises:
-        UsageError: `tracklake.toml` or an environment variable cannot be read.
+        SettingError: a setting is unknown, out of its bounds or cannot be read.
     """
     flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
     # Absolute, so that a worker in another folder finds the same file.
     flags |= {"columns": None if columns is None else columns.absolute(), "recording": recording}
-    try:
-        return Settings(**{name: value for name, value in flags.items() if value is not None})
-    except (TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UsageError(f"tracklake.toml: {error}") from error
-    except SettingsError as error:
-        raise UsageError(f"environment: {error}; expected JSON in that TRACKLAKE_* variable") from error
+    given = {name: value for name, value in flags.items() if value is not None}
+    settings = Settings(**given)
+    for source in read_sources(given) if LOG.isEnabledFor(logging.DEBUG) else ():
+        if source.values:
+            LOG.debug("settings from %s: %s", source.name, source.values)
+    return settings

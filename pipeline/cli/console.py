@@ -1,6 +1,7 @@
 """The terminal of a command: results go to stdout, progress and errors to stderr."""
 
 import json
+import logging
 import os
 import shutil
 import sys
@@ -13,7 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from tracklake.pipeline.orchestration.progress import Silent, reporting_to
+from tracklake.pipeline.cli.logs import LOG, chosen, log_shown
+from tracklake.pipeline.orchestration.progress import Reporter, Silent, reporting_to
 from tracklake.schemas.text import make_visible, quote_shell
 
 
@@ -34,6 +36,7 @@ class Terminal:
 
     def print_line(self, text: str, *, style: str = "") -> None:
         """Print a line for people."""
+        log_shown(logging.INFO, text)
         if self.verbose:
             self.out.print(escape(make_visible(text, keep="\n")), style=style or None)
 
@@ -49,11 +52,13 @@ class Terminal:
 
     def print_problem(self, text: str, *, label: str = "error") -> None:
         """Print an error or refusal, always, on stderr."""
+        log_shown(logging.ERROR if label == "error" else logging.WARNING, f"{label}: {text}")
         colour = "red" if label == "error" else "yellow"
         self.err.print(f"[bold {colour}]{label}:[/] {escape(make_visible(text, keep=chr(10)))}")
 
     def print_bug(self, text: str) -> None:
         """Print the traceback of a bug on stderr."""
+        log_shown(logging.CRITICAL, text)
         self.err.print(make_visible(text, keep="\n"), markup=False)
 
     def print_json(self, record: dict[str, Any]) -> None:
@@ -65,9 +70,9 @@ class Terminal:
 
     @contextmanager
     def show_stages(self) -> Iterator[None]:
-        """Show one progress bar per stage while a block runs."""
-        if not self.verbose:
-            with reporting_to(Silent()):
+        """Show one progress bar per stage while a block runs, or with --verbose lines of the log."""
+        if not self.verbose or chosen.verbose:
+            with reporting_to(_Lines(Silent())):
                 yield
             return
         columns = (
@@ -77,7 +82,7 @@ class Terminal:
             TimeElapsedColumn(),
             TextColumn("[dim]{task.fields[title]}"),
         )
-        with Progress(*columns, console=self.err) as progress, reporting_to(_Bars(progress)):
+        with Progress(*columns, console=self.err) as progress, reporting_to(_Lines(_Bars(progress))):
             yield
 
     @contextmanager
@@ -90,6 +95,21 @@ class Terminal:
         with Progress(*columns, TextColumn("[dim]{task.fields[loss]}"), console=self.err) as progress:
             bar = progress.add_task(escape(title), total=1.0, loss="")
             yield lambda share, loss: progress.update(bar, completed=share, loss=f"loss {loss:.3f}")
+
+
+class _Lines:
+    """Logs progress, and hands it on."""
+
+    def __init__(self, shown: Reporter) -> None:
+        self._shown = shown
+
+    def begin(self, stage: str, total: int) -> None:
+        LOG.info("%s: %d to do", stage, total)
+        self._shown.begin(stage, total)
+
+    def advance(self, stage: str, title: str) -> None:
+        LOG.info("%s: %s done", stage, make_visible(title))
+        self._shown.advance(stage, title)
 
 
 class _Bars:

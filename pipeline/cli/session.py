@@ -19,7 +19,7 @@ from tracklake.pipeline.lake import LakeError, load, refuse_foreign, refuse_if_b
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
-from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.settings import Settings, list_files
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.stages.report import DOCUMENT, PAGE, read_quality
 from tracklake.schemas.columns import DATASETS
@@ -52,6 +52,8 @@ def run_steps(
     where = None if source is None else str(Path(source).absolute())
     request = RunRequest(str(settings.lake.absolute()), steps, where, dataset, plain, replace, prune, rebuild)
     request.check()
+    for file in list_files(settings.lake):
+        terminal.print_line(f"settings: {file}", style="dim")
     refuse_foreign(request.root, rebuild=rebuild)
     if prune and source is not None and Path(source).is_file():
         raise typer.BadParameter(f"--prune compares a folder with the lake; {source} is a file")

@@ -321,6 +321,12 @@ class Digests:
         self._changed = True
         return str(self._known[key][2])
 
+    def has_changed(self, path: Path) -> bool:
+        """Return whether a file has another size or time of change than when it, or a member of it, was hashed."""
+        stat, name = path.stat(), str(path.resolve())
+        known = [state for key, state in self._known.items() if key == name or key.startswith(f"{name}/")]
+        return bool(known) and all(state[:2] != [stat.st_size, stat.st_mtime_ns] for state in known)
+
     def save(self) -> None:
         """Store new hashes beside the lake's manifest, where there is a lake."""
         if self._changed and self._path.with_name(MANIFEST).exists():

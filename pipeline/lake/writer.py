@@ -16,7 +16,7 @@ from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissi
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
 from tracklake.pipeline.lake.rebuild import start_rebuild
 from tracklake.pipeline.lake.session_end import LOCK
-from tracklake.schemas.files import remove_unfinished
+from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
 
 KEPT_GENERATIONS = 2
 """Generations for which a replaced file is kept, in writing sessions."""
@@ -220,7 +220,8 @@ def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:
     if (root / MANIFEST).exists():
         (start_rebuild if rebuild else load)(root)  # another program's manifest is found out before anything is touched
     elif root.is_dir():
-        foreign = sorted(item.name for item in root.iterdir() if not item.name.startswith("."))
+        names = {item.name for item in root.iterdir() if not item.name.startswith(".")}
+        foreign = sorted(names - {SETTINGS_FILE})
         if foreign:
             raise LakeError(
                 f"{root}: holds other files ({', '.join(foreign[:3])}{', ...' if len(foreign) > 3 else ''}) and is no "

@@ -1,5 +1,6 @@
 """The pipeline as a Python function."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from tracklake.pipeline.orchestration.run_plan import (
     plan_run,
     survey_source,
 )
-from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.settings import Settings, find_unknown_variables
 from tracklake.pipeline.sources import SourceError
 
 
@@ -44,9 +45,11 @@ def run(
     Raises:
         SourceError: nothing in the source can be used.
         LakeError: the lake is damaged, of another version, or another process writes to it; or a stage failed.
-        pydantic.ValidationError: a setting is invalid.
+        SettingError: a setting is unknown or out of its bounds.
     """
     chosen = Settings(lake=Path(lake), **settings)
+    for message in find_unknown_variables():
+        warnings.warn(message, stacklevel=2)
     plain = chosen.model_dump(mode="json", exclude_unset=True)
     place, where = str(Path(lake).absolute()), str(Path(source).absolute())
     request = RunRequest(place, ALL_STEPS, where, dataset, plain, replace, prune, rebuild)

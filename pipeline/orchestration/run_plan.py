@@ -23,7 +23,6 @@ from tracklake.pipeline.sources.column_mapping import load_mapping
 from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage
-from tracklake.quality_reports.rules.registry import RULES, resolve
 from tracklake.schemas.errors import UsageError
 
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
@@ -72,14 +71,13 @@ class RunRequest:
 
     def get_settings(self) -> Settings:
         """Return the settings, validated."""
-        return Settings(**self.settings)
+        return Settings(**{**self.settings, "lake": self.lake})
 
     def check(self) -> None:
-        """Refuse paths and settings that would only fail in a later stage.
+        """Refuse paths that would only fail in a later stage.
 
         Raises:
             UsageError: the path of the lake or the source is no UTF-8 text.
-            ThresholdError: no rule has a threshold of that name.
         """
         for name, path in (("lake", self.root), ("SOURCE", self.origin)):
             full = str(path.resolve())
@@ -87,7 +85,6 @@ class RunRequest:
                 raise UsageError(
                     f"{name} {full}: the path is no UTF-8 text, which DuckDB and Prefect need. Rename the folder."
                 )
-        resolve(RULES, self.get_settings().thresholds)
 
     def list_stages(self) -> list[Stage]:
         """Return the requested stages after ingestion; with the report, the pages that it links to."""

@@ -37,7 +37,7 @@ def _summarise(rule: Rule) -> tuple[str, ...]:
 
 def _write_section(rule: Rule) -> Iterator[str]:
     """Yield the lines of a rule's section."""
-    thresholds = (f"`{each.name}` = {each.default:g} {each.unit}" for each in rule.thresholds)
+    thresholds = (f"`{each.name}` = {each.default:g} {each.unit} ({each.range})" for each in rule.thresholds)
     yield f"## {rule.name}"
     yield ""
     yield f"An entry breaks it when {rule.meaning}."

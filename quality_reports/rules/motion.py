@@ -41,7 +41,7 @@ BACKWARD = Rule(
     name="backward",
     severity="error",
     unit="m/s",
-    thresholds=(Threshold("backward_mps", 0.0, "m/s"),),
+    thresholds=(Threshold("backward_mps", 0.0, "m/s", least=None, greatest=0.0),),
     meaning="the recorded speed along the direction of travel is below the threshold: the vehicle reverses",
     source=f"{STUDY}: highD recordings 25, 26 and 36; {DESIGN}",
     breaks=lambda limits: pl.col("speed_mps") < recorded(limits["backward_mps"]),

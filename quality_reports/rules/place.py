@@ -8,7 +8,7 @@ NEGATIVE_HEADWAY = Rule(
     name="negative_headway",
     severity="error",
     unit="m",
-    thresholds=(Threshold("negative_headway_m", 0.0, "m"),),
+    thresholds=(Threshold("negative_headway_m", 0.0, "m", least=None, greatest=0.0),),
     meaning="the bumper-to-bumper gap to the leader, from positions, is below the threshold: two vehicles overlap",
     source=f"{STUDY}; {DESIGN}; found in NGSIM by {COIFMAN}",
     breaks=lambda limits: pl.col("gap_m") < limits["negative_headway_m"],
@@ -22,7 +22,7 @@ NEGATIVE_HEADWAY_RECORDED = Rule(
     name="negative_headway_recorded",
     severity="error",
     unit="m",
-    thresholds=(Threshold("negative_headway_recorded_m", 0.0, "m"),),
+    thresholds=(Threshold("negative_headway_recorded_m", 0.0, "m", least=None, greatest=0.0),),
     meaning="the recorded headway less the leader's length is below the threshold, whatever the positions say: how the "
     "published counts were made. Headways recorded from bumper to bumper (those that are nearer to gap_m as they "
     "stand, in the subset's median) count without taking the length off again",

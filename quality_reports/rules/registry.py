@@ -12,6 +12,7 @@ from tracklake.quality_reports.rules.motion import MOTION_RULES
 from tracklake.quality_reports.rules.place import PLACE_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
 from tracklake.schemas.errors import UsageError
+from tracklake.schemas.text import suggest_name
 
 __all__ = [
     "RULES",
@@ -24,6 +25,7 @@ __all__ = [
     "columns_needed",
     "columns_read",
     "describe",
+    "find_threshold_faults",
     "resolve",
     "select_broken",
 ]
@@ -55,16 +57,31 @@ def resolve(rules: Sequence[Rule], overrides: Mapping[str, float] | None = None)
     """Return every threshold of the rules by name: the default unless overridden.
 
     Raises:
-        ThresholdError: an override's name is no threshold of these rules, or its value is not a finite number.
+        ThresholdError: an override's name is no threshold of these rules, or its value is not allowed.
     """
-    values = {name: default for rule in rules for name, default in rule.defaults.items()}
-    for name, value in (overrides or {}).items():
-        if name not in values:
-            raise ThresholdError(f"thresholds: unknown name {name!r}; expected one of {', '.join(sorted(values))}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ThresholdError(f"thresholds: {name} must be a finite number, got {value!r}")
-        values[name] = float(value)
-    return values
+    for name, fault in find_threshold_faults(rules, overrides or {}).items():
+        raise ThresholdError(f"thresholds: {name}: {fault}, got {(overrides or {})[name]!r}")
+    defaults = {name: default for rule in rules for name, default in rule.defaults.items()}
+    return defaults | {name: float(value) for name, value in (overrides or {}).items()}
+
+
+def find_threshold_faults(rules: Sequence[Rule], overrides: Mapping[str, Any]) -> dict[str, str]:
+    """Return what is wrong with overrides of thresholds, by name: what was expected."""
+    known = {threshold.name: threshold for rule in rules for threshold in rule.thresholds}
+    faults = {}
+    for name, value in overrides.items():
+        if name not in known:
+            faults[name] = f"unknown name; {suggest_name(name, known)}"
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            faults[name] = "expected a finite number"
+        elif not known[name].allows(value):
+            faults[name] = f"expected {known[name].range} ({known[name].unit})"
+    values = {name: threshold.default for name, threshold in known.items()} | {**overrides}
+    for name in () if faults else overrides:
+        low, high = name.replace("_max_", "_min_"), name.replace("_min_", "_max_")
+        if values[low] > values[high]:
+            faults[name] = f"expected {low} to be no more than {high}, which are {values[low]:g} and {values[high]:g}"
+    return faults
 
 
 def as_schema(rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None) -> pa.DataFrameSchema:

@@ -26,11 +26,24 @@ class Threshold:
         name: the setting's name, unit included.
         default: its value unless set.
         unit: SI symbol.
+        least: least value allowed; None: any.
+        greatest: greatest value allowed; None: any.
     """
 
     name: str
     default: float
     unit: str
+    least: float | None = 0.0
+    greatest: float | None = None
+
+    @property
+    def range(self) -> str:
+        """Values that are allowed, in words."""
+        return f"{self.least:g} or more" if self.least is not None else f"{self.greatest:g} or less"
+
+    def allows(self, value: float) -> bool:
+        """Return whether a value lies within the bounds."""
+        return (self.least is None or value >= self.least) and (self.greatest is None or value <= self.greatest)
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,21 @@
 """Settings and protocols: what no one sets is the protocol's, and what cannot go together is refused."""
 
+import json
+from pathlib import Path
+
 import pytest
 from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app, load_command
-from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.settings import SettingError, Settings
 from tracklake.schemas.protocols import PROTOCOLS
 
 
 @pytest.fixture(autouse=True)
 def nowhere(tmp_path, monkeypatch):
-    """No tracklake.toml, no lake."""
+    """No tracklake.toml, no lake, wide enough a terminal."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -36,7 +40,7 @@ def test_what_is_set_takes_its_place(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"protocol": "mine"}, "expected one of csp, csp-2018, highd-flow-balanced, mha-2020, grid-2021"),
+        ({"protocol": "mine"}, "setting protocol: expected one of csp, csp-2018"),
         ({"min_future_s": 5.1}, "expected 5 or less, the horizon of the protocol csp"),
         ({"protocol": "grid-2021", "min_future_s": 2.5}, "expected 2 or less, the horizon of the protocol grid-2021"),
         ({"protocol": "csp-2018", "splits": ["flow-balanced"]}, "expected 'csp-2018' among them"),
@@ -76,3 +80,104 @@ def test_a_protocol_that_there_is_not_is_a_usage_error(command):
     done = CliRunner().invoke(app, [*command, "--protocol", "mine"])
     assert done.exit_code == 2
     assert "expected one of csp, csp-2018" in done.stderr
+
+
+def refused(**options) -> str:
+    with pytest.raises(SettingError) as caught:
+        Settings(**options)
+    return str(caught.value)
+
+
+def test_a_file_is_found_above_and_its_paths_are_relative_to_it(tmp_path, monkeypatch):
+    (tmp_path / "tracklake.toml").write_text('lake = "data"\ncolumns = "/etc/columns.toml"\nworkers = 3\n')
+    assert Settings().lake == Path("data"), "as written where the file is in the working folder"
+    below = tmp_path / "a" / "b"
+    below.mkdir(parents=True)
+    monkeypatch.chdir(below)
+    found = Settings()
+    assert (found.lake, found.columns, found.workers) == (tmp_path / "data", Path("/etc/columns.toml"), 3)
+    (below / "tracklake.toml").write_text("workers = 5\n")
+    assert (Settings().workers, Settings().lake) == (5, Path("lake")), "the nearest file alone"
+
+
+def test_the_lakes_own_file_overrides_that_of_the_folder(tmp_path, monkeypatch):
+    own = tmp_path / "data" / "tracklake.toml"
+    own.parent.mkdir()
+    (tmp_path / "tracklake.toml").write_text(
+        'lake = "data"\nnearest = 1\nsplit_seed = 1\nworkers = 1\n[thresholds]\noverlap_m = 1\nhigh_jerk_mps3 = 1\n'
+    )
+    own.write_text("nearest = 2\nsplit_seed = 2\nworkers = 2\n[thresholds]\noverlap_m = 2\n")
+    monkeypatch.setenv("TRACKLAKE_SPLIT_SEED", "3")
+    monkeypatch.setenv("TRACKLAKE_WORKERS", "3")
+    found = Settings(workers=4)
+    assert (found.nearest, found.split_seed, found.workers) == (2, 3, 4)
+    assert found.thresholds == {"overlap_m": 2.0, "high_jerk_mps3": 1.0}
+    assert Settings(lake="elsewhere", workers=4).nearest == 1
+    monkeypatch.chdir(own.parent)
+    assert Settings(lake=".").nearest == 2, "one file, read once"
+    monkeypatch.chdir(tmp_path)
+    own.write_text('lake = "other"\n')
+    assert "data/tracklake.toml:1: a lake's own file names no lake" in refused()
+
+
+def test_what_is_wrong_is_named_with_its_place(tmp_path, monkeypatch):
+    (tmp_path / "tracklake.toml").write_text(
+        '# mine\nsplits = [\n  "csp-2018",\n  "no",\n]\nworker = 2\nmax_backward_share = 1.5\nsplit_block_s = nan\n'
+    )
+    said = refused().splitlines()
+    assert "tracklake.toml:6: setting worker: unknown setting; did you mean workers?" in said
+    assert "tracklake.toml:7: setting max_backward_share: expected 0 or more and 1 or less, got 1.5" in said
+    assert "tracklake.toml:8: setting split_block_s: expected a finite number, got nan" in said
+    assert any(line.startswith("tracklake.toml:2: setting splits.1: expected 'flow-balanced'") for line in said)
+    (tmp_path / "tracklake.toml").write_text("[thresholds]\nhigh_jerk_mps3 = 9\nhigh_acceleration_mps2 = -3\n")
+    message = "tracklake.toml:3: setting thresholds.high_acceleration_mps2: expected 0 or more (m/s2), got -3.0"
+    assert refused() == message
+    monkeypatch.setenv("TRACKLAKE_THRESHOLDS__HIGH_JERK_MPS3", "-1")
+    assert "TRACKLAKE_THRESHOLDS__HIGH_JERK_MPS3: setting thresholds.high_jerk_mps3: expected 0 or more" in refused()
+    monkeypatch.setenv("TRACKLAKE_THRESHOLDS", "{")
+    assert refused() == "TRACKLAKE_THRESHOLDS: expected JSON, got '{'"
+    monkeypatch.setenv("TRACKLAKE_THRESHOLDS", "")
+    assert refused(workers=0).startswith("setting workers: expected 1 or more, got 0")
+
+
+def test_variables_that_are_no_settings_are_named_and_harmless(monkeypatch):
+    monkeypatch.setenv("TRACKLAKE_WORKER", "3")
+    monkeypatch.setenv("TRACKLAKE_THRESHOLDS__OVERLAP_M", "0.5")
+    monkeypatch.setenv("TRACKLAKE_DEBUG", "0")
+    done = CliRunner().invoke(app, ["config"])
+    assert done.exit_code == 0
+    assert done.stderr == (
+        "warning: TRACKLAKE_WORKER: no setting has this name, so it has no effect; did you mean TRACKLAKE_WORKERS?\n"
+    )
+
+
+def test_config_shows_what_is_in_force_and_where_it_comes_from(tmp_path, monkeypatch):
+    (tmp_path / "tracklake.toml").write_text("nearest = 4\n[thresholds]\n\nhigh_jerk_mps3 = 12\n")
+    monkeypatch.setenv("TRACKLAKE_SPLIT_SEED", "7")
+    done = CliRunner().invoke(app, ["config", "--lake", "mine", "--protocol", "mha-2020", "--json"])
+    said = json.loads(done.stdout)
+    assert said["files"] == ["tracklake.toml"]
+    shown = {name: (row["value"], row["from"]) for name, row in said["settings"].items()}
+    expected = {
+        "lake": ("mine", "--lake"),
+        "protocol": ("mha-2020", "--protocol"),
+        "nearest": (4, "tracklake.toml:1"),
+        "split_seed": (7, "TRACKLAKE_SPLIT_SEED"),
+        "thresholds.high_jerk_mps3": (12.0, "tracklake.toml:4"),
+        "thresholds.high_acceleration_mps2": (3.05, "default"),
+        "min_future_s": (PROTOCOLS["mha-2020"].min_future_s, "protocol mha-2020"),
+        "validation_part": (False, "default"),
+    }
+    assert {name: shown[name] for name in expected} == expected
+    assert set(Settings.model_fields) == {name.partition(".")[0] for name in shown}
+    assert "settings: tracklake.toml\n" in CliRunner().invoke(app, ["validate"]).stdout, "commands name the file"
+    table = CliRunner().invoke(app, ["config"]).stdout
+    assert table.startswith("files: tracklake.toml\n")
+    assert [line.split() for line in table.splitlines() if line.startswith("thresholds.high_jerk")] == [
+        ["thresholds.high_jerk_mps3", "12.0", "tracklake.toml:4"]
+    ]
+
+
+def test_the_page_names_every_setting():
+    page = (Path(__file__).parents[2] / "docs" / "settings.md").read_text()
+    assert [name for name in Settings.model_fields if name not in page] == []

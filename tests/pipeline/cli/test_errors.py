@@ -90,7 +90,7 @@ def test_settings_that_cannot_be_read_are_a_usage_error(command, tmp_path, conte
 def test_a_variable_that_is_no_json_is_a_usage_error(command):
     done = command.here("validate", TRACKLAKE_THRESHOLDS="3 metres")
     assert done.code == 2
-    assert "thresholds" in done.err
+    assert "TRACKLAKE_THRESHOLDS: expected JSON, got '3 metres'" in done.err
     assert "Traceback" not in done.err
 
 

@@ -166,15 +166,33 @@ def test_thresholds_override_the_defaults():
     assert frame.select(rule.measure({**rule.defaults, "car_length_max_m": 6.0})).item() == 3.0
 
 
-def test_an_unknown_threshold_is_refused_with_the_known_ones():
-    with pytest.raises(ThresholdError, match=r"unknown name 'high_accel'.*high_acceleration_mps2"):
+def test_an_unknown_threshold_is_refused_with_the_nearest_known_one():
+    with pytest.raises(ThresholdError, match=r"high_accel: unknown name; did you mean high_acceleration_mps2\?"):
         resolve(RULES, {"high_accel": 3.0})
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "3", None, True])
 def test_a_threshold_must_be_a_finite_number(value):
-    with pytest.raises(ThresholdError, match="high_acceleration_mps2 must be a finite number"):
+    with pytest.raises(ThresholdError, match="high_acceleration_mps2: expected a finite number"):
         resolve(RULES, {"high_acceleration_mps2": value})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"high_acceleration_mps2": -3}, r"high_acceleration_mps2: expected 0 or more \(m/s2\), got -3"),
+        ({"backward_mps": 0.5}, r"backward_mps: expected 0 or less \(m/s\), got 0\.5"),
+        ({"car_length_min_m": 9}, "car_length_min_m to be no more than car_length_max_m, which are 9 and 8"),
+    ],
+)
+def test_thresholds_have_bounds(overrides, message):
+    with pytest.raises(ThresholdError, match=message):
+        resolve(RULES, overrides)
+
+
+def test_defaults_lie_within_their_bounds():
+    thresholds = [threshold for rule in RULES for threshold in rule.thresholds]
+    assert resolve(RULES, {each.name: each.default for each in thresholds}) == resolve(RULES)
 
 
 def test_rules_are_checkable_where_nothing_they_read_is_lacking():

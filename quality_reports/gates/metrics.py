@@ -1,0 +1,132 @@
+"""Metrics that quality gates compare: their names, and their values per subset, recording, dataset and lake."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tracklake.quality_reports.rules.registry import RULES
+from tracklake.quality_reports.summaries import Connection, collect_rules, query
+from tracklake.quality_reports.verdicts import VERDICTS, judge
+
+SCOPES = ("subset", "recording", "dataset", "lake")
+"""Scopes of metrics: what one value is of, the smallest first."""
+OF_RECORDINGS = SCOPES[1:]
+OF_RULES = ("subset", "dataset", "lake")
+LABEL = "text"
+"""Unit of metrics that are text."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of a lake, or a name by which a gate selects parts of it.
+
+    Args:
+        name: name in gates.
+        meaning: what it is, in words.
+        unit: SI symbol; `0 to 1`, `1` for counts, or `text`.
+        scopes: scopes in which it is known.
+        needs: what has to have run, or to be in the files, for its value to be known.
+        selects: whether it names parts of the lake and is no quality of them.
+        choices: all values of a text, where they are known.
+    """
+
+    name: str
+    meaning: str
+    unit: str = "1"
+    scopes: tuple[str, ...] = SCOPES
+    needs: str = "`tracklake validate`"
+    selects: bool = False
+    choices: tuple[str, ...] = ()
+
+
+RULE_FIGURES = {
+    "entries": ("entries that break the rule", "1"),
+    "entry_share": ("share of the entries that break it", "0 to 1"),
+    "vehicles": ("vehicles with an entry that breaks it", "1"),
+    "vehicle_share": ("share of the vehicles with one", "0 to 1"),
+    "runs": ("findings: runs of consecutive entries", "1"),
+    "worst": ("most extreme value", "the rule's"),
+}
+"""Meanings and units of the metrics of each rule, `RULE.NAME`."""
+
+METRICS: tuple[Metric, ...] = (
+    Metric("error_share", "share of the entries that break a rule of severity error", "0 to 1"),
+    Metric("warning_share", "share of the entries that break a rule of severity error or warning", "0 to 1"),
+    Metric("vehicle_error_share", "share of the vehicles with an error in any entry", "0 to 1"),
+    Metric("vehicle_warning_share", "share of the vehicles with an error or a warning in any entry", "0 to 1"),
+    Metric("excluded_subsets", "subsets kept out of samples and splits; of one subset 0 or 1"),
+    Metric(
+        "verdict",
+        "verdict of the report: 'usable', 'usable with care', 'not usable' or 'not checked'",
+        LABEL,
+        ("subset", "dataset"),
+        choices=VERDICTS,
+    ),
+    Metric("unchecked_rules", "rules that read a column which the source lacks", scopes=("subset",)),
+    Metric("speed_rms_mps", "root mean square of recorded - recomputed speed", "m/s", ("subset",)),
+    Metric("accel_rms_mps2", "root mean square of recorded - recomputed acceleration", "m/s2", ("subset",)),
+    Metric("spacing_rms_m", "root mean square of recorded headway - headway from positions", "m", ("subset",)),
+    Metric("worst_jerk_mps3", "greatest magnitude of the jerk", "m/s3"),
+    Metric("late_share", "late starts / starts that were judged", "0 to 1", needs="`tracklake repair` of a freeway"),
+    Metric("samples", "prediction origins", needs="`tracklake samples` of a freeway"),
+    Metric("kept_share", "samples / (samples + dropped)", "0 to 1", needs="`tracklake samples` of a freeway"),
+    Metric("subsets", "subsets in the lake", scopes=OF_RECORDINGS),
+    Metric("recordings", "recordings in the lake", scopes=("dataset", "lake")),
+    Metric("vehicles", "tracks", needs="a recording"),
+    Metric("entries", "rows of `tracks`", needs="a recording"),
+    Metric("flow_vphpl", "flow in vehicles per hour and lane", "veh/h/lane", ("subset",), "known lanes"),
+    Metric("rows_read", "data rows of the source files", scopes=OF_RECORDINGS, needs="`tracklake ingest`"),
+    Metric("rows_dropped", "data rows that were rejected", scopes=OF_RECORDINGS, needs="`tracklake ingest`"),
+    Metric("dropped_share", "rows_dropped / rows_read", "0 to 1", OF_RECORDINGS, "`tracklake ingest`"),
+    Metric("missing_entry_share", "announced entries that are missing", "0 to 1", OF_RECORDINGS, "an announced number"),
+    Metric(
+        "missing_vehicle_share", "announced vehicles that are missing", "0 to 1", OF_RECORDINGS, "an announced number"
+    ),
+    Metric("dataset", "highd, ngsim or custom", LABEL, SCOPES[:3], selects=True),
+    Metric("recording", "name of the recording", LABEL, SCOPES[:2], selects=True),
+    Metric("subset", "name of the subset", LABEL, SCOPES[:1], selects=True),
+    Metric("site", "place of the recording", LABEL, SCOPES[:2], selects=True),
+    Metric("origin", "recorded or synthetic", LABEL, SCOPES[:2], selects=True),
+    *(
+        Metric(
+            f"{rule.name}.{name}", meaning, unit, OF_RULES, "`tracklake validate`, and the columns that the rule reads"
+        )
+        for rule in RULES
+        for name, (meaning, unit) in RULE_FIGURES.items()
+    ),
+)
+"""Everything that a gate can name."""
+METRIC_BY_NAME = {metric.name: metric for metric in METRICS}
+
+Row = dict[str, Any]
+
+
+def collect_metrics(connection: Connection, names: Collection[str]) -> list[Row]:
+    """Return the values of metrics: a row per subset, recording and dataset, and one of the lake, as `scope` says.
+
+    Args:
+        connection: connection to a lake.
+        names: metrics that are needed; those of rules and the verdict are queried only for these.
+    """
+    rows = query(connection, "gate_metrics")
+    has_verdict = "verdict" in names
+    if not has_verdict and not any("." in name for name in names):
+        return rows
+    by_key = {(row["scope"], row["dataset"], row["subset"]): row for row in rows if row["scope"] != "recording"}
+    rules: Sequence[Any] = collect_rules(connection, RULES, {})
+    for rule in rules:
+        found = [("lake", rule["total"]), *(("dataset", row) for row in rule["datasets"])]
+        for scope, own in (*found, *(("subset", row) for row in rule["subsets"])):
+            row = by_key[scope, own.get("dataset"), own.get("subset")]
+            row |= {f"{rule['name']}.{figure}": own[figure] for figure in RULE_FIGURES}
+    if has_verdict:
+        for verdict in _judge(connection, rules):
+            scope = "dataset" if verdict["subset"] is None else "subset"
+            by_key[scope, verdict["dataset"], verdict["subset"]]["verdict"] = verdict["verdict"]
+    return rows
+
+
+def _judge(connection: Connection, rules: Sequence[Any]) -> Sequence[Any]:
+    """Return the verdicts of the report on subsets and datasets."""
+    subsets, scores, completeness = (query(connection, name) for name in ("subsets", "subset_scores", "completeness"))
+    return judge(subsets, scores, rules, completeness)
