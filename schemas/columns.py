@@ -6,15 +6,17 @@ catalog, the validation and the documentation all read that one declaration.
 
 import operator
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import pandera.polars as pa
 import polars as pl
-from pandera.errors import SchemaErrors
 
 from tracklake.schemas.errors import TracklakeError
+
+if TYPE_CHECKING:
+    import pandera.polars as pa
+    from pandera.errors import SchemaErrors
 
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
@@ -32,19 +34,9 @@ LONGITUDINAL_MANEUVERS = ("normal", "brake")
 DType = type[pl.DataType] | pl.DataType
 
 
-def column(
-    dtype: DType,
-    description: str,
-    *,
-    unit: str | None = None,
-    nullable: bool = False,
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
-    lt: float | None = None,
-    isin: tuple[str, ...] | None = None,
-) -> pa.Column:
-    """Declare one column of a table.
+@dataclass(frozen=True)
+class Column:
+    """Declaration of one column of a table.
 
     Args:
         dtype: Polars dtype, exact.
@@ -57,10 +49,60 @@ def column(
         lt: bound that a value stays under.
         isin: the only values.
     """
-    given = (("ge", ge), ("gt", gt), ("le", le), ("lt", lt), ("isin", isin))
-    checks = [getattr(pa.Check, name)(value) for name, value in given if value is not None]
-    return pa.Column(dtype, checks=checks, nullable=nullable, description=description, metadata={"unit": unit})
 
+    dtype: DType
+    description: str
+    _: KW_ONLY
+    unit: str | None = None
+    nullable: bool = False
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+    lt: float | None = None
+    isin: tuple[str, ...] | None = None
+
+    @property
+    def comment(self) -> str:
+        """Meaning with the unit before it, as shown in databases: `[m] front centre ...`."""
+        return self.description if self.unit is None else f"[{self.unit}] {self.description}"
+
+    def make_pandera_column(self) -> "pa.Column":
+        """Return the column as Pandera checks it."""
+        import pandera.polars as pa
+
+        given = ((name, getattr(self, name)) for name in (*BOUNDS, "isin"))
+        checks = [getattr(pa.Check, name)(limit) for name, limit in given if limit is not None]
+        return pa.Column(self.dtype, checks=checks, nullable=self.nullable, description=self.description)
+
+    def list_rules(self, values: pl.Expr) -> list[pl.Expr]:
+        """Return expressions, one boolean each, that are all true for a valid column; an empty one keeps every bound.
+
+        Args:
+            values: the column in a frame of the table's dtypes.
+        """
+        rules = [
+            holds(getattr(values, end)(), limit).fill_null(value=True)
+            for name, (holds, end) in BOUNDS.items()
+            if (limit := getattr(self, name)) is not None
+        ]
+        if self.isin is not None:
+            rules.append(values.is_in(list(self.isin)).all())
+        if not self.nullable:
+            rules.append(values.null_count() == 0)
+            if self.dtype in (pl.Float32, pl.Float64):
+                rules.append(~values.is_nan().any())
+        return rules
+
+
+BOUNDS: Mapping[str, tuple[Callable[[pl.Expr, Any], pl.Expr], str]] = {
+    "ge": (operator.ge, "min"),
+    "gt": (operator.gt, "min"),
+    "le": (operator.le, "max"),
+    "lt": (operator.lt, "max"),
+}
+"""Bounds of a column by name: the comparison, and whether the least or the greatest value is compared."""
+
+column = Column
 
 DATASET = column(pl.String, "ngsim, highd, or custom (read with --columns)", isin=DATASETS)
 SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording")
@@ -82,29 +124,6 @@ def key_increases(key: tuple[str, ...]) -> pl.Expr:
     return increases | (pl.int_range(pl.len()) == 0)
 
 
-_Translation = Callable[[pl.Expr, Mapping[str, Any]], pl.Expr]
-
-
-def _compare(statistic: str, holds: Callable[[pl.Expr, Any], pl.Expr], end: str) -> _Translation:
-    """Compare a bound with the column's least or greatest value; a column without values keeps every bound."""
-    return lambda values, given: holds(getattr(values, end)(), given[statistic]).fill_null(value=True)
-
-
-_AS_EXPRESSION: dict[str, _Translation] = {
-    "greater_than_or_equal_to": _compare("min_value", operator.ge, "min"),
-    "greater_than": _compare("min_value", operator.gt, "min"),
-    "less_than_or_equal_to": _compare("max_value", operator.le, "max"),
-    "less_than": _compare("max_value", operator.lt, "max"),
-    "isin": lambda values, given: values.is_in(list(given["allowed_values"])).all(),
-}
-"""Translations of Pandera's checks, by name, to one boolean per column."""
-
-
-def _unknown(_values: pl.Expr, _given: Mapping[str, Any]) -> pl.Expr:
-    """Return false for a check without translation, so that Pandera runs it."""
-    return pl.lit(value=False)
-
-
 @dataclass(frozen=True, eq=False)  # declared once and compared by identity, so that a table can be a key
 class Table:
     """Declaration of one table of the lake.
@@ -120,19 +139,22 @@ class Table:
     name: str
     meaning: str
     key: tuple[str, ...]
-    columns: Mapping[str, pa.Column]
+    columns: Mapping[str, Column]
     partition: tuple[str, ...] = ("dataset", "subset")
 
     @cached_property
     def dtypes(self) -> dict[str, pl.DataType]:
         """Column names and Polars dtypes, in order."""
-        return {name: declared.dtype.type for name, declared in self.schema.columns.items()}
+        kinds = {name: declared.dtype for name, declared in self.columns.items()}
+        return {name: kind() if isinstance(kind, type) else kind for name, kind in kinds.items()}
 
     @cached_property
-    def schema(self) -> pa.DataFrameSchema:
+    def schema(self) -> "pa.DataFrameSchema":
         """Pandera schema of the table: exactly these columns, no silent casts, the key sorted and unique."""
+        import pandera.polars as pa  # a third of the time that a query's command takes to start
+
         return pa.DataFrameSchema(
-            columns=dict(self.columns),
+            columns={name: declared.make_pandera_column() for name, declared in self.columns.items()},
             checks=[
                 pa.Check(
                     lambda data: data.lazyframe.select(key_increases(self.key)),
@@ -148,15 +170,12 @@ class Table:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float | None, float | None]]:
-        """Least and greatest value of the columns that declare one (`ge`, `le`)."""
-        found: dict[str, tuple[float | None, float | None]] = {}
-        for name, declared in self.columns.items():
-            limits: dict[str, float] = {}
-            for check in declared.checks:
-                limits |= check.statistics or {}
-            if "min_value" in limits or "max_value" in limits:
-                found[name] = (limits.get("min_value"), limits.get("max_value"))
-        return found
+        """Least and greatest value of the columns that declare a bound, itself included or not."""
+        limits = {
+            name: (one.gt if one.ge is None else one.ge, one.lt if one.le is None else one.le)
+            for name, one in self.columns.items()
+        }
+        return {name: found for name, found in limits.items() if found != (None, None)}
 
     @cached_property
     def required(self) -> frozenset[str]:
@@ -183,6 +202,8 @@ class Table:
         """
         if dict(frame.schema) == self.dtypes and frame.select(self._holds).item():
             return frame
+        from pandera.errors import SchemaErrors
+
         try:
             return self.schema.validate(frame, lazy=True)
         except SchemaErrors as broken:
@@ -192,18 +213,10 @@ class Table:
     def _holds(self) -> pl.Expr:
         """Expression that is true for a valid frame: all checks in one pass, where Pandera takes one for each.
 
-        Pandera then explains what is wrong with an invalid frame; a check that is not translated here leaves
-        every frame to it.
+        Pandera then explains what is wrong with an invalid frame.
         """
-        rules = [key_increases(self.key).all()]
-        for name, declared in self.schema.columns.items():
-            values = pl.col(name)
-            if not declared.nullable:
-                rules.append(values.null_count() == 0)
-                if self.dtypes[name].is_float():
-                    rules.append(~values.is_nan().any())
-            rules += [_AS_EXPRESSION.get(check.name, _unknown)(values, check.statistics) for check in declared.checks]
-        return pl.all_horizontal(rules)
+        rules = [rule for name, declared in self.columns.items() for rule in declared.list_rules(pl.col(name))]
+        return pl.all_horizontal(key_increases(self.key).all(), *rules)
 
     def describe(self) -> list[dict[str, str]]:
         """Describe each column in a row: column, dtype, unit, null, meaning."""
@@ -211,9 +224,9 @@ class Table:
             {
                 "column": name,
                 "dtype": "Enum" if isinstance(self.dtypes[name], pl.Enum) else str(self.dtypes[name]),
-                "unit": (declared.metadata or {}).get("unit") or "",
+                "unit": declared.unit or "",
                 "null": "yes" if declared.nullable else "",
-                "meaning": declared.description or "",
+                "meaning": declared.description,
             }
             for name, declared in self.columns.items()
         ]
@@ -222,7 +235,7 @@ class Table:
 class StructureError(TracklakeError):
     """A frame breaks the structural rules of its table; the recording it came from cannot enter the lake."""
 
-    def __init__(self, table: Table, where: str, broken: SchemaErrors) -> None:
+    def __init__(self, table: Table, where: str, broken: "SchemaErrors") -> None:
         """Put pandera's failure cases (never printed whole: one row per bad value) into a few lines."""
         cases: Any = broken.failure_cases
         lines = [

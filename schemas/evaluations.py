@@ -14,10 +14,9 @@ is judged by `nll_nats` alone. `average` is how n samples become one figure:
 Roots are taken last: rmse_m of `vehicles` is the root of the mean over vehicles of their mean squared distances.
 """
 
-import pandera.polars as pa
 import polars as pl
 
-from tracklake.schemas.columns import PARTS, Table, column
+from tracklake.schemas.columns import PARTS, Column, Table, column
 from tracklake.schemas.origin import DATA_ORIGINS
 
 ORIGINS = ("measured", "published")
@@ -35,12 +34,12 @@ history or the known future, and the others."""
 _OF_TICK = "at `seconds`"
 
 
-def _metres(description: str) -> pa.Column:
+def _metres(description: str) -> Column:
     """Declare a column of distances."""
     return column(pl.Float64, description, unit="m", nullable=True, ge=0)
 
 
-def _share(description: str) -> pa.Column:
+def _share(description: str) -> Column:
     """Declare a column of shares."""
     return column(pl.Float64, description, nullable=True, ge=0, le=1)
 

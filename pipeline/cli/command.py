@@ -13,6 +13,7 @@ import typer
 
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.logs import LOG, open_log
+from tracklake.pipeline.lake import follow_move
 from tracklake.pipeline.settings import DEBUG, Settings, find_unknown_variables, read_sources
 from tracklake.schemas.errors import TracklakeError, describe_bug
 from tracklake.schemas.text import make_visible
@@ -94,7 +95,7 @@ def read_settings(
     columns: Path | None = None,
     recording: str | None = None,
 ) -> Settings:
-    """Read the settings from files and environment, with the given flags on top.
+    """Read the settings from files and environment, flags on top; a moved lake gets its catalog again.
 
     Raises:
         SettingError: a setting is unknown, out of its bounds or cannot be read.
@@ -107,4 +108,5 @@ def read_settings(
     for source in read_sources(given) if LOG.isEnabledFor(logging.DEBUG) else ():
         if source.values:
             LOG.debug("settings from %s: %s", source.name, source.values)
+    follow_move(settings.lake)
     return settings

@@ -2,6 +2,7 @@
 
 import errno
 import sys
+from difflib import get_close_matches
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, BinaryIO, cast
@@ -15,6 +16,8 @@ from tracklake.pipeline.cli.options import LakeOption, require_choice
 from tracklake.pipeline.cli.tables import cut_text, print_table
 from tracklake.pipeline.lake import LakeResult, connect, query_errors, refuse_lake
 from tracklake.pipeline.lake import query as run_query
+from tracklake.pipeline.lake.catalog import list_columns, sql_type
+from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
@@ -32,22 +35,29 @@ MAX_ROWS = 40
 MAX_CELL_CHARS = 120
 """Longest cell printed in a terminal table, in characters."""
 
+LISTED = ("column", "type", "unit", "meaning")
+"""Headings of a table's columns."""
+
 NUMERIC = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UBIGINT", "UINTEGER", "FLOAT", "DOUBLE", "DECIMAL")
 """Beginnings of the names of DuckDB's types whose columns are aligned to the right."""
 
 
 def sql(
-    query: Annotated[str | None, typer.Argument(help="One SELECT; `-` reads it from standard input.")] = None,
+    query: Annotated[
+        str | None, typer.Argument(help="One SELECT; `-` reads it from standard input. With --list: a name.")
+    ] = None,
     lake: LakeOption = None,
     format: Annotated[str, typer.Option("--format", help="table, csv, json or parquet.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", help="Write the result to this file.")] = None,
-    names: Annotated[bool, typer.Option("--list", help="List the tables and macros, and what they are.")] = False,
+    names: Annotated[
+        bool, typer.Option("--list", help="List the tables and macros; with the name of one, its columns.")
+    ] = False,
 ) -> None:
     """Query the tables with SQL, read-only, from anywhere."""
     with command() as terminal:
         require_choice("--format", format, FORMATS)
         if names:
-            show_names(terminal)
+            show_names(terminal) if query is None else show_name(terminal, query)
             return
         refuse_lake(out)
         if query is None:
@@ -122,13 +132,37 @@ def _format_cell(value: object) -> str:
 def show_names(terminal: Terminal) -> None:
     """Print every table and macro with its meaning; they are the same in all lakes."""
     for title, meanings in (
-        ("Tables (columns: DESCRIBE tracks)", {table.name: _take_first_sentence(table.meaning) for table in TABLES}),
+        (
+            "Tables (columns: tracklake sql --list tracks)",
+            {table.name: _take_first_sentence(table.meaning) for table in TABLES},
+        ),
         ("Macros (call: FROM track('01-upper', 5))", {macro.signature: macro.meaning for macro in MACROS}),
     ):
         terminal.print_line(title, style="bold")
         width = max(map(len, meanings)) + 2
         for name, meaning in meanings.items():
             terminal.print_line(f"  {name:<{width}}{meaning}")
+
+
+def show_name(terminal: Terminal, name: str) -> None:
+    """Print the columns of a table with type, unit and meaning, or the parameters and columns of a macro.
+
+    Raises:
+        UsageError: no table or macro has this name.
+    """
+    table, macro = TABLE_BY_NAME.get(name), next((each for each in MACROS if each.name == name), None)
+    if table is not None:
+        columns = list_columns(table).items()
+        rows = [(column, sql_type(each.dtype), each.unit or "", each.description) for column, each in columns]
+        print_table(terminal, LISTED, rows, title=table.meaning, right=[False] * len(LISTED))
+    elif macro is not None:
+        terminal.print_line(macro.signature, style="bold")
+        terminal.print_line(macro.explanation)
+    else:
+        known = [*TABLE_BY_NAME, *(each.name for each in MACROS)]
+        near = get_close_matches(name, known, n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise UsageError(f"no table or macro {name!r}{hint} `tracklake sql --list` shows all.")
 
 
 def _take_first_sentence(text: str) -> str:

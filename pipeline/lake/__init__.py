@@ -15,7 +15,7 @@ from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest, load
 from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested
 from tracklake.pipeline.lake.session_end import is_settled
-from tracklake.pipeline.lake.writer import Writer, open_for_writing, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake.writer import Writer, follow_move, open_for_writing, refuse_foreign, refuse_if_busy
 
 __all__ = [
     "Commit",
@@ -34,6 +34,7 @@ __all__ = [
     "find_damaged_files",
     "find_free_path",
     "find_lake",
+    "follow_move",
     "is_intact",
     "is_settled",
     "list_ingested",

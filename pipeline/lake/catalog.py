@@ -1,4 +1,9 @@
-"""The catalog: views over the live Parquet files, table macros over the views, and catalog.duckdb with both."""
+"""The catalog: views over the live Parquet files, table macros over the views, and catalog.duckdb for other programs.
+
+Every program opens catalog.duckdb from any folder, also attached beside other catalogs: its paths are absolute, and its
+macros read the files themselves, as DuckDB looks for a macro's tables in the database in use. Tables of few rows are
+stored in it. A lake that was moved or copied gets another catalog when tracklake next opens it (`writer.follow_move`).
+"""
 
 import re
 import tempfile
@@ -14,6 +19,7 @@ from tracklake.pipeline.lake.files import STAGING, read_partition
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
+from tracklake.schemas.columns import Column
 from tracklake.schemas.files import write_file
 from tracklake.schemas.text import quote_shell
 
@@ -28,6 +34,9 @@ JOINED: dict[str, tuple[Table, tuple[str, ...]]] = {
     SUBSETS.name: (SUBSET_STATUS, ("backward_vehicles", "excluded", "excluded_reason")),
 }
 """Views that show columns of a later stage beside those that ingestion wrote."""
+
+STORED_ROWS = 20_000
+"""Most rows of a table that catalog.duckdb stores; a larger one is a view of its files."""
 
 _SQL_TYPES: dict[pl.DataType, str] = {
     pl.String(): "VARCHAR",
@@ -64,14 +73,10 @@ def escape_pattern(path: str) -> str:
     return re.sub(r"[*?\[]", r"[\g<0>]", path)
 
 
-def list_view_statements(manifest: Manifest, locate: Callable[[str], str]) -> list[str]:
-    """Return CREATE VIEW statements for every table of the lake.
-
-    Args:
-        manifest: live files of the lake.
-        locate: turns a path relative to the lake into the path to write into the view.
-    """
-    return [f'CREATE VIEW "{table.name}" AS {_write_select(table, manifest, locate)}' for table in TABLES]
+def list_columns(table: Table) -> dict[str, Column]:
+    """Return the columns that a table has in SQL: its own, and those of a later stage."""
+    later, names = JOINED.get(table.name, (table, ()))
+    return {**table.columns, **{name: later.columns[name] for name in names}}
 
 
 def _write_select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
@@ -93,56 +98,66 @@ def _write_read(table: Table, manifest: Manifest, locate: Callable[[str], str]) 
     if not files:
         columns = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.dtypes.items())
         return f"SELECT {columns} WHERE false"
-    columns = ", ".join(f'"{name}"' for name in table.dtypes)
+    # Qualified, as a macro's parameter takes the place of every other name like it.
+    columns = ", ".join(f'file."{name}"' for name in table.dtypes)
     if not table.partition:
-        return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = false)"
+        return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = false) AS file"
     if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
         # A folder above the lake looks like a partition, and DuckDB would believe it.
         return " UNION ALL ".join(_write_read_of_file(table, path, locate) for path in paths)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
-    return (
-        f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = true, hive_types = {{{types}}})"
-    )
+    options = f"hive_partitioning = true, hive_types = {{{types}}}"
+    return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], {options}) AS file"
 
 
 def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
     stated = read_partition(table, path)
     columns = ", ".join(
-        f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'"{name}"'
+        f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'file."{name}"'
         for name, dtype in table.dtypes.items()
     )
-    return f"SELECT {columns} FROM read_parquet([{quote(locate(path))}], hive_partitioning = false)"
+    return f"SELECT {columns} FROM read_parquet([{quote(locate(path))}], hive_partitioning = false) AS file"
 
 
-def create_views(
-    connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest, locate: Callable[[str], str]
-) -> None:
+def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest) -> None:
     """Create the views, the macros over them, and a comment on each with its meaning.
 
     Args:
         connection: connection to an empty database.
-        root: the lake's folder, for messages.
+        root: the lake's folder.
         manifest: live files of the lake.
-        locate: turns a path relative to the lake into the path to write into the views.
 
     Raises:
         LakeError: a live file is missing or unreadable.
     """
-    import duckdb
-
-    for table, statement in zip(TABLES, list_view_statements(manifest, locate), strict=True):
-        try:
-            connection.execute(statement)
-        except duckdb.Error as failed:
-            reason = str(failed).splitlines()[0]
-            raise LakeError(
-                f"{root}: the table `{table.name}` cannot be read: {reason}\nIf its files were removed or damaged, "
-                f"`tracklake run SOURCE --lake {quote_shell(root)}` on the raw files makes them again."
-            ) from failed
+    for name, select in _write_selects(root, manifest).items():
+        _create(connection, root, name, f'CREATE VIEW "{name}" AS {select}')
+    for table in TABLES:
         connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
     for macro in MACROS:
         connection.execute(macro.statement)
         connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
+
+
+def _write_selects(root: Path, manifest: Manifest) -> dict[str, str]:
+    """Return a SELECT of the live rows of every table, by name."""
+    folder = str(root.resolve())
+    return {
+        table.name: _write_select(table, manifest, lambda path: escape_pattern(f"{folder}/{path}")) for table in TABLES
+    }
+
+
+def _create(connection: "duckdb.DuckDBPyConnection", root: Path, name: str, statement: str) -> None:
+    import duckdb
+
+    try:
+        connection.execute(statement)
+    except duckdb.Error as failed:
+        reason = str(failed).splitlines()[0]
+        raise LakeError(
+            f"{root}: the table `{name}` cannot be read: {reason}\nIf its files were removed or damaged, "
+            f"`tracklake run SOURCE --lake {quote_shell(root)}` on the raw files makes them again."
+        ) from failed
 
 
 def rebuild_catalog(root: Path, manifest: Manifest) -> None:
@@ -161,20 +176,48 @@ def rebuild_catalog(root: Path, manifest: Manifest) -> None:
 
 
 def build_catalog(root: Path, manifest: Manifest) -> bytes:
-    """Return the content of catalog.duckdb, whose views hold paths relative to the lake's folder.
+    """Return the content of catalog.duckdb for a lake where it stands now.
 
-    It is made in a temporary folder, where the lake goes by a link. Views are checked on creation against files
-    relative to DuckDB's search path, which is a list of patterns without a way to quote, and "?" in a database's path
-    starts its options; a lake may be called "a,b" or "c[1]?".
+    Raises:
+        LakeError: a live file is missing or unreadable.
     """
+    try:
+        return _build_catalog(root, manifest, STORED_ROWS)
+    except LakeError:
+        return _build_catalog(root, manifest, 0)  # a view needs its first file only, and the others may be made again
+
+
+def _build_catalog(root: Path, manifest: Manifest, stored_rows: int) -> bytes:
+    """Return the catalog's content; tables of at most so many rows are stored in it."""
     import duckdb
 
+    selects = _write_selects(root, manifest)
+    # In a temporary folder, as DuckDB takes "?" in a database's path for the start of its options.
     with tempfile.TemporaryDirectory() as elsewhere:
-        made, link = Path(elsewhere) / CATALOG, Path(elsewhere) / "lake"
-        link.symlink_to(root.resolve(), target_is_directory=True)
-        with duckdb.connect(str(made)) as connection:
-            connection.execute(f"SET file_search_path = {quote(str(link))}")
+        made = Path(elsewhere) / CATALOG
+        with duckdb.connect(str(made), config={"threads": 1}) as connection:  # small files: more only wait
             connection.begin()  # or each statement is written to disk by itself
-            create_views(connection, root, manifest, locate=str)
+            for table in TABLES:
+                rows = sum(file.rows or 0 for file in manifest.live(table.name))
+                kind = "TABLE" if rows <= stored_rows else "VIEW"
+                _create(connection, root, table.name, f'CREATE {kind} "{table.name}" AS {selects[table.name]}')
+                connection.execute(";".join(_write_comments(table, kind)))
+            for macro in MACROS:
+                connection.execute(re.sub(r"\bmain\.(\w+)", lambda found: f"({selects[found[1]]})", macro.statement))
+                connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
             connection.commit()
         return made.read_bytes()
+
+
+def _write_comments(table: Table, kind: str) -> list[str]:
+    """Return the statements that write the meaning of a table and the unit and meaning of its columns into a database.
+
+    Args:
+        table: declaration of the table.
+        kind: TABLE or VIEW.
+    """
+    columns = list_columns(table).items()
+    return [
+        f'COMMENT ON {kind} "{table.name}" IS {quote(table.meaning)}',
+        *(f'COMMENT ON COLUMN "{table.name}"."{name}" IS {quote(declared.comment)}' for name, declared in columns),
+    ]

@@ -10,6 +10,7 @@ from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME, TENSORS, scan
 from tracklake.pipeline.lake.manifest import MANIFEST, load
 from tracklake.pipeline.lake.query import LakeConnection, LakeResult, Parameters, connect
+from tracklake.pipeline.lake.writer import follow_move
 
 if TYPE_CHECKING:
     from tracklake.training.data.tensor_folder import TensorFolder
@@ -31,6 +32,7 @@ class Lake:
         self._connection: LakeConnection | None = None
         self._state: tuple[int, int] | None = None
         load(self.path)
+        follow_move(self.path)
 
     def sql(self, query: str, parameters: Parameters | None = None) -> LakeResult:
         """Run one SELECT over the tables and macros.

@@ -218,7 +218,7 @@ def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection
             "allow_community_extensions": False,
         },
     )
-    create_views(connection, root, manifest, locate=lambda path: escape_pattern(str(root / path)))
+    create_views(connection, root, manifest)
     live = [str(root / file.path) for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
     allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})

@@ -12,7 +12,9 @@ from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import list_unfinished, write_file
 
 SESSION = ".session"
-"""File of the lake with the checksums of the manifest and the catalog at the end of the last session."""
+"""File of the lake with its place and the checksums of manifest and catalog at the end of the last session."""
+LOCATION = "location"
+"""Key of the lake's folder in that file."""
 LOCK = ".lock"
 """Name of the lock's file in the lake; it names the process that writes, and is empty after a session's end."""
 
@@ -31,7 +33,7 @@ def is_settled(root: Path, manifest: Manifest) -> bool:
 
 
 def has_ended(root: Path, manifest: Manifest) -> bool:
-    """Return whether a session's end has been reached since the manifest and the catalog were changed.
+    """Return whether a session's end has been reached since the manifest, the catalog or the lake's place was changed.
 
     The catalog is then the one made of this manifest, the live folders show what is live, and nothing is left lying.
     """
@@ -45,5 +47,17 @@ def has_ended(root: Path, manifest: Manifest) -> bool:
     return not leftovers and not find_orphans(root, manifest) and is_shown(root, manifest)
 
 
+def has_moved(root: Path) -> bool:
+    """Return whether a lake stands elsewhere than at the end of its last session, where its catalog still leads."""
+    try:
+        ended = read_json(root / SESSION)
+        if not isinstance(ended, dict) or ended.get(LOCATION) == str(root.resolve()):
+            return False
+        return bool(ended.get(MANIFEST) == hash_file(root / MANIFEST, again=True))  # else its session's end is missing
+    except (OSError, ValueError):
+        return False
+
+
 def _describe_state(root: Path) -> dict[str, str]:
-    return {name: hash_file(root / name, again=True) for name in (MANIFEST, CATALOG)}
+    checksums = {name: hash_file(root / name, again=True) for name in (MANIFEST, CATALOG)}
+    return {LOCATION: str(root.resolve()), **checksums}

@@ -16,6 +16,7 @@ from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissi
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
 from tracklake.pipeline.lake.rebuild import start_rebuild
 from tracklake.pipeline.lake.session_end import LOCK
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
 
 KEPT_GENERATIONS = 2
@@ -37,9 +38,10 @@ os.register_at_fork(after_in_child=_release_locks)
 class Writer:
     """The only process that changes a lake; made by `open_for_writing`."""
 
-    def __init__(self, root: Path, manifest: Manifest) -> None:
+    def __init__(self, root: Path, manifest: Manifest, *, has_catalog: bool) -> None:
         self.root = root
         self.manifest = manifest
+        self._cataloged = manifest if has_catalog else None
         self._generation = manifest.generation + 1
         self._guard = threading.Lock()
         self._process = os.getpid()
@@ -84,14 +86,15 @@ class Writer:
                 self._store(replace(self.manifest, ingested_from=origins))
 
     def finish(self) -> None:
-        """Rebuild the catalog, then delete what neither it nor a reader of the one before needs: a session's last step.
+        """Bring the catalog up to date and delete what neither it nor a reader of the one before needs.
 
         Raises:
             LakeError: live files were removed or damaged by others, so that there is no catalog to make.
         """
         with self._guard:
             self._refuse_child()
-            catalog.rebuild_catalog(self.root, self.manifest)
+            if self._cataloged != self.manifest:
+                catalog.rebuild_catalog(self.root, self.manifest)
             live_folders.show_manifest(self.root, self.manifest)
             limit = self.manifest.generation - KEPT_GENERATIONS
             old = [item for item in self.manifest.retired if item.generation <= limit]
@@ -115,7 +118,7 @@ class Writer:
 
 @contextmanager
 def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
-    """Lock a lake (making it where there is none) and yield its writer; the catalog is rebuilt at the end.
+    """Lock a lake (making it where there is none) and yield its writer; its catalog is brought up to date at the end.
 
     The lock is the kernel's: it goes with the process, however that ends, and is not inherited by children. With
     `rebuild` nothing is live at first, whatever schema version the lake is of.
@@ -138,6 +141,15 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
         if descriptor in _HELD:  # not in a forked child, which closed it
             _HELD.discard(descriptor)
             os.close(descriptor)
+
+
+def follow_move(root: Path) -> None:
+    """Make the catalog of a lake that was moved or copied again, where it can be written and nobody does."""
+    if os.access(root, os.W_OK) and session_end.has_moved(root):
+        with suppress(TracklakeError, OSError):
+            refuse_if_busy(root)
+            catalog.rebuild_catalog(root, load(root))
+            session_end.record_end(root)
 
 
 def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
@@ -197,14 +209,16 @@ def _open_writer(root: Path, *, rebuild: bool) -> Writer:
     if adopted != manifest:
         manifest = adopted
         store_manifest(root, manifest)
+    has_catalog = False
     if is_new:
         live_folders.show_manifest(root, manifest)
     elif not session_end.has_ended(root, manifest):
         # Readers of the catalog must not fall behind by more generations than files are kept for.
         with suppress(LakeError):  # files are missing: this session may be the one that makes them again
             catalog.rebuild_catalog(root, manifest)
+            has_catalog = True
         live_folders.show_manifest(root, manifest)
-    return Writer(root, manifest)
+    return Writer(root, manifest, has_catalog=has_catalog)
 
 
 def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:

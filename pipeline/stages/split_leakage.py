@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest
-from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
+from tracklake.pipeline.lake.catalog import create_views, quote
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS, Table
@@ -85,7 +85,7 @@ def open_tables(root: Path, manifest: Manifest) -> "duckdb.DuckDBPyConnection":
     connection = duckdb.connect(":memory:")
     (root / STAGING).mkdir(exist_ok=True)
     connection.execute(f"SET temp_directory = {quote(str(root.resolve() / STAGING / 'duckdb'))}")
-    create_views(connection, root, manifest, locate=lambda path: escape_pattern(str(root.resolve() / path)))
+    create_views(connection, root, manifest)
     return connection
 
 

@@ -95,9 +95,8 @@ def test_an_empty_frame_is_admitted(table):
 
 def a_value(declared, dtype):
     """One that the column admits: 1 lies within the bounds of all numbers that are declared."""
-    for check in declared.checks:
-        if check.name == "isin":
-            return check.statistics["allowed_values"][0]
+    if declared.isin is not None:
+        return declared.isin[0]
     if isinstance(dtype, pl.Enum):
         return dtype.categories[0]
     if dtype == pl.String:
@@ -106,7 +105,7 @@ def a_value(declared, dtype):
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_the_tables_of_the_lake_leave_no_check_untranslated(table):
+def test_the_tables_of_the_lake_admit_what_their_columns_admit(table):
     row = {name: [a_value(declared, table.dtypes[name])] for name, declared in table.columns.items()}
     frame = pl.DataFrame(row, schema=table.dtypes, strict=False)
     assert frame.null_count().sum_horizontal().item() == 0

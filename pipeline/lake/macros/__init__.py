@@ -35,6 +35,12 @@ class Macro:
         """For instance `track(subset, vehicle)`."""
         return f"{self.name}({', '.join(self.parameters)})"
 
+    @property
+    def explanation(self) -> str:
+        """Text of the header: the meaning, notes, and what parameters and columns mean."""
+        lines = self.statement.partition("\nCREATE MACRO")[0].splitlines()
+        return "\n".join(line.removeprefix("--").removeprefix(" ") for line in lines)
+
 
 _HEADER = re.compile(r"\A-- (?P<meaning>[^\n]+)\n(?:--[^\n]*\n)*CREATE MACRO (?P<name>\w+)\((?P<parameters>[\w, ]+)\)")
 

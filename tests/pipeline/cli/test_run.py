@@ -223,9 +223,8 @@ def test_the_report_stands_alone(lake):
     assert quality["schema"].startswith("tracklake/quality/")
 
 
-def test_the_catalog_opens_with_the_plain_client_in_the_lakes_folder(lake, monkeypatch):
-    monkeypatch.chdir(lake.root)
-    with duckdb.connect("catalog.duckdb", read_only=True) as plain:
+def test_the_catalog_opens_with_the_plain_client_from_any_folder(lake):
+    with duckdb.connect(str(lake.root / "catalog.duckdb"), read_only=True) as plain:
         for table in TABLES:
             plain.sql(f'SELECT count(*) FROM "{table.name}"').fetchone()
         assert plain.sql("SELECT count(*) FROM tracks").fetchone() == (lake.said["headline"]["entries"],)

@@ -2,6 +2,7 @@
 
 import os
 import pty
+import re
 import subprocess
 import sys
 
@@ -53,6 +54,16 @@ def test_the_listing_needs_no_lake(command, tmp_path):
     assert done.code == 0
     assert "tracks " in done.out
     assert "track(subset, vehicle)" in done.out
+
+
+def test_the_listing_of_a_name_says_what_its_columns_are(command):
+    listed = command.here("sql", "--list", "vehicles").out
+    assert re.search(r"^length_m +FLOAT +m +along the direction of travel$", listed, flags=re.MULTILINE)
+    assert re.search(r"^starts_late +BOOLEAN +eligible and first seen", listed, flags=re.MULTILINE)
+    assert "\ndistance_m: from the point to the vehicle's front centre\n" in command.here("sql", "near", "--list").out
+    wrong = command.here("sql", "--list", "trakcs")
+    assert wrong.code == 2
+    assert "no table or macro 'trakcs'; did you mean tracks?" in wrong.err
 
 
 def test_a_wrong_name_gets_duckdbs_guess_and_what_there_is(command, lake):

@@ -1,5 +1,7 @@
 """The lake as SQL: the views, their types, odd folder names, moved lakes, and what the sandbox admits."""
 
+import errno
+import os
 import re
 import shutil
 import subprocess
@@ -13,11 +15,23 @@ import polars as pl
 import pytest
 from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
 
-from tracklake.pipeline.lake import QueryError, connect, load, open_for_writing, query, query_errors, scan
+from tracklake.pipeline.lake import (
+    QueryError,
+    catalog,
+    connect,
+    is_settled,
+    load,
+    open_for_writing,
+    query,
+    query_errors,
+    scan,
+)
 from tracklake.pipeline.lake.errors import DamagedFileError
+from tracklake.pipeline.lake.lake import open_lake
 from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
+from tracklake.schemas.errors import FileAccessError
 
 SQL_NAMES = {
     pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
@@ -73,19 +87,24 @@ def build(root: Path) -> None:
         writer.commit(put(root, "d", 1, make_splits(2), SPLITS))
 
 
+def refuse_to_write(target: Path, _content: bytes) -> None:
+    """As on a file system mounted read-only."""
+    raise FileAccessError(f"{target}: {os.strerror(errno.EROFS)}")
+
+
 def types_of(connection: duckdb.DuckDBPyConnection, view: str) -> dict[str, str]:
     return {name: kind.replace('"', "") for name, kind, *_ in connection.execute(f'DESCRIBE "{view}"').fetchall()}
 
 
-@pytest.mark.parametrize("filled", [False, True])
-def test_every_view_has_the_declared_columns_and_types(tmp_path: Path, monkeypatch, filled: bool):
+@pytest.mark.parametrize(("filled", "stored"), [(False, 20_000), (True, 20_000), (True, 0)])
+def test_every_table_has_the_declared_columns_and_types(tmp_path: Path, monkeypatch, filled: bool, stored: int):
+    monkeypatch.setattr(catalog, "STORED_ROWS", stored)
     if filled:
         build(tmp_path)
     else:
         with open_for_writing(tmp_path):
             pass
-    monkeypatch.chdir(tmp_path)
-    with connect(tmp_path) as ours, duckdb.connect("catalog.duckdb", read_only=True) as plain:
+    with connect(tmp_path) as ours, duckdb.connect(str(tmp_path / "catalog.duckdb"), read_only=True) as plain:
         for connection in (ours, plain):
             names = {name for (name,) in connection.execute("SHOW TABLES").fetchall()}
             assert names == {table.name for table in TABLES}
@@ -93,6 +112,15 @@ def test_every_view_has_the_declared_columns_and_types(tmp_path: Path, monkeypat
                 declared = {name: sql_name(dtype) for name, dtype in table.dtypes.items()}
                 found = types_of(connection, table.name)
                 assert list(found.items()) == list((declared | JOINED.get(table.name, {})).items()), table.name
+        views = plain.execute("SELECT view_name FROM duckdb_views() WHERE NOT internal").fetchall()
+        assert {name for (name,) in views} == {
+            t.name for t in TABLES if sum(file.rows for file in load(tmp_path).live(t.name)) > stored
+        }
+        comments = plain.execute("SELECT table_name, column_name, comment FROM duckdb_columns() WHERE NOT internal")
+        said = {(table, column): comment for table, column, comment in comments.fetchall()}
+        assert said["tracks", "speed_mps"].startswith("[m/s] recorded, signed along the direction of travel: ")
+        assert said["vehicles", "starts_late"] == "eligible and first seen beyond the cut-off"
+        assert all(said.values())
 
 
 def test_the_views_join_what_later_stages_found_out(tmp_path: Path):
@@ -141,7 +169,9 @@ def test_a_lake_may_be_called_anything(tmp_path: Path, monkeypatch: pytest.Monke
         asked = "SELECT dataset, subset, backward_vehicles FROM subset_status ORDER BY 2"
         rows = [("highd", "01-lower", 2), ("highd", "01-upper", 2)]
         assert query(connection, asked).fetchall() == rows
-        monkeypatch.chdir(root)
+        monkeypatch.setattr(catalog, "STORED_ROWS", 0)
+        write_round(root, 2)
+        monkeypatch.chdir(root)  # for DuckDB, "?" ends a database's path
         with duckdb.connect("catalog.duckdb", read_only=True) as plain:
             assert plain.execute(asked).fetchall() == rows
     frame = scan(root, load(root), SUBSET_STATUS).sort("subset").collect()
@@ -196,6 +226,32 @@ def test_a_moved_lake_works_from_anywhere(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path / "far" / "after")
     write_round(Path(), 3)
     check_lake(Path())
+
+
+def read_catalog(root: Path) -> list[tuple[object, ...]]:
+    with duckdb.connect(str(root / "catalog.duckdb"), read_only=True) as plain:
+        return plain.execute("SELECT subset, backward_vehicles FROM subset_status ORDER BY 1").fetchall()
+
+
+def test_the_catalog_of_a_moved_or_copied_lake_is_made_again_by_whoever_opens_it(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(catalog, "STORED_ROWS", 0)
+    before, moved, copy = (tmp_path / name for name in ("before", "moved", "copy"))
+    write_round(before, 2)
+    expected = read_catalog(before)
+    shutil.copytree(before, copy)
+    before.rename(moved)
+    for root in (moved, copy):
+        with pytest.raises(duckdb.Error, match="before"):
+            read_catalog(root)
+        with monkeypatch.context() as patched:  # a lake that cannot be written to is read all the same
+            patched.setattr(catalog, "write_file", refuse_to_write)
+            assert open_lake(root).sql("SELECT count(*) FROM subset_status").fetchall() == [(2,)]
+        open_lake(root)
+        assert read_catalog(root) == expected
+        assert is_settled(root, load(root))
+        made = (root / "catalog.duckdb").stat().st_mtime_ns
+        open_lake(root)
+        assert (root / "catalog.duckdb").stat().st_mtime_ns == made
 
 
 # ------------------------------------------------------------------------------------------- the sandbox

@@ -26,7 +26,7 @@ from small_lake import (
     write_round,
 )
 
-from tracklake.pipeline.lake import is_settled, load, open_for_writing, scan
+from tracklake.pipeline.lake import follow_move, is_settled, load, open_for_writing, scan
 from tracklake.pipeline.lake.live_folders import list_names
 from tracklake.schemas import SUBSET_STATUS
 
@@ -135,12 +135,14 @@ def test_a_copied_or_moved_lake_is_right_and_linked_again(tmp_path: Path, with_t
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "lake", copy, copy_function=shutil.copy2 if with_times else shutil.copy)
     assert read_folder(copy)["backward_vehicles"].to_list() == [1, 1]
+    assert not is_settled(copy, load(copy))  # its catalog leads to the other lake
+    follow_move(copy)
     assert is_settled(copy, load(copy)) == with_times
     with open_for_writing(copy):
         pass
     check_folder(copy, linked=True)
     (tmp_path / "lake").rename(tmp_path / "moved")
-    assert is_settled(tmp_path / "moved", load(tmp_path / "moved"))
+    assert not is_settled(tmp_path / "moved", load(tmp_path / "moved"))
     write_round(tmp_path / "moved", 2)
     check_folder(tmp_path / "moved", linked=True)
 

@@ -105,13 +105,16 @@ def test_a_querys_own_tables_do_not_take_the_lakes_place(opened: LakeConnection,
     assert opened.sql(f"WITH {own} FROM {call(name)}").fetchall() == expected
 
 
-def test_the_catalog_carries_the_macros_also_after_a_move(opened, several: Path, tmp_path: Path, monkeypatch):
-    shutil.copytree(several, tmp_path / "moved")
-    monkeypatch.chdir(tmp_path / "moved")
-    with duckdb.connect("catalog.duckdb", read_only=True) as plain:
+def test_the_catalogs_macros_read_their_own_lake_also_beside_another(opened, several: Path, tmp_path: Path):
+    put_subset(tmp_path / "other", [{**row, "x_m": row["x_m"] + 10.0} for row in PAIRS], subset="a")
+    with duckdb.connect() as plain:
+        for name, root in (("other", tmp_path / "other"), ("several", several)):
+            plain.execute(f"ATTACH '{root / 'catalog.duckdb'}' AS {name} (READ_ONLY)")
+        plain.execute("USE other")
         for name in CALLS:
-            query = f"FROM {call(name)}"
-            assert plain.sql(query).fetchall() == opened.sql(query).fetchall(), name
+            assert plain.sql(f"FROM several.{call(name)}").fetchall() == opened.sql(f"FROM {call(name)}").fetchall()
+        moved = plain.sql("SELECT max(x_m) FROM track('a', 1)").fetchone()
+        assert moved == plain.sql("SELECT max(x_m) + 10 FROM several.track('a', 1)").fetchone()
 
 
 @pytest.mark.parametrize("macro", MACROS, ids=lambda macro: macro.name)
