@@ -29,8 +29,9 @@ $(INSTALLED): pyproject.toml
 run: install
 	$(BIN)/tracklake run $(ARGS)
 
+# Bytecode is kept, whatever the environment says: tests start many commands.
 test: install
-	$(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
+	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
 
 # mypy and import-linter read folders, not what an import finds: links give the packages their installed names.
 lint: install

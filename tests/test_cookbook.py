@@ -79,7 +79,7 @@ CALLS = {
 
 @pytest.mark.parametrize("macro", MACROS, ids=lambda macro: macro.name)
 def test_a_macro_reads_one_partition_of_the_lakes_many(asked, macro):
-    """Of every table, by what DuckDB says it did."""
+    """Every table is read from one file only, as the plan of DuckDB says."""
     plan = asked.sql(f"EXPLAIN (ANALYZE, FORMAT json) FROM {macro.name}({CALLS[macro.name]})").fetchall()[0][1]
     scans = plan.count('"Function": "READ_PARQUET"')
     assert scans >= 1
@@ -147,7 +147,7 @@ def test_the_carriageways_flow_is_that_of_all_entries(asked):
 
 
 def test_the_flow_of_a_subset_is_the_mean_of_its_main_lanes(asked):
-    """By the macro, over the whole recording; the vehicles seen in a short one are many more."""
+    """The flow over the whole recording is that of the macro; a short one counts many more vehicles per second."""
     found = asked.sql(
         "SELECT s.subset, any_value(flow_vphpl) AS flow, sum(f.flow_veh_per_h) / any_value(s.lanes) AS mean_of_lanes, "
         "any_value(3600 * vehicles_per_lane_s) AS seen FROM subsets AS s, flow_density(s.subset, 1000000) AS f "

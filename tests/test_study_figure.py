@@ -25,7 +25,7 @@ HAND = table(
 
 
 def test_means_and_bands_over_seeds_by_hand():
-    """Of lstm on NGSIM-like: growth 1 then 2 with seed 0, 2 then 5 with seed 1."""
+    """Errors of lstm on an NGSIM-like study: growth 1 then 2 with seed 0, 2 then 5 with seed 1."""
     rows = summarise_seeds(HAND).to_dicts()
     assert [(row["model"], row["dataset"], row["seconds"]) for row in rows] == [
         ("lstm", "NGSIM-like", 0.2),

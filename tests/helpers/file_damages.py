@@ -46,7 +46,7 @@ def write_old_torch_code(path):
 
 
 def flip_a_bit(path):
-    """In a weight: the file is as long, and torch reads it as if nothing were wrong."""
+    """Change a byte of a weight: the file is as long, and torch reads it as if nothing were wrong."""
     content = torch.load(path, weights_only=True)
     weight = content.get("network", content)["first.weight"].numpy().tobytes()
     data = bytearray(path.read_bytes())

@@ -24,12 +24,11 @@ def high_accelerations(root) -> dict[str, tuple]:
 
 @pytest.fixture(scope="module")
 def pair(make_lake, sample, empty_charts, tmp_path_factory) -> Path:
-    """A lake of two recordings of the sample, in which accelerations are found."""
+    """A lake of two subsets of the sample, in which accelerations are found."""
     del empty_charts
     raw = tmp_path_factory.mktemp("pair")
-    for number in ("01", "04"):
-        for kind in KINDS:
-            shutil.copy(sample / f"{number}_{kind}.csv", raw)
+    for kind in KINDS:
+        shutil.copy(sample / f"01_{kind}.csv", raw)
     return make_lake(raw).root
 
 
@@ -39,7 +38,7 @@ def copied(lake, tmp_path):
 
 
 def test_a_copy_is_said_to_be_equal(command, lake, copied):
-    done = command.alone("report", "--lake", copied, "--compare", lake.root)
+    done = command.here("report", "--lake", copied, "--compare", lake.root)
     assert (done.code, done.err) == (0, "")
     page = copied / "reports" / "compare.html"
     assert "nothing to do: the lake is up to date\n" in done.out

@@ -154,7 +154,7 @@ def test_devices_are_written_to_and_not_replaced(command, lake):
 
 @pytest.mark.parametrize("folder", ["/proc/self/fd", "/dev/fd"])
 def test_an_open_descriptor_is_written_where_it_stands(tmp_path, folder):
-    """As with `>file`, where what others write through the descriptor comes before and behind."""
+    """Standard output is a file, as with `>file`: others write to it before and after."""
     with (tmp_path / "out").open("wb", buffering=0) as stream:
         stream.write(b"before\n")
         link = tmp_path / "link"

@@ -72,31 +72,24 @@ def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path, m
     assert count(tmp_path / "lake") == 20
 
 
-def test_stages_refuse_what_was_made_with_other_settings(command, lake, tmp_path):
+def test_what_was_made_with_other_settings_is_refused_or_skipped(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)
+    assert command.here("train", "lstm", "--lake", copy, "--seconds", "0.5", "--name", "old").code == 0
     strict = {"TRACKLAKE_MAX_BACKWARD_SHARE": "0"}
+    full = {**strict, "TRACKLAKE_MIN_FUTURE_S": "5"}
     assert command.here("validate", "--lake", copy, **strict).code == 0
     stale = command.here("split", "--lake", copy, **strict)
     assert stale.code == 1
     assert "Run `tracklake samples` first" in stale.err
     for stage in ("samples", "split", "tensors"):
-        assert command.here(stage, "--lake", copy, **strict).code == 0
+        assert command.here(stage, "--lake", copy, **full).code == 0
     with connect(copy) as connection:
         query = "SELECT count(*) FROM splits JOIN subsets USING (dataset, subset) WHERE excluded"
         assert connection.sql(query).fetchall() == [(0,)]
-    other = command.here("evaluate", "--lake", copy, TRACKLAKE_MIN_FUTURE_S="5")
+    other = command.here("evaluate", "--lake", copy, **strict)
     assert other.code == 1
     assert "another protocol" in other.err
-
-
-def test_evaluate_skips_a_run_that_was_made_for_other_tensors(command, lake, tmp_path):
-    copy = tmp_path / "lake"
-    shutil.copytree(lake.root, copy)
-    assert command.here("train", "lstm", "--lake", copy, "--seconds", "0.5", "--name", "old").code == 0
-    full = {"TRACKLAKE_MIN_FUTURE_S": "5"}
-    for stage in ("samples", "split", "tensors"):
-        assert command.here(stage, "--lake", copy, **full).code == 0
     done = command.here("evaluate", "--lake", copy, **full)
     assert done.code == 0, done.err
     assert "constant-velocity " in done.out

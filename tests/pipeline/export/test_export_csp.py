@@ -95,7 +95,7 @@ def sort_rows(rows, order):
 
 @pytest.mark.parametrize("order", ["vehicle", "frame", "other"])
 def test_samples_keep_the_order_of_the_files_rows(tmp_path, order):
-    """Of two data sets the second one has no vehicle in validation, so `tracks` of ValSet has one row."""
+    """The second of two data sets has no vehicle in validation, so `tracks` of ValSet has one row."""
     rows = sort_rows(make_rows(0), order)
     alone = [(1, frame, "20.000", f"{5 * frame:.3f}", 2) for frame in range(1, 61)]
     lake = ingest(tmp_path / "lake", tmp_path / "raw", {"us-101-0750": rows, "us-101-0805": alone})

@@ -148,16 +148,13 @@ def test_the_views_join_what_later_stages_found_out(tmp_path: Path):
 @pytest.mark.parametrize(
     "name",
     [
-        "it's a lake",
-        'la"ke',
+        'it\'s a "lake"',
         "Straße 東京",
-        "a,b",
+        "a,b;c",
         "a[1]*?{x}",
         "50%25",
-        "exp=1",
-        "dataset=ngsim",
+        "exp=1 dataset=ngsim",
         "subset=other",
-        "a;b",
     ],
 )
 def test_a_lake_may_be_called_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
@@ -359,7 +356,7 @@ def test_what_writes_or_looks_elsewhere_is_refused(opened: LakeConnection, lake:
 
 
 def test_a_switch_that_gets_past_us_writes_nothing(lake: Path, folder: Path):
-    """In a process of its own, for DuckDB may end it: the file system itself refuses."""
+    """The file system itself refuses; a process of its own, because DuckDB may end it."""
     before = snapshot(folder)
     script = (
         "import sys; from tracklake.pipeline.lake import connect; connection = connect(sys.argv[1]);"

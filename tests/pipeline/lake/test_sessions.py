@@ -370,7 +370,7 @@ def test_another_schema_version_asks_for_a_rebuild(tmp_path: Path):
 
 
 @pytest.mark.parametrize("broken", ["fsync", "replace"])
-@pytest.mark.parametrize("after", range(0, 28, 4))
+@pytest.mark.parametrize("after", range(0, 28, 6))
 def test_a_full_disk_at_any_moment_leaves_the_lake_as_it_was_or_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, after: int
 ):

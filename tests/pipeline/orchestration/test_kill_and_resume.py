@@ -7,7 +7,6 @@ import signal
 import sqlite3
 import time
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import polars as pl
@@ -56,32 +55,28 @@ def read_all(root: Path) -> dict[str, pl.DataFrame]:
     return {table.name: tables[table.name].select(*table.dtypes) for table in TABLES}
 
 
-def test_killed_runs_leave_whole_tables_and_the_next_run_does_the_rest(
+def test_a_killed_run_leaves_whole_tables_and_the_next_run_does_the_rest(
     command, raw, undisturbed, prefect_home, tmp_path
 ):
+    """One death in the middle; test_killed_writers.py has those at every step of a session."""
     root, home = tmp_path / "lake", {"PREFECT_HOME": str(prefect_home)}
-    committed: dict[str, str] = {}
-    for wanted in (1, 9):
-        # The first leaves a server's database behind as well, and the run that goes on from there begins with it.
-        begin = partial(command.alone.start, **home) if wanted == 1 else command.start
-        process = begin("run", raw, "--lake", root, "--quiet")
-        reached = wait_until(lambda wanted=wanted: len(entries(root)) >= wanted, process)
-        assert reached, process.communicate()[0]
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-        assert not children.exists() or children.read_text().split() == [], "a server that outlives its process"
-        os.kill(process.pid, signal.SIGKILL)
-        process.communicate(timeout=10)  # returns only when no process holds the pipe any more
-        # Nothing that was committed is lost, and every file of it is whole.
-        manifest = load(root)
-        now = {key: entry.fingerprint for key, entry in manifest.commits.items()}
-        assert committed.items() <= now.items()
-        assert len(now) >= wanted
-        committed = now
-        for entry in manifest.commits.values():
-            assert is_intact(root, (file for group in entry.files.values() for file in group)), entry.key
-        tables = read_all(root)
-        for table in TABLES:
-            assert tables[table.name].height == sum(file.rows for file in manifest.live(table.name)), table.name
+    # It leaves a server's database behind as well, and the run that goes on from there begins with it.
+    process = command.alone.start("run", raw, "--lake", root, "--quiet", **home)
+    reached = wait_until(lambda: len(entries(root)) >= 5, process)
+    assert reached, process.communicate()[0]
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    assert not children.exists() or children.read_text().split() == [], "a server that outlives its process"
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=10)  # returns only when no process holds the pipe any more
+    # Every file of what was committed is whole.
+    manifest = load(root)
+    committed = manifest.commits.keys()
+    assert 5 <= len(committed) < 16
+    for entry in manifest.commits.values():
+        assert is_intact(root, (file for group in entry.files.values() for file in group)), entry.key
+    tables = read_all(root)
+    for table in TABLES:
+        assert tables[table.name].height == sum(file.rows for file in manifest.live(table.name)), table.name
     before = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
     done = command.alone("run", raw, "--lake", root, "--json", **home)
     assert done.code == 0, done.err

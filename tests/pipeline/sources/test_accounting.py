@@ -1,4 +1,4 @@
-"""Nothing is lost silently: whole sources under damage."""
+"""Every row of a damaged source is kept or counted among the dropped ones."""
 
 import polars as pl
 import pytest

@@ -349,7 +349,7 @@ def test_class_0_is_an_unknown_class(tmp_path):
 
 
 def test_times_in_scientific_notation(tmp_path):
-    """With all digits they are exact; rounded by a spreadsheet they are lost."""
+    """Times with all digits are exact; those that a spreadsheet rounded are lost."""
     exact = ngsim(tmp_path / "exact", as_text([ngsim_row(7, 1, Global_Time="1.118846979000e+12")]))
     assert [subset.name for subset in exact.subsets] == ["us-101-0750"]
     path = write(tmp_path / "lost.csv", as_csv([ngsim_row(7, frame, Global_Time="1.12E+12") for frame in (1, 2)]))

@@ -79,7 +79,7 @@ def links(root: Path) -> set[str]:
 
 
 def thresholds(root: Path) -> tuple[float, dict, dict]:
-    """Of high acceleration, as quality.json tells them: the rule's, the overrides, those of other recordings."""
+    """The thresholds of high acceleration in quality.json: the rule's, the overrides, those of other recordings."""
     quality = json.loads((root / "reports" / "quality.json").read_text())
     (rule,) = (rule for rule in quality["rules"] if rule["name"] == "high_acceleration")
     provenance = quality["provenance"]

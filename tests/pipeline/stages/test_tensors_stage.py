@@ -80,7 +80,7 @@ def test_tensors_are_made_again_where_findings_change(remade):
 
 
 def test_samples_with_a_neighbor_cut_off_are_counted_and_dropped_by_setting(remade):
-    """In time-blocks of 10 s, vehicles at a border are left out of eval, and those beside them do not see them."""
+    """Time-blocks of 10 s: vehicles at a border are left out of eval, and those beside them do not see them."""
     given = {"lake": remade[0], "split": "time-blocks", "splits": ["time-blocks"], "split_block_s": 10.0}
     found = {}
     for name in ("samples", "split"):

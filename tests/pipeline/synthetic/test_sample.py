@@ -16,7 +16,7 @@ from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
 
 MINUTES, SEED = (kind(text) for kind, text in zip((float, int), SAMPLE[1::2], strict=True))
-"""As of the session's sample, with which this one shares its simulations."""
+"""Length in minutes and seed of the session's sample, with which this one shares its simulations."""
 
 
 @pytest.fixture(scope="module")

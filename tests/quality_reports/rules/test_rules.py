@@ -48,7 +48,7 @@ def entries(**columns) -> pl.DataFrame:
 
 
 def broken(frame: pl.DataFrame, name: str, **thresholds: float) -> list[bool]:
-    """Which entries break a rule."""
+    """The entries that break a rule."""
     (rule,) = (rule for rule in RULES if rule.name == name)
     return frame.select(rule.broken(resolve(RULES, thresholds))).to_series().to_list()
 

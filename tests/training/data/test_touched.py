@@ -13,7 +13,7 @@ from tracklake.schemas.findings import FINDINGS
 from tracklake.training.data.tensor_folder import TensorFolder
 
 ONE = st.tuples(st.integers(0, 10_000), st.sampled_from(SEVERITIES), st.integers(-6, 3), st.integers(0, 4))
-"""Which entry of the clocks a finding stands at, how bad it is, where it begins beside it, and its length in frames."""
+"""A finding: its entry on the clocks, its severity, its first frame relative to the entry, its length in frames."""
 
 
 @settings(max_examples=25, deadline=None)

@@ -41,7 +41,7 @@ def registry(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def _ctrl_c():
-    """As in a process that somebody sits before."""
+    """This process behaves as one at a terminal."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

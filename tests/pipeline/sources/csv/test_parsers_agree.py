@@ -77,7 +77,7 @@ def texts(draw, row, blanks):
 
 @pytest.mark.parametrize("case", CASES)
 @given(data=st.data())
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_what_is_accepted_at_once_is_accepted_line_by_line(case, data):
     layout, row = CASES[case]
     check(data.draw(texts(row, layout.blanks)), layout)

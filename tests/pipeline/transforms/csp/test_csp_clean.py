@@ -66,7 +66,7 @@ def test_a_later_run_gets_an_id_that_no_vehicle_had():
 @given(recordings(), st.sampled_from([None, 6]), st.booleans())
 @settings(max_examples=15, deadline=None)
 def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_future):
-    """Of vehicles without gaps, in one part, with no one missing around them."""
+    """Samples of vehicles without gaps, in one part, with all vehicles around them present."""
     frames = {vehicle: [row[1] for row in rows if row[0] == vehicle] for vehicle, *_ in rows}
     whole = [row for row in rows if max(frames[row[0]]) - min(frames[row[0]]) + 1 == len(frames[row[0]])]
     if not whole:

@@ -57,7 +57,7 @@ def test_missing_constants_are_a_constant_too():
 
 
 def test_entries_that_lack_a_constant_have_that_of_the_others():
-    """As where the later frames stand only in a file without sizes."""
+    """A case where the later frames stand only in a file without sizes."""
     found = identify([entry(5, 1, 0.0, announced=9), entry(5, 2, 1.0, length=None), entry(5, 3, 2.0)])
     assert found.ids_split == 0
     assert found.entries.select("vehicle_id", "announced", "length").rows() == [(5, 9, 4.0), (5, None, None),
