@@ -3,15 +3,25 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
+import polars as pl
 from markupsafe import Markup
 
-from tracklake.quality_reports.pages.examples import find_examples
+from tracklake.quality_reports.pages.examples import AROUND_S, declare_rule, find_examples
 from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.player import make_player
 from tracklake.quality_reports.pages.rendering import make_environment
+from tracklake.quality_reports.pages.subset_scenes import SubsetScenes, read_scenes
 from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.flow import draw_flow, draw_fundamental
-from tracklake.quality_reports.plots.time_space import MARK_COLUMNS, MARK_ROWS, draw_lanes, draw_scale, make_grid
+from tracklake.quality_reports.plots.plan_views import SHOWN, Road, draw_plan_views
+from tracklake.quality_reports.plots.time_space import (
+    MARK_COLUMNS,
+    MARK_ROWS,
+    draw_lanes,
+    draw_scale,
+    find_top_speed,
+    make_grid,
+)
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import (
     Connection,
@@ -53,11 +63,8 @@ def render_pages(
     template = make_environment().get_template("subset.html.j2")
     figures = collect_subsets(connection, provenance, rules=rules)
     names = names or name_pages(figures["subsets"])
-    extremes = {rule.name: rule.extreme for rule in rules}
-    declared = [
-        {"name": rule["name"], "unit": rule["unit"], "extreme": extremes[rule["name"]]}
-        for rule in rank_rules(figures["rules"])
-    ]
+    by_name = {rule.name: rule for rule in rules}
+    declared = [declare_rule(by_name[rule["name"]], rule["unit"]) for rule in rank_rules(figures["rules"])]
     judged = judge(figures["subsets"], figures["subset_scores"], figures["rules"], figures["completeness"])
     verdicts = {(row["dataset"], row["subset"]): row for row in judged}
     for subset in figures["subsets"]:
@@ -120,6 +127,8 @@ def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[R
     limited = {**where, "most": MOST_ROWS}
     seconds = choose_interval(subset["seconds"])
     examples = find_examples(connection, where, rules, subset["frame_rate_hz"])
+    scenes = read_scenes(connection, where, extent, examples, subset["frame_rate_hz"])
+    views = _draw_views(scenes, examples, find_top_speed(extent)) if scenes else [None] * len(examples)
     return {
         "extent": extent,
         **_draw_plots(connection, where, extent, seconds),
@@ -129,9 +138,32 @@ def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[R
         "windows": query(connection, "subset_windows", limited),
         "vehicle_scores": query(connection, "subset_vehicle_scores", limited),
         "drops": query(connection, "subset_sample_drops", where),
-        "examples": [{**example, "plot": example["plot"] and Markup(example["plot"])} for example in examples],
-        "player": make_player(connection, where, extent, examples, subset["frame_rate_hz"]),
+        "examples": [{**example, "view": view} for example, view in zip(examples, views, strict=True)],
+        "player": make_player(scenes, extent, examples) if scenes else None,
     }
+
+
+def _draw_views(scenes: SubsetScenes, examples: Sequence[Row], top_mps: float) -> list[Row | None]:
+    """Draw a plan view of each listed finding; None where the vehicle is not there.
+
+    Returns:
+        `facts`, what the vehicles do in words, and `svg`; or `same`, the number of an earlier one of the same scene.
+    """
+    reach = scenes.entries.select(low=pl.col("y_m").min(), high=pl.col("y_m").max()).row(0)
+    around = round(AROUND_S * scenes.rate_hz)
+    shown = [
+        (number, row["vehicle_id"], partner, row["moment"], row["moment"] - around, row["moment"] + around)
+        for number, (row, partner) in enumerate(zip(examples, scenes.partners, strict=True))
+    ]
+    frame = pl.DataFrame(shown, schema=SHOWN, orient="row")
+    views = draw_plan_views(scenes.entries, frame, Road(scenes.markings, scenes.lanes, *reach), top_mps)
+    seen: dict[tuple[frozenset[int | None], int], int] = {}
+    drawn: list[Row | None] = []
+    for view, (number, vehicle, partner, moment, *_) in zip(views, shown, strict=True):
+        first = seen.setdefault((frozenset((vehicle, partner)), moment), number)
+        picture = {"svg": Markup(view.svg)} if view and first == number else {"same": first}
+        drawn.append({"facts": view.facts, **picture} if view else None)
+    return drawn
 
 
 def choose_interval(seconds: float) -> float:

@@ -1,7 +1,7 @@
 """Axes, ticks and lines as plain SVG: the fast path for plots that a subset's page draws by the dozen.
 
-A plot takes 2.3 ms this way and 85 to 185 ms by Altair (benchmarks/report_plots.py), and every subset has a page. Plots
-that a whole report has once are Altair's, in `charts.py`.
+A plot takes 2 ms this way and 85 to 185 ms by Altair, and every subset has a page. Plots that a whole report has once
+are Altair's, in `charts.py`.
 """
 
 import math

@@ -12,8 +12,10 @@ from tracklake.schemas.arrays import Integers
 
 ENTRY_BYTES, SEGMENT_BYTES = 4, 28
 """Packed size of an entry and of a segment's head, in bytes, before base64."""
-X_PER_M, Y_PER_M, SPEED_PER_MPS, HEADING_PER_RAD = 10, 100, 4, 75
-"""Units of packed positions along and across the road, speeds and headings: 0.1 m, 0.01 m, 0.25 m/s, 1/75 rad."""
+X_PER_M, Y_PER_M, SPEED_PER_MPS, HEADING_PER_RAD = 10, 100, 3.6, 75
+"""Units of packed positions along and across the road, speeds and headings: 0.1 m, 0.01 m, 1 km/h, 1/75 rad."""
+LEAST_SPEED = 40
+"""Speed backwards that is packed as 0, in km/h."""
 LARGEST_STEP = 127
 """Largest step of a position between two ticks that one byte holds; behind a larger one a new segment begins."""
 LENGTH_M, WIDTH_M = 4.5, 1.8
@@ -47,7 +49,11 @@ def prepare_entries(entries: pl.DataFrame) -> pl.DataFrame:
     quantised = entries.with_columns(
         (pl.col("x_m") * X_PER_M).round().cast(pl.Int32).alias("x"),
         (pl.col("y_m") * Y_PER_M).round().cast(pl.Int32).alias("y"),
-        (pl.col("speed_mps").cast(pl.Float64) * SPEED_PER_MPS).round().clip(0, 255).cast(pl.UInt8).alias("speed"),
+        (pl.col("speed_mps").cast(pl.Float64) * SPEED_PER_MPS + LEAST_SPEED)
+        .round()
+        .clip(0, 255)
+        .cast(pl.UInt8)
+        .alias("speed"),
         (pl.col("heading_rad").cast(pl.Float64) * HEADING_PER_RAD)
         .round()
         .clip(-127, 127)
@@ -110,20 +116,18 @@ def find_stretches(ticks: Integers) -> list[list[int]]:
     return stretches
 
 
-def pack_entries(entries: pl.DataFrame, sizes: pl.DataFrame, ticks: Integers) -> dict[str, str]:
+def pack_entries(entries: pl.DataFrame, ticks: Integers) -> dict[str, str]:
     """Pack the entries of some ticks as base64 of little-endian integers.
 
     `segments` has seven 32-bit integers per segment: vehicle, first tick, entries, x (0.1 m), y (0.01 m), and the
     vehicle's length and width (0.1 m). `entries` has four bytes per entry: its steps of x and y since the entry before,
-    0 for a segment's first, speed (0.25 m/s, unsigned) and heading (1/75 rad).
+    0 for a segment's first, speed (km/h + LEAST_SPEED, unsigned) and heading (1/75 rad).
 
     Args:
-        entries: entries of `prepare_entries`.
-        sizes: vehicle_id, length_m, width_m; null where unknown.
+        entries: entries of `prepare_entries`, with length_m and width_m, which are null where unknown.
         ticks: ticks to pack.
     """
-    of_ticks = entries.filter(pl.col("tick").is_in(pl.Series(ticks).implode()))
-    packed = mark_segments(of_ticks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
+    packed = mark_segments(entries.filter(pl.col("tick").is_in(pl.Series(ticks).implode())))
     follows = ~packed["begins"].to_numpy()
     steps = [np.where(follows, packed[name].diff().fill_null(0).to_numpy(), 0) for name in ("x", "y")]
     rows: NDArray[np.int8] = np.empty((packed.height, ENTRY_BYTES), np.int8)

@@ -23,7 +23,7 @@
       y += bytes[row + 1];
       segment.x.push(x / 10);
       segment.y.push(y / 100);
-      segment.speed.push((bytes[row + 2] & 255) / 4);
+      segment.speed.push(((bytes[row + 2] & 255) - 40) / 3.6);
       segment.heading.push(bytes[row + 3] / 75);
     }
     segments.push(segment);
@@ -109,8 +109,7 @@
     pen.font = "11px system-ui, sans-serif";
     pen.textBaseline = "middle";
     for (const [lane, middle] of scene.lanes) {
-      const marked = scene.markings && lane >= 1 && lane < scene.markings.length;
-      const y = toY(marked ? (scene.markings[lane - 1] + scene.markings[lane]) / 2 : middle);
+      const y = toY(middle);
       if (!scene.markings) line([0, y], [size[0], y], "#b4bcc4", [2, 6]);
       pen.fillStyle = "#4b545d";
       pen.textAlign = "left";

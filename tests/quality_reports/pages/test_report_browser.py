@@ -169,6 +169,11 @@ def test_a_finding_is_watched_with_both_vehicles_of_an_overlap_in_view(browser, 
     )
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run(report) == "2 vehicles on the road"
+    ends = "((each) => [each.left, each.right])(({}).getBoundingClientRect())"
+    left, right = browser.run(ends.format("document.querySelector('.plan')"))
+    for number in (0, 1):
+        begin, end = browser.run(ends.format(f"document.querySelectorAll('.plan .own path')[{number}]"))
+        assert left < begin < end < right, "the plan view shows both, too"
     browser.run("document.querySelector('[data-finding]').click()")
     # 5 s before frame 250, at the scene before: frame 125, 4.96 s after the first.
     assert 4.9 <= float(browser.run(clock).split()[0]) <= 5.3
@@ -204,4 +209,4 @@ def test_the_player_is_steered_by_keys_and_by_its_slider(browser, scene):
 def test_without_a_script_a_subset_page_hides_the_player_alone(browser, scene):
     browser.open(scene, script=False)
     assert browser.run("document.querySelector('.player').hidden && document.querySelector('[data-finding]').hidden")
-    assert browser.run("document.querySelectorAll('.example svg').length") > 0
+    assert browser.run("document.querySelectorAll('.example .plan').length") > 0

@@ -6,12 +6,13 @@ import pytest
 from page_elements import HOSTILE, parse, spoil_texts
 
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
-from tracklake.quality_reports.pages.examples import find_examples, write_sql
+from tracklake.quality_reports.pages.examples import choose_moment, declare_rule, find_examples, write_sql
 from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.pages.subsets import choose_interval, render_pages
 from tracklake.quality_reports.plots.rasters import make_palette
 from tracklake.quality_reports.published import list_published
+from tracklake.quality_reports.rules.registry import RULES
 from tracklake.quality_reports.summaries import query, query_frame
 
 WHERE = {"dataset": "highd", "subset": "01-lower"}
@@ -158,7 +159,6 @@ def test_diagrams_axes_and_units(open_lake, road):
         "flow (veh/h/lane)",
         "density (veh/km)",
         "speed (m/s)",
-        "acceleration (m/s²)",
         "time (s)",
         "recorded speed (m/s)",
         "share of entries (%)",
@@ -198,19 +198,36 @@ def test_speeds_and_lane_changes_of_a_subset(open_lake, road):
 
 def test_the_worst_of_each_vehicle_comes_first_and_its_sql_shows_its_entries(open_lake, road):
     lake = open_lake(**road)
-    rules = [
-        {"name": "high_acceleration", "unit": "m/s2", "extreme": "max"},
-        {"name": "negative_headway", "unit": "m", "extreme": "min"},
-    ]
+    rules = [declare_rule(rule, rule.unit) for rule in RULES if rule.name in ("high_acceleration", "negative_headway")]
     found = find_examples(lake, WHERE, rules, 25.0)
-    assert [(each["rule"], each["vehicle_id"], each["worst"]) for each in found] == [
-        ("high_acceleration", 2, 5.0),
-        ("negative_headway", 1, -9.0),
-        ("negative_headway", 2, -4.0),
+    assert [(each["rule"], each["vehicle_id"], each["worst"], each["partner"]) for each in found] == [
+        ("high_acceleration", 2, 5.0, None),
+        ("negative_headway", 1, -9.0, "leader"),
+        ("negative_headway", 2, -4.0, "leader"),
     ]
     frames = [row["frame"] for row in lake.execute(found[1]["sql"]).pl().to_dicts()]
     assert frames == [20, 21]
-    assert all("<path" in each["plot"] for each in found)
+
+
+def test_an_overlap_is_listed_once_and_its_scene_drawn_once(open_lake, road):
+    pair = [a_finding("overlap", vehicle, 40, 41, 1.5) for vehicle in (1, 2)]
+    gap = [{**a_finding("negative_headway", 2, 40, 41, -1.5)}]
+    tracks = [{**row, "leader_id": 1 if row["vehicle_id"] == 2 else None} for row in road["tracks"]]
+    box = {"length_m": 40.0, "width_m": 2.0, "start_x_m": 0.0, "end_x_m": 40.0}
+    sizes = [{**WHERE, "vehicle_id": vehicle, **box} for vehicle in (1, 2)]
+    html = render(open_lake(**{**road, "tracks": tracks, "vehicles": sizes, "findings": pair + gap}))["01-lower.html"]
+    assert html.count('<figure class="example"') == 2
+    assert html.count('<svg class="plan"') == 1
+    assert 'The scene is drawn <a href="#example-1">above</a>' in html
+    assert "Frame 40: vehicle 1: 72 km/h (20.0 m/s) at 31 m, lane 1; vehicle 2: 36 km/h (10.0 m/s) at 16 m" in html
+    assert '"vehicles":[1,2]' in html, "the player keeps both in view"
+
+
+def test_the_moment_shown_is_the_middle_of_the_first_seconds():
+    found = {"first_frame": 100, "last_frame": 110, "entries": 11}
+    assert choose_moment(found, 125) == 105
+    assert choose_moment({**found, "last_frame": 1099, "entries": 1000}, 125) == 162
+    assert choose_moment({**found, "entries": 10}, 125) == 100, "a frame in between may be missing"
 
 
 def test_sql_quotes_names(open_lake, road):
