@@ -1,6 +1,5 @@
 """Data of the scene player: its road, its findings and its packed entries."""
 
-import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,7 +15,7 @@ from tracklake.quality_reports.plots.scenes import (
     prepare_entries,
     select_ticks,
 )
-from tracklake.quality_reports.plots.time_space import find_top_speed
+from tracklake.quality_reports.plots.time_space import find_top_speed, write_data
 from tracklake.quality_reports.summaries import Row
 
 MOST_BYTES = 1_500_000
@@ -47,7 +46,7 @@ def make_player(scenes: SubsetScenes, extent: Row, examples: Sequence[Row]) -> R
     seconds = scenes.stride / scenes.rate_hz
     content = {
         "seconds": seconds,
-        "zero_s": extent["first_s"] - extent["first_frame"] / scenes.rate_hz,
+        "zero_s": find_zero(extent, scenes),
         "stretches": find_stretches(selection.ticks),
         "markings": scenes.markings,
         "lanes": scenes.lanes,
@@ -58,7 +57,7 @@ def make_player(scenes: SubsetScenes, extent: Row, examples: Sequence[Row]) -> R
         "findings": _list_findings(examples, scenes, selection),
         **pack_entries(entries, selection.ticks),
     }
-    text = json.dumps(content, separators=(",", ":"), sort_keys=True).replace("<", "\\u003c")
+    text = write_data(content)
     return {
         "data": Markup(text),  # numbers, base64 and names of rules; no "<" is left
         "accepted": selection.accepted,
@@ -67,6 +66,11 @@ def make_player(scenes: SubsetScenes, extent: Row, examples: Sequence[Row]) -> R
         "rate_hz": 1 / seconds,
         "megabytes": len(text) / 1e6,
     }
+
+
+def find_zero(extent: Row, scenes: SubsetScenes) -> float:
+    """Return the time of frame 0, in seconds."""
+    return float(extent["first_s"] - extent["first_frame"] / scenes.rate_hz)
 
 
 def _list_findings(examples: Sequence[Row], scenes: SubsetScenes, selection: Selection) -> list[Row]:

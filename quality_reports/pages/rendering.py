@@ -41,8 +41,8 @@ def make_environment() -> jinja2.Environment:
         worst=_format_worst,
     )
     templates = files("tracklake.quality_reports") / "templates"
-    for name, file in (("style", "report.css"), ("script", "report.js"), ("player_script", "player.js")):
-        environment.globals[name] = Markup((templates / file).read_text(encoding="utf-8"))
+    for file in ("report.css", "report.js", "canvas.js", "player.js", "diagrams.js"):
+        environment.globals[file.replace(".", "_")] = Markup((templates / file).read_text(encoding="utf-8"))
     return environment
 
 

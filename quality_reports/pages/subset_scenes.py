@@ -1,4 +1,4 @@
-"""Scenes of a subset around its listed findings and at its beginning, read once for all pictures of a page."""
+"""Entries of a subset that its page draws, read once: scenes around findings and at the beginning, points of tracks."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,6 +9,7 @@ import polars as pl
 
 from tracklake.quality_reports.pages.examples import AROUND_S
 from tracklake.quality_reports.plots.scenes import Window
+from tracklake.quality_reports.plots.time_space import choose_step
 from tracklake.quality_reports.summaries import Connection, Row, query_frame
 from tracklake.schemas.arrays import Integers
 
@@ -26,6 +27,7 @@ class SubsetScenes:
         entries: rows of subset_scenes.sql, sorted by vehicle_id and frame.
         markings: y_m of the lane markings; None where they are unknown.
         stride: frames from one tick to the next.
+        step: frames from one point of a track in the diagrams to the next, a multiple of `stride`.
         rate_hz: frames per second.
         first: ticks of the recording's beginning.
         windows: ticks around each listed finding.
@@ -36,6 +38,7 @@ class SubsetScenes:
     entries: pl.DataFrame
     markings: list[float] | None
     stride: int
+    step: int
     rate_hz: float
     first: Window
     windows: list[Window]
@@ -79,16 +82,18 @@ def read_scenes(
     ]
     first = (low, min(high, low + round(FIRST_S * rate_hz / stride)))
     ticks = np.unique(np.concatenate([np.arange(begin, end + 1) for begin, end in [first, *windows]]))
+    step = choose_step(extent["entries"], stride)
     frames = {*(ticks * stride).tolist(), *(example["moment"] for example in examples)}
     if not frames:
         return None
     # Text, since DuckDB looks for pandas once for every number of a list.
-    found = query_frame(connection, "subset_scenes", {**where, "frames": ",".join(map(str, sorted(frames)))})
-    entries = found.sort("vehicle_id", "frame")
+    parameters = {**where, "frames": ",".join(map(str, sorted(frames))), "step": step}
+    entries = query_frame(connection, "subset_scenes", parameters).sort("vehicle_id", "frame")
     return SubsetScenes(
         entries=entries,
         markings=extent["lane_markings_m"],
         stride=stride,
+        step=step,
         rate_hz=rate_hz,
         first=first,
         windows=windows,

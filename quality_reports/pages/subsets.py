@@ -3,24 +3,25 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
 import polars as pl
 from markupsafe import Markup
 
 from tracklake.quality_reports.pages.examples import AROUND_S, declare_rule, find_examples
 from tracklake.quality_reports.pages.page_names import name_pages
-from tracklake.quality_reports.pages.player import make_player
+from tracklake.quality_reports.pages.player import find_zero, make_player
 from tracklake.quality_reports.pages.rendering import make_environment
 from tracklake.quality_reports.pages.subset_scenes import SubsetScenes, read_scenes
 from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.flow import draw_flow, draw_fundamental
 from tracklake.quality_reports.plots.plan_views import SHOWN, Road, draw_plan_views
+from tracklake.quality_reports.plots.rasters import colour_values
 from tracklake.quality_reports.plots.time_space import (
-    MARK_COLUMNS,
-    MARK_ROWS,
-    draw_lanes,
+    COLOURS,
     draw_scale,
     find_top_speed,
-    make_grid,
+    pack_diagrams,
+    write_data,
 )
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import (
@@ -140,6 +141,7 @@ def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[R
         "drops": query(connection, "subset_sample_drops", where),
         "examples": [{**example, "view": view} for example, view in zip(examples, views, strict=True)],
         "player": make_player(scenes, extent, examples) if scenes else None,
+        "diagrams": _make_diagrams(connection, where, extent, scenes) if scenes else None,
     }
 
 
@@ -172,22 +174,39 @@ def choose_interval(seconds: float) -> float:
 
 
 def _draw_plots(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
-    """Draw the subset's plots as markup; empty or None where it has no entries."""
+    """Draw the subset's plots as markup; None where it has no entries."""
     if not extent["entries"]:
-        return {"diagrams": [], "legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
-    grid = make_grid(extent)
-    cells = query_frame(connection, "subset_time_space", {**where, **grid.parameters()})
-    marks = query_frame(connection, "subset_errors", {**where, **grid.parameters(MARK_COLUMNS, MARK_ROWS)})
+        return {"legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
+    top_mps = find_top_speed(extent)
     intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
     histogram = query(connection, "subset_speed_histogram", where)
     return {
-        "diagrams": [(lane, Markup(svg)) for lane, svg in draw_lanes(grid, cells, marks)],
-        "legend": Markup(draw_scale(grid)),
+        "legend": Markup(draw_scale(top_mps)),
         # Without a section of some length there is neither flow nor density.
         "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
-        "fundamental": Markup(draw_fundamental(intervals, grid.top_mps)) if _is_measured(intervals) else None,
+        "fundamental": Markup(draw_fundamental(intervals, top_mps)) if _is_measured(intervals) else None,
         "speed_histogram": Markup(plots.draw_speed_histogram(histogram, [])),
     }
+
+
+def _make_diagrams(connection: Connection, where: Mapping[str, str], extent: Row, scenes: SubsetScenes) -> Row | None:
+    """Make the `data` of the time-space diagrams (JSON as markup), and say what they hold; None without a point."""
+    points = scenes.entries.filter(pl.col("frame") % scenes.step == 0)
+    if points.is_empty():
+        return None
+    errors = query_frame(connection, "subset_errors", where)
+    packed = pack_diagrams(points, errors, scenes.step, scenes.rate_hz)
+    content = {
+        **packed,
+        "zero_s": find_zero(extent, scenes),
+        "time_s": [extent["first_s"], max(extent["last_s"], extent["first_s"] + packed["seconds"])],
+        "x_m": [extent["first_x_m"], max(extent["last_x_m"], extent["first_x_m"] + 1.0)],
+        "top_mps": find_top_speed(extent),
+        "colours": colour_values(np.linspace(0.0, 1.0, COLOURS), 0, 1),
+    }
+    text = write_data(content)
+    facts = {"seconds": packed["seconds"], "errors": errors.height, "megabytes": len(text) / 1e6}
+    return {"data": Markup(text), **facts}  # numbers, base64 and names of rules; no "<" is left
 
 
 def _is_measured(intervals: Sequence[Row]) -> bool:

@@ -1,8 +1,4 @@
-"""Rasters: grids of numbers as PNG images with a palette, without an imaging library."""
-
-import base64
-import struct
-import zlib
+"""Colours of numbers on a perceptually uniform scale."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,29 +34,3 @@ def grade_values(values: Floats, least: float, greatest: float) -> Bytes:
 def colour_values(values: Floats, least: float, greatest: float) -> list[str]:
     """Return the colours of known values as `#rrggbb`, on the scale of `grade_values`."""
     return [f"#{bytes(colour[:3]).hex()}" for colour in make_palette()[grade_values(values, least, greatest)]]
-
-
-def encode_png(indices: Bytes) -> bytes:
-    """Encode palette entries (H, W) as a PNG, the first row uppermost; the same entries give the same bytes.
-
-    Source: Portable Network Graphics (PNG) Specification, W3C: colour type 3, bit depth 8, filter 0.
-    """
-    height, width = indices.shape
-    palette = make_palette()
-    rows = np.zeros((height, width + 1), np.uint8)
-    rows[:, 1:] = indices
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", palette[:, :3].tobytes()),
-        (b"tRNS", palette[:1, 3].tobytes()),
-        (b"IDAT", zlib.compress(rows.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
-    )
-
-
-def encode_uri(indices: Bytes) -> str:
-    """Encode palette entries as a data URI of their PNG."""
-    return "data:image/png;base64," + base64.b64encode(encode_png(indices)).decode("ascii")

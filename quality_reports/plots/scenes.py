@@ -49,11 +49,7 @@ def prepare_entries(entries: pl.DataFrame) -> pl.DataFrame:
     quantised = entries.with_columns(
         (pl.col("x_m") * X_PER_M).round().cast(pl.Int32).alias("x"),
         (pl.col("y_m") * Y_PER_M).round().cast(pl.Int32).alias("y"),
-        (pl.col("speed_mps").cast(pl.Float64) * SPEED_PER_MPS + LEAST_SPEED)
-        .round()
-        .clip(0, 255)
-        .cast(pl.UInt8)
-        .alias("speed"),
+        pack_speeds().alias("speed"),
         (pl.col("heading_rad").cast(pl.Float64) * HEADING_PER_RAD)
         .round()
         .clip(-127, 127)
@@ -61,6 +57,12 @@ def prepare_entries(entries: pl.DataFrame) -> pl.DataFrame:
         .alias("heading"),
     )
     return mark_segments(quantised)
+
+
+def pack_speeds() -> pl.Expr:
+    """Return `speed_mps` as a byte, in km/h from LEAST_SPEED backwards on."""
+    speed = pl.col("speed_mps").cast(pl.Float64) * SPEED_PER_MPS + LEAST_SPEED
+    return speed.round().clip(0, 255).cast(pl.UInt8)
 
 
 def mark_segments(entries: pl.DataFrame) -> pl.DataFrame:

@@ -1,89 +1,29 @@
-"""Time-space diagrams: one raster per lane, coloured by mean speed, with marks where errors were found."""
+"""Time-space diagrams as small integers: every lane's tracks coloured by speed, with marks where errors were found."""
 
+import base64
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from tracklake.quality_reports.plots.axes import (
-    Scale,
-    draw_frame,
-    draw_path,
-    draw_text,
-    format_points,
-    make_ticks,
-    wrap_svg,
-)
-from tracklake.quality_reports.plots.rasters import LEVELS, encode_uri, grade_values
-from tracklake.schemas.arrays import Floats
+from tracklake.quality_reports.plots.axes import draw_text, make_ticks, wrap_svg
+from tracklake.quality_reports.plots.rasters import colour_values
+from tracklake.quality_reports.plots.scenes import LARGEST_STEP, pack_speeds
 
-COLUMNS, ROWS = 1000, 140
-"""Most cells of a raster, in time and along the road."""
-LEAST_SECONDS, LEAST_METRES = 0.2, 1.0
-"""Least size of a cell; in smaller ones the gaps between entries, 0.04 or 0.1 s apart, would look like data."""
-MARK_COLUMNS, MARK_ROWS = 8, 7
-"""Cells of the raster, in time and along the road, that share one mark; this bounds the number of marks."""
-MARK_PIXELS = 3
-"""Half of a mark's width, in pixels."""
+MOST_POINTS, MOST_MARKS = 100_000, 3_000
+"""Greatest number of points and of marks in a page."""
+FASTEST_MPS = 60.0
+"""Speed up to which the points of a track are joined, in m/s; behind a faster step a new segment begins."""
+NO_LANE = -1
+"""Packed lane of entries without one."""
 SPEED_STEP_MPS = 5
 """Step of the colour scale's upper end, in m/s."""
-PANEL, HALO, MARK = "#f4f6f8", "#ffffff", "#000000"
-LEFT, RIGHT, TOP, WIDTH, HEIGHT, BOTTOM = 52, 14, 24, 1000, 140, 40
-"""Margins and size of a diagram, in pixels; WIDTH includes the margins."""
-CROSS = "l6 6m0-6l-6 6"
-"""Path of a mark from its upper left corner."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Cells of a subset's diagrams.
-
-    Args:
-        first_s: beginning of the first column.
-        seconds: length of a column.
-        columns: number of columns.
-        first_x_m: beginning of the first row.
-        metres: length of a row.
-        rows: number of rows.
-        top_mps: upper end of the colour scale.
-    """
-
-    first_s: float
-    seconds: float
-    columns: int
-    first_x_m: float
-    metres: float
-    rows: int
-    top_mps: float
-
-    def parameters(self, columns: int = 1, rows: int = 1) -> dict[str, float]:
-        """Return the parameters of the statements that count cells of so many columns and rows."""
-        cell = {"seconds": self.seconds * columns, "metres": self.metres * rows}
-        return {"first_s": self.first_s, "first_x_m": self.first_x_m, **cell}
-
-
-def make_grid(extent: Mapping[str, Any]) -> Grid:
-    """Divide a subset's recording and road into at most COLUMNS x ROWS cells.
-
-    Args:
-        extent: row of subset_extent.sql, of a subset with entries.
-    """
-    duration, length = extent["last_s"] - extent["first_s"], extent["last_x_m"] - extent["first_x_m"]
-    # A little more than the extent, so that the last entry lies within the last cell.
-    seconds = max(LEAST_SECONDS, duration * 1.0001 / COLUMNS)
-    metres = max(LEAST_METRES, length * 1.0001 / ROWS)
-    return Grid(
-        first_s=extent["first_s"],
-        seconds=seconds,
-        columns=math.floor(duration / seconds) + 1,
-        first_x_m=extent["first_x_m"],
-        metres=metres,
-        rows=math.floor(length / metres) + 1,
-        top_mps=find_top_speed(extent),
-    )
+COLOURS = 48
+"""Number of colours of speeds."""
 
 
 def find_top_speed(extent: Mapping[str, Any]) -> float:
@@ -91,75 +31,112 @@ def find_top_speed(extent: Mapping[str, Any]) -> float:
     return float(SPEED_STEP_MPS * max(1, math.ceil((extent["fast_mps"] or 0) / SPEED_STEP_MPS)))
 
 
-def draw_lanes(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> list[tuple[int | None, str]]:
-    """Draw the diagrams as (lane, svg), the leftmost lane first; lane is None for entries without one.
+def choose_step(entries: int, stride: int) -> int:
+    """Return the frames between points of a track: a multiple of `stride` that makes MOST_POINTS at most."""
+    return stride * max(1, math.ceil(entries / stride / MOST_POINTS))
+
+
+def pack_diagrams(points: pl.DataFrame, errors: pl.DataFrame, step: int, rate_hz: float) -> dict[str, Any]:
+    """Pack tracks and marks for the page's script.
+
+    `segments` holds five 32-bit integers per segment: lane (NO_LANE: none), vehicle, first tick, points, and x in
+    units of `unit_m`. `points` holds two bytes per point: the step of x since the point before, 0 for a segment's
+    first, and speed (km/h + 40, unsigned). `marks` lists lane, tick, x_m, findings, rule and vehicle of the first.
 
     Args:
-        grid: cells of the subset.
-        cells: lane, grid_column, grid_row, speed_mps: rows of subset_time_space.sql.
-        marks: lane, grid_column, grid_row: rows of subset_errors.sql on cells of MARK_COLUMNS by MARK_ROWS.
+        points: vehicle_id, frame, lane, x_m, speed_mps at frames that are multiples of `step`.
+        errors: vehicle_id, rule, first_frame, last_frame of findings of severity error.
+        step: frames from one tick to the next.
+        rate_hz: frames per second.
     """
-    drawn = []
-    for lane in cells["lane"].unique().sort().to_list():
-        in_lane = pl.col("lane").eq_missing(pl.lit(lane))
-        drawn.append((lane, _draw_lane(grid, cells.filter(in_lane), marks.filter(in_lane))))
-    return drawn
-
-
-def rasterise(grid: Grid, cells: pl.DataFrame) -> Floats:
-    """Return speeds as (rows, columns), the road's end uppermost; NaN in cells without entries."""
-    speeds = np.full((grid.rows, grid.columns), np.nan)
-    row = np.clip(cells["grid_row"].to_numpy(), 0, grid.rows - 1)
-    column = np.clip(cells["grid_column"].to_numpy(), 0, grid.columns - 1)
-    speeds[grid.rows - 1 - row, column] = cells["speed_mps"].to_numpy()
-    return speeds
-
-
-def _draw_lane(grid: Grid, cells: pl.DataFrame, marks: pl.DataFrame) -> str:
-    """Draw the diagram of one lane."""
-    x = Scale(grid.first_s, grid.first_s + grid.columns * grid.seconds, LEFT, WIDTH - RIGHT)
-    y = Scale(grid.first_x_m, grid.first_x_m + grid.rows * grid.metres, TOP + HEIGHT, TOP)
-    image = encode_uri(grade_values(rasterise(grid, cells), 0, grid.top_mps))
-    wide = WIDTH - LEFT - RIGHT
-    time_s = grid.first_s + (marks["grid_column"].to_numpy() + 0.5) * MARK_COLUMNS * grid.seconds
-    x_m = grid.first_x_m + (marks["grid_row"].to_numpy() + 0.5) * MARK_ROWS * grid.metres
-    # The last cells may reach beyond the raster.
-    at = format_points(
-        np.minimum(x.to_pixels(time_s), x.end) - MARK_PIXELS, np.maximum(y.to_pixels(x_m), y.end) - MARK_PIXELS
+    seconds = step / rate_hz
+    unit_m = math.ceil(FASTEST_MPS * seconds / LARGEST_STEP * 10) / 10
+    placed = points.select(
+        pl.col("lane").cast(pl.Int32).fill_null(NO_LANE),
+        "vehicle_id",
+        "frame",
+        "x_m",
+        (pl.col("frame") // step).alias("tick"),
+        (pl.col("x_m") / unit_m).round().cast(pl.Int32).alias("x"),
+        pack_speeds().alias("speed"),
+    ).sort("lane", "vehicle_id", "tick")
+    follows = (
+        (pl.col("lane").diff() == 0)
+        & (pl.col("vehicle_id").diff() == 0)
+        & (pl.col("tick").diff() == 1)
+        & (pl.col("x").diff().abs() <= LARGEST_STEP)
+    ).fill_null(value=False)
+    placed = placed.with_columns(step_of_x=pl.when(follows).then(pl.col("x").diff()).otherwise(0), begins=~follows)
+    starts = np.flatnonzero(placed["begins"].to_numpy())
+    heads = placed[starts].select(
+        "lane", "vehicle_id", "tick", pl.Series("points", np.diff(starts, append=placed.height)), "x"
     )
-    crosses = "".join(f"M{point}{CROSS}" for point in at.tolist())
-    return wrap_svg(
-        WIDTH,
-        TOP + HEIGHT + BOTTOM,
-        "Time-space diagram coloured by speed",
-        f'<rect x="{LEFT}" y="{TOP}" width="{wide}" height="{HEIGHT}" fill="{PANEL}"/>'
-        + draw_frame(x, y, "time since the recording began (s)", "position (m)", x_ticks=10, y_ticks=5)
-        + f'<image x="{LEFT}" y="{TOP}" width="{wide}" height="{HEIGHT}" preserveAspectRatio="none" '
-        f'style="image-rendering:pixelated" href="{image}"/>' + (_draw_marks(crosses) if crosses else ""),
+    bytes_of_points: NDArray[np.uint8] = np.empty((placed.height, 2), np.uint8)
+    bytes_of_points[:, 0] = placed["step_of_x"].cast(pl.Int8).to_numpy().view(np.uint8)
+    bytes_of_points[:, 1] = placed["speed"].to_numpy()
+    return {
+        "seconds": seconds,
+        "unit_m": unit_m,
+        "segments": _encode(heads.to_numpy().astype("<i4")),
+        "points": _encode(bytes_of_points),
+        "marks": [list(row) for row in place_marks(placed, errors).iter_rows()],
+    }
+
+
+def place_marks(points: pl.DataFrame, errors: pl.DataFrame, most: int = MOST_MARKS) -> pl.DataFrame:
+    """Place findings at the nearest point in time of their vehicle's track; those of a cell share a mark.
+
+    Args:
+        points: lane, vehicle_id, frame, tick, x_m.
+        errors: vehicle_id, rule, first_frame, last_frame.
+        most: greatest number of marks.
+
+    Returns:
+        Rows of lane, tick, x_m, findings, rule and vehicle_id: those of the first finding in a cell.
+    """
+    found = errors.with_columns(frame=(pl.col("first_frame") + pl.col("last_frame")) // 2).sort("frame")
+    placed = found.join_asof(
+        points.sort("frame"), on="frame", by="vehicle_id", strategy="nearest", check_sortedness=False
+    ).drop_nulls("tick")
+    cell = 1
+    while placed.select(pl.struct(_find_cell(cell)).n_unique()).item() > most:
+        cell *= 2
+    first = pl.col("tick", "x_m", "rule", "vehicle_id").first().name.prefix("first_")
+    return (
+        placed.group_by(_find_cell(cell), maintain_order=True)
+        .agg(first, pl.len().alias("findings"))
+        .select("lane", "first_tick", pl.col("first_x_m").round(1), "findings", "first_rule", "first_vehicle_id")
     )
 
 
-def _draw_marks(crosses: str) -> str:
-    """Draw marks with a halo around them."""
-    return draw_path(crosses, HALO, 3.6) + draw_path(crosses, MARK, 1.6)
+def _find_cell(size: int) -> list[pl.Expr]:
+    """Return the cell of a mark: its lane, and `size` ticks and metres each."""
+    return [pl.col("lane"), (pl.col("tick") // size).alias("column"), (pl.col("x_m") // size).alias("row")]
 
 
-def draw_scale(grid: Grid) -> str:
-    """Draw the legend of the diagrams: the colours of speeds, and the mark."""
-    x = Scale(0, grid.top_mps, 12, 332)
-    strip = encode_uri(np.arange(1, LEVELS + 1, dtype=np.uint8)[None, :])
+def _encode(numbers: NDArray[Any]) -> str:
+    """Return numbers as base64."""
+    return base64.b64encode(numbers.tobytes()).decode("ascii")
+
+
+def write_data(content: Mapping[str, Any]) -> str:
+    """Return data of a page's script as JSON that ends no element."""
+    return json.dumps(content, separators=(",", ":"), sort_keys=True).replace("<", "\\u003c")
+
+
+def draw_scale(top_mps: float) -> str:
+    """Draw the legend of speeds: colours between km/h above and m/s below."""
+    left, width, top_kmh = 40, 480, top_mps * 3.6
+    colours = colour_values(np.linspace(0.0, 1.0, COLOURS), 0, 1)
+    wide = width / COLOURS
+    strip = "".join(
+        f'<path d="M{left + wide * number:.1f} 18h{wide + 0.3:.1f}v12h-{wide + 0.3:.1f}Z" fill="{colour}"/>'
+        for number, colour in enumerate(colours)
+    )
     labels = "".join(
-        draw_text(f"{x.to_pixels(value):.1f}", 36, f"{value:g}", anchor="middle")
-        for value in make_ticks(x.low, x.high, 6)
+        draw_text(f"{left + width * value / top:.1f}", height, f"{value:g}", anchor="middle")
+        for top, height, most in ((top_kmh, 12, 8), (top_mps, 44, 6))
+        for value in make_ticks(0.0, top, most)
     )
-    cell = f"mean speed in a cell of {grid.seconds:.2g} s by {grid.metres:.2g} m (m/s)"
-    return wrap_svg(
-        760,
-        56,
-        "Legend: colour of mean speed, and the mark of errors",
-        f'<image x="12" y="8" width="320" height="14" preserveAspectRatio="none" href="{strip}"/>{labels}'
-        + draw_text(172, 51, cell, anchor="middle")
-        + f'<rect x="461" y="5" width="24" height="20" fill="{PANEL}"/>'
-        + _draw_marks(f"M470 12{CROSS}")
-        + draw_text(493, 19, "findings of severity error near here"),
-    )
+    units = draw_text(left - 6, 12, "km/h", anchor="end") + draw_text(left - 6, 44, "m/s", anchor="end")
+    return wrap_svg(left + width + 30, 50, "Legend: colours of speeds", strip + labels + units)

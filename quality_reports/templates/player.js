@@ -3,15 +3,9 @@
 (() => {
   const player = document.querySelector(".player");
   const scene = JSON.parse(document.getElementById("scene").textContent);
-  const make = (tag, properties, ...children) => {
-    const made = Object.assign(document.createElement(tag), properties);
-    made.append(...children);
-    return made;
-  };
-  const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+  const { make, button, clamp, unpack, readSpeed, nameSpeed, chooseStep, fit, colour } = tracklake;
 
   // Data: segments with positions per tick, and ticks counted without the gaps between stretches.
-  const unpack = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const heads = new DataView(unpack(scene.segments).buffer);
   const bytes = new Int8Array(unpack(scene.entries).buffer);
   const segments = [];
@@ -23,7 +17,7 @@
       y += bytes[row + 1];
       segment.x.push(x / 10);
       segment.y.push(y / 100);
-      segment.speed.push(((bytes[row + 2] & 255) - 40) / 3.6);
+      segment.speed.push(readSpeed(bytes[row + 2]));
       segment.heading.push(bytes[row + 3] / 75);
     }
     segments.push(segment);
@@ -50,21 +44,10 @@
   const canvas = make("canvas", { tabIndex: 0, ariaLabel: "Vehicles from above. Space plays, arrows step." });
   canvas.setAttribute("role", "img");
   const pen = canvas.getContext("2d");
-  const button = (label, title, act) => {
-    const made = make("button", { type: "button", textContent: label, title });
-    made.addEventListener("click", act);
-    return made;
-  };
 
   // Drawing.
   let scale, tall, origin, size;
-  const measure = () => {
-    const ratio = devicePixelRatio || 1;
-    size = [canvas.clientWidth, canvas.clientHeight];
-    canvas.width = size[0] * ratio;
-    canvas.height = size[1] * ratio;
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  };
+  const measure = () => { size = fit(canvas); };
   const toX = (x) => size[0] / 2 + (x - state.middle) * scale;
   const toY = (y) => origin + (y - top) * tall;
   const place = (values, at, share) => (at + 1 < values.length ? values[at] + (values[at + 1] - values[at]) * share : values[at]);
@@ -95,10 +78,9 @@
     pen.stroke();
     pen.setLineDash([]);
   };
-  const theme = getComputedStyle(document.documentElement);
   const drawRoad = () => {
-    const muted = theme.getPropertyValue("--muted");
-    pen.fillStyle = theme.getPropertyValue("--panel");
+    const muted = colour("--muted");
+    pen.fillStyle = colour("--panel");
     pen.fillRect(0, 0, ...size);
     pen.fillStyle = "#f4f6f8";  // light in the dark, too: dark purple must stay visible
     pen.fillRect(0, toY(edges[0]), size[0], toY(edges.at(-1)) - toY(edges[0]));
@@ -115,7 +97,7 @@
       pen.textAlign = "left";
       pen.fillText(`lane ${lane}`, 4, y);
     }
-    const step = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((metres) => metres * scale >= 70) ?? 10000;
+    const step = chooseStep(scale, 70);
     pen.textAlign = "center";
     for (let x = Math.ceil((state.middle - state.span / 2) / step) * step; toX(x) < size[0]; x += step) {
       line([toX(x), size[1] - 20], [toX(x), size[1] - 15], muted, []);
@@ -162,7 +144,7 @@
     const vehicle = vehicles.find((each) => each.id === id);
     if (!vehicle) return `vehicle ${id}: not on the road`;
     const inView = toX(vehicle.x) >= 0 && toX(vehicle.x - vehicle.length) <= size[0];
-    return `vehicle ${id}: ${(vehicle.speed * 3.6).toFixed(0)} km/h (${vehicle.speed.toFixed(1)} m/s) at ${vehicle.x.toFixed(0)} m`
+    return `vehicle ${id}: ${nameSpeed(vehicle.speed)} at ${vehicle.x.toFixed(0)} m`
       + (inView ? "" : ", out of view");
   });
   const draw = () => {
@@ -285,7 +267,7 @@
       button("Whole road", "Show the whole road (0)", showAll)),
     report,
     make("p", { className: "note" }, "0", ramp,
-      `${(scene.top_mps * 3.6).toFixed(0)} km/h (${scene.top_mps} m/s). Drag to move along the road. Keys: space, arrows, Home, End, + and −, `
+      `${nameSpeed(scene.top_mps)}. Drag to move along the road. Keys: space, arrows, Home, End, + and −, `
       + "0 (whole road), n and p (findings)." + (scene.markings ? "" : " Markings are unknown: dotted lines are the median positions in each lane.")),
   );
   player.hidden = false;

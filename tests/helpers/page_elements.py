@@ -7,8 +7,8 @@ from pathlib import Path
 import tracklake.quality_reports.pages
 
 SCRIPT = Path(tracklake.quality_reports.pages.__file__).parents[1] / "templates" / "report.js"
-PLAYER = SCRIPT.with_name("player.js")
-SCENE = re.compile(r'<script type="application/json" id="scene">[^<]*</script>')
+DRAWING = [SCRIPT.with_name(name) for name in ("canvas.js", "player.js", "diagrams.js")]
+DATA = re.compile(r'<script type="application/json" id="(?:scene|tracks)">[^<]*</script>')
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;\u202e"
 
@@ -37,11 +37,12 @@ class Elements(HTMLParser):
 
 
 def drop_script(html: str) -> str:
-    """The page without the script that every page has, and without the player's script and data."""
-    own, player = (f"<script>\n{path.read_text(encoding='utf-8')}\n</script>" for path in (SCRIPT, PLAYER))
-    assert html.count(own) == 1
-    assert html.count(player) == len(SCENE.findall(html)) <= 1
-    return SCENE.sub("", html.replace(own, "").replace(player, ""))
+    """The page without the script that every page has, and without those of pictures and their data."""
+    for path in (SCRIPT, *DRAWING):
+        block = f"<script>\n{path.read_text(encoding='utf-8')}\n</script>"
+        assert html.count(block) == 1 if path == SCRIPT else html.count(block) <= 1
+        html = html.replace(block, "")
+    return DATA.sub("", html)
 
 
 def parse(html: str) -> Elements:

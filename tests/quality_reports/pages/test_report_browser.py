@@ -206,7 +206,42 @@ def test_the_player_is_steered_by_keys_and_by_its_slider(browser, scene):
     assert browser.errors == []
 
 
-def test_without_a_script_a_subset_page_hides_the_player_alone(browser, scene):
+@pytest.mark.parametrize(("width", "dark"), [(400, True), (1280, False), (1920, True)])
+def test_time_space_diagrams_are_zoomed_moved_and_read(browser, scene, width, dark):
+    browser.open(scene, width=width, height=SCREEN, dark=dark)
+    shown, hint = (f"document.querySelector('.diagrams {name}').textContent" for name in ("output", ".hint"))
+    canvas = "document.querySelector('.diagrams canvas')"
+    assert browser.run(f"{canvas}.clientHeight") >= 332, "300 pixels and the axes"
+    browser.run(f"{canvas}.scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    browser.run("new Promise(done => setTimeout(done, 100))")
+    # 20 s and 200.6 m, of which vehicle 1 drives 0.4 m per frame and is at 100 m after 10 s, in the middle.
+    whole = browser.run(shown)
+    assert whole == "0 to 20 s, \u22122 to 199 m"
+    at = f"{canvas}.getBoundingClientRect()"
+    x, y, w = browser.run(f"(r => [r.left, r.top, r.width])({at})")
+    middle = {"x": x + 46 + (w - 54) / 2, "y": y + 8 + 154}
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", **middle)
+    said = browser.run(hint)
+    assert "36 km/h (10.0 m/s)" in said
+    assert "vehicle 1 at " in said or "vehicle 2 at " in said
+    assert browser.run(hint).startswith("overlap of vehicle ")
+    label = "[...document.querySelectorAll('.diagrams button')]"
+    browser.run(f"{label}[1].click()")
+    assert browser.run(shown) == "5 to 15 s, \u22122 to 199 m"
+    for kind, by in (("mousePressed", 0), ("mouseMoved", (w - 54) / 4), ("mouseReleased", (w - 54) / 4)):
+        place = {"x": middle["x"] + by, "y": middle["y"]}
+        browser.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+    assert browser.run(shown) == "2 to 12 s, \u22122 to 199 m"
+    browser.run(f"{canvas}.dispatchEvent(new WheelEvent('wheel', {{ctrlKey: true, deltaY: -200, cancelable: true}}))")
+    assert browser.run(shown) != "2 to 12 s, \u22122 to 199 m"
+    browser.run(f"{canvas}.dispatchEvent(new KeyboardEvent('keydown', {{key: '0'}}))")
+    assert browser.run(shown) == whole
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    assert browser.errors == []
+
+
+def test_without_a_script_a_subset_page_hides_the_player_and_the_diagrams_alone(browser, scene):
     browser.open(scene, script=False)
-    assert browser.run("document.querySelector('.player').hidden && document.querySelector('[data-finding]').hidden")
+    hidden = "['.player', '.diagrams', '[data-finding]'].every(each => document.querySelector(each).hidden)"
+    assert browser.run(hidden)
     assert browser.run("document.querySelectorAll('.example .plan').length") > 0
