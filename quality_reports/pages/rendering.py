@@ -61,7 +61,7 @@ def format_cell(value: object, kind: str = "text") -> str:
 
     Args:
         value: plain value.
-        kind: text, int, percent, bool, duration, or f0 to f4 for that many decimals.
+        kind: text, int, percent, bool, duration, speed (in m/s; km/h stands below), or f0 to f4 for that many decimals.
     """
     if value is None:
         return DASH
@@ -82,6 +82,8 @@ def _format_number(value: float, kind: str) -> str:
         return _percent(value)
     if kind == "duration":
         return format_duration(value)
+    if kind == "speed":
+        return Markup(f"{_fixed(value, 2)} <small>{_fixed(value * 3.6, 1)}</small>")  # numbers only
     return _fixed(value, int(kind[1:]))
 
 
@@ -113,7 +115,8 @@ def _format_worst(value: float | None, unit: str) -> str:
     """Format a finding's worst value with its unit; counts have no decimals."""
     if value is None:
         return DASH
-    return f"{_integer(value) if unit in COUNTED_UNITS else _fixed(value, 2)} {_unit(unit)}"
+    kmh = f" ({_fixed(value * 3.6, 1)} km/h)" if unit == "m/s" else ""
+    return f"{_integer(value) if unit in COUNTED_UNITS else _fixed(value, 2)} {_unit(unit)}{kmh}"
 
 
 def _integer(value: float | None) -> str:

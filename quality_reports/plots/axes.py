@@ -16,6 +16,8 @@ from tracklake.schemas.arrays import Floats
 from tracklake.schemas.chart_theme import GRID, MUTED
 
 MINUS = "\N{MINUS SIGN}"
+KMH_PER_MPS = 3.6
+"""Factor from m/s to km/h."""
 
 Number = TypeVar("Number", float, Floats)
 
@@ -91,10 +93,42 @@ def draw_path(shape: str, colour: str, width: float) -> str:
     )
 
 
-def draw_frame(x: Scale, y: Scale, x_title: str, y_title: str, *, x_ticks: int, y_ticks: int) -> str:
-    """Return the grid, the tick labels and the titles around the rectangle of two scales."""
+def draw_frame(
+    x: Scale,
+    y: Scale,
+    x_title: str,
+    y_title: str,
+    *,
+    x_ticks: int,
+    y_ticks: int,
+    x_kmh: bool = False,
+    y_kmh: bool = False,
+) -> str:
+    """Return the grid, the tick labels and the titles around the rectangle of two scales.
+
+    Args:
+        x: scale across.
+        y: scale upwards.
+        x_title: text below.
+        y_title: text above the left end.
+        x_ticks: most steps between ticks across.
+        y_ticks: most steps between ticks upwards; 0 for none.
+        x_kmh: whether x is a speed in m/s, which is written in km/h as well, in a second row.
+        y_kmh: whether y is one, which is written in km/h on the right as well.
+    """
     left, right, bottom, top = x.start, x.end, y.start, y.end
     parts = []
+    if x_kmh:
+        for value in make_ticks(x.low * KMH_PER_MPS, x.high * KMH_PER_MPS, x_ticks):
+            at = f"{x.to_pixels(value / KMH_PER_MPS):.1f}"
+            parts.append(f'<path d="M{at} {bottom}v4" stroke="{MUTED}" fill="none"/>')
+            parts.append(draw_text(at, bottom + 29, format_number(value), anchor="middle"))
+    if y_kmh:
+        parts += [
+            draw_text(right + 4, f"{y.to_pixels(value / KMH_PER_MPS) + 4:.1f}", format_number(value))
+            for value in make_ticks(y.low * KMH_PER_MPS, y.high * KMH_PER_MPS, y_ticks + 1)
+        ]
+        parts.append(draw_text(right + 20, top - 7, "km/h", anchor="end"))
     for value in make_ticks(x.low, x.high, x_ticks):
         at = f"{x.to_pixels(value):.1f}"
         parts.append(f'<path d="M{at} {top}V{bottom + 4}" stroke="{GRID}" fill="none"/>')
@@ -104,7 +138,7 @@ def draw_frame(x: Scale, y: Scale, x_title: str, y_title: str, *, x_ticks: int, 
         parts.append(f'<path d="M{left - 4} {height:.1f}H{right}" stroke="{GRID}" fill="none"/>')
         parts.append(draw_text(left - 7, f"{height + 4:.1f}", format_number(value), anchor="end"))
     parts.append(f'<path d="M{left} {top}V{bottom}H{right}" stroke="{MUTED}" fill="none"/>')
-    parts.append(draw_text(f"{(left + right) / 2:.1f}", bottom + 32, x_title, anchor="middle"))
+    parts.append(draw_text(f"{(left + right) / 2:.1f}", bottom + (45 if x_kmh else 32), x_title, anchor="middle"))
     parts.append(draw_text(left - 40, top - 7, y_title))
     return "".join(parts)
 

@@ -10,8 +10,10 @@ from tracklake.schemas.chart_theme import BLUE, INK, MUTED, ORANGE
 
 Row = Mapping[str, Any]
 
-WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 52, 14, 30, 42
+WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 52, 14, 30, 55
 """Width of a plot and the margins around its axes, in pixels."""
+SPEED_TITLE = "recorded speed (m/s, below in km/h)"
+"""Title of an axis of speeds."""
 HISTOGRAM_HEIGHT = 130
 """Height of a histogram's axes, in pixels."""
 LABELS, LABEL_CHARS = 190, 26
@@ -39,7 +41,7 @@ def draw_speed_histogram(histogram: Sequence[Row], summary: Sequence[Row]) -> st
         bins = [row for row in histogram if row["dataset"] == dataset]
         marks = [row for row in summary if row["dataset"] == dataset and row["subset"] is None]
         y = Scale(0, 105 * max(row["share"] for row in bins), height + HISTOGRAM_HEIGHT, height)
-        drawn.append(draw_frame(x, y, "recorded speed (m/s)", "share of entries (%)", x_ticks=12, y_ticks=4))
+        drawn.append(draw_frame(x, y, SPEED_TITLE, "share of entries (%)", x_ticks=12, y_ticks=4, x_kmh=True))
         bars = "".join(
             f"M{x.to_pixels(row['speed_mps']) + 0.5:.1f} {y.start}V{y.to_pixels(100 * row['share']):.1f}"
             f"H{x.to_pixels(row['speed_mps'] + 1) - 0.5:.1f}V{y.start}Z"
@@ -77,7 +79,7 @@ def draw_speed_ranges(summary: Sequence[Row]) -> str:
         f'<path d="{thick}" stroke="{BLUE}" stroke-opacity="0.75" stroke-width="7" fill="none"/>'
         f'<path d="{median}" stroke="{INK}" stroke-width="2" fill="none"/>'
     )
-    return _wrap_lines(lines, x, "recorded speed (m/s)", "Range of recorded speed per subset", marks)
+    return _wrap_lines(lines, x, SPEED_TITLE, "Range of recorded speed per subset", marks)
 
 
 def draw_start_positions(positions: Sequence[Row], starts: Sequence[Row]) -> str:
@@ -150,7 +152,8 @@ def _place_lines(rows: Iterable[Row]) -> dict[tuple[str, str], int]:
 def _wrap_lines(lines: Mapping[tuple[str, str], int], x: Scale, title: str, label: str, marks: str) -> str:
     """Return the drawing of marks on one line per subset, each beside its name."""
     bottom = TOP + len(lines) * ROW_HEIGHT
-    frame = draw_frame(x, Scale(0, 1, bottom, TOP), title, "", x_ticks=12, y_ticks=0)
+    kmh = title == SPEED_TITLE
+    frame = draw_frame(x, Scale(0, 1, bottom, TOP), title, "", x_ticks=12, y_ticks=0, x_kmh=kmh)
     names = "".join(
         draw_text(LABELS - 8, y + 4, html.escape(_shorten(subset)), anchor="end") for (_, subset), y in lines.items()
     )

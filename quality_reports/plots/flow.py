@@ -18,7 +18,7 @@ FLOW = (
 )
 """Columns of subset_flow.sql and their axis titles."""
 
-PANEL_WIDTH, PANEL_HEIGHT, LEFT, TOP, BOTTOM, APART = 250, 80, 58, 40, 38, 20
+PANEL_WIDTH, PANEL_HEIGHT, LEFT, TOP, BOTTOM, APART = 250, 80, 58, 40, 38, 28
 """Size of a plot, the margins around it, and the space between two, in pixels."""
 MOST_COLUMNS, WIDEST = 4, 420
 """Most plots of flow against density side by side, and the greatest width of one, in pixels."""
@@ -47,7 +47,7 @@ def draw_flow(intervals: Sequence[Row]) -> str:
             x = Scale(0, end_s, left, left + PANEL_WIDTH)
             low, high = data.select(pl.col(column).min().alias("low"), pl.col(column).max().alias("high")).row(0)
             y = Scale(min(0.0, low or 0.0), 1.05 * max(1.0, high or 0.0), top + PANEL_HEIGHT, top)
-            drawn.append(draw_frame(x, y, "time (s)", title, x_ticks=6, y_ticks=4))
+            drawn.append(draw_frame(x, y, "time (s)", title, x_ticks=6, y_ticks=4, y_kmh=column == "speed_mps"))
             path = draw_line(points, x, y, column, "middle_s")
             dots = draw_line(points.with_columns(follows=pl.lit(value=False)), x, y, column, "middle_s")
             drawn += [draw_path(path, BLUE, 1.4), draw_path(dots, BLUE, 4)]

@@ -39,6 +39,13 @@
   };
 
   // Drawing.
+  const measure = (canvas) => {
+    const [w, h] = [canvas.clientWidth - LEFT - RIGHT, canvas.clientHeight - TOP - BOTTOM];
+    const scaleT = w / (shown.t[1] - shown.t[0]), scaleX = h / (shown.x[1] - shown.x[0]);
+    const placeT = (t) => LEFT + (t - shown.t[0]) * scaleT;
+    const placeX = (x) => TOP + h - (x - shown.x[0]) * scaleX;
+    return { w, h, scaleT, scaleX, placeT, placeX };
+  };
   const crosses = (pen, points, tint, width) => {
     pen.beginPath();
     pen.strokeStyle = tint;
@@ -67,11 +74,8 @@
     const { canvas, segments } = diagram;
     const pen = canvas.getContext("2d");
     const [width, height] = fit(canvas);
-    const [w, h] = [width - LEFT - RIGHT, height - TOP - BOTTOM];
+    const { w, h, scaleT, scaleX, placeT, placeX } = measure(canvas);
     if (w <= 0) return;
-    const scaleT = w / (shown.t[1] - shown.t[0]), scaleX = h / (shown.x[1] - shown.x[0]);
-    const placeT = (t) => LEFT + (t - shown.t[0]) * scaleT;
-    const placeX = (x) => TOP + h - (x - shown.x[0]) * scaleX;
     const muted = colour("--muted");
     pen.clearRect(0, 0, width, height);
     pen.fillStyle = colour("--raster");
@@ -143,7 +147,6 @@
     crosses(pen, points, "#ffffff", 4);
     crosses(pen, points, "#000000", 1.6);
     pen.restore();
-    diagram.place = { placeT, placeX, scaleT, scaleX, w, h };
     diagram.stale = false;
   };
   const inView = ({ canvas }) => {
@@ -168,8 +171,8 @@
 
   // Acts.
   const say = (diagram, across, down) => {
-    const { placeX, placeT } = diagram.place;
-    const tick = toTick(shown.t[0] + (across - LEFT) / diagram.place.scaleT);
+    const { placeX, placeT, scaleT } = measure(diagram.canvas);
+    const tick = toTick(shown.t[0] + (across - LEFT) / scaleT);
     let best = null;
     for (const { id, first, last, row } of diagram.segments) {
       if (tick < first - 1 || tick > last + 1) continue;
@@ -196,7 +199,7 @@
   const listen = (diagram) => {
     const { canvas } = diagram;
     const share = (event) => {
-      const { w, h } = diagram.place;
+      const { w, h } = measure(canvas);
       return [clamp((event.offsetX - LEFT) / w, 0, 1), clamp(1 - (event.offsetY - TOP) / h, 0, 1)];
     };
     let held = null;
@@ -204,12 +207,13 @@
     canvas.addEventListener("pointerup", () => { held = null; });
     canvas.addEventListener("pointercancel", () => { held = null; });
     canvas.addEventListener("pointermove", (event) => {
-      if (!diagram.place) return;
+      if (diagram.stale && held === null) return;
       if (held === null) return say(diagram, event.offsetX, event.offsetY);
       const by = [held[0] - event.clientX, event.clientY - held[1]];
       held = [event.clientX, event.clientY];
-      move("t", by[0] / diagram.place.scaleT);
-      move("x", by[1] / diagram.place.scaleX);
+      const { scaleT, scaleX } = measure(canvas);
+      move("t", by[0] / scaleT);
+      move("x", by[1] / scaleX);
     });
     canvas.addEventListener("dblclick", (event) => move("t", 0, 0.5, share(event)[0]));
     canvas.addEventListener("wheel", (event) => {

@@ -59,7 +59,7 @@
   const read = (cell) => {
     const text = cell?.textContent.trim() ?? "";
     if (text === "" || text === "\u2013") return null;
-    return cell.classList.contains("n") ? parseFloat(text.replace(/[,<+\s]/g, "").replace("\u2212", "-")) : text;
+    return cell.classList.contains("n") ? parseFloat(text.replace(/[,<+]/g, "").replace("\u2212", "-")) : text;
   };
   const compare = (a, b) => (typeof a === "number" ? a - b : a.localeCompare(b, "en", { numeric: true }));
   const listGroups = (body) => {

@@ -68,7 +68,7 @@ def test_every_colour_of_a_plot_follows_the_theme(report):
 
 def test_every_axis_has_its_unit(report):
     for title in (
-        "recorded speed (m/s)",
+        "recorded speed (m/s, below in km/h)",
         "share of entries (%)",
         "x of the first entry (m)",
         "vehicles per lane and second",
@@ -98,6 +98,8 @@ def test_every_statement_says_what_a_row_is():
         (True, "bool", "yes"),
         (["a", "b"], "text", "a, b"),
         (61.0, "duration", "61.0 s"),
+        (-27.5, "speed", "\N{MINUS SIGN}27.50 <small>\N{MINUS SIGN}99.0</small>"),
+        (None, "speed", DASH),
     ],
 )
 def test_cells(value, kind, text):

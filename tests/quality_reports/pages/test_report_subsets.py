@@ -166,7 +166,7 @@ def test_diagrams_axes_and_units(open_lake, road):
         "density (veh/km)",
         "speed (m/s)",
         "time (s)",
-        "recorded speed (m/s)",
+        "recorded speed (m/s, below in km/h)",
         "share of entries (%)",
         "x of the first entry (m)",
     ):
@@ -250,12 +250,12 @@ def test_a_page_says_what_is_known_of_its_subset(open_lake, road):
     lower, upper, arterial = pages["01-lower.html"], pages["01-upper.html"], pages["peachtree-north.html"]
     assert "negative_headway error 2 100.00 % 8 200.00 %" in lower, "8 findings' entries of the 4 that `subsets` tells"
     assert "Entries without error 92.00 % nor with a warning: 90.00 %" in lower
-    assert "Speed 0.125 m/s" in lower
+    assert "Speed 0.125 m/s (0.45 km/h)" in lower
     assert "Not checked: outside_lane." in lower
     assert "The least feasible 1 of 1 vehicles" in lower
     assert "Cut-off 2 m; 1 of 2 judged starts are late (50.00 %)" in lower
     assert "The longest 1 of 1" in lower
-    assert "31.00 100 40.00 mean_speed 1 2.00 0.50 25 3.00" in lower, "the repair window of vehicle 2"
+    assert "31.00 100 40.00 144.0 mean_speed 1 2.00 0.50 25 3.00" in lower, "the repair window of vehicle 2"
     assert "history csp 4" in lower
     assert "1 of 1 vehicles reverse" in upper
     assert "excluded: 1 of 1 vehicles reverse" in upper
