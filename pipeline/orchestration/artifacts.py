@@ -38,43 +38,29 @@ class FigureTable:
     rows: list[dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class ReportLink:
-    """A link to the report's page: its key as that of a table, meaning, file URI, and words shown instead of that."""
-
-    key: str
-    description: str
-    address: str
-    text: str
-
-
-def summarise_report(root: Path) -> tuple[list[FigureTable], ReportLink]:
-    """Return the tables of reports/quality.json and the link to reports/index.html.
+def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, str]]:
+    """Return the tables of reports/quality.json, and the link to reports/index.html as Prefect takes it.
 
     Raises:
         OSError: the lake has no report.
     """
     quality = read_quality(root)
     make_key = partial(_make_key, root=root, lake_id=load(root).lake_id)
-    tables = [
-        FigureTable(make_key("findings"), "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
-        FigureTable(
-            make_key("subsets"), "Per subset: its size, and the entries that break each rule.", _list_subsets(quality)
-        ),
-        FigureTable(
-            make_key("ingestion"), "Per source file: rows read = rows kept + rows dropped.", _list_files(quality)
-        ),
-        FigureTable(
-            make_key("completeness"),
-            "Per recording: what was announced beside what was found.",
-            _list_completeness(quality),
-        ),
-    ]
-    page = (root / REPORTS / PAGE).resolve()
-    # Brackets would end the link's text in the Markdown that Prefect makes of it.
-    text = "quality report of " + re.sub(r"[^\w .-]", "_", root.resolve().name)
-    where = "A page on the disk of the machine that made it; browsers open it by its address, not by a click."
-    return tables, ReportLink(make_key("report"), where, page.as_uri(), text)
+    figures = (
+        ("findings", "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
+        ("subsets", "Per subset: its size, and the entries that break each rule.", _list_subsets(quality)),
+        ("ingestion", "Per source file: rows read = rows kept + rows dropped.", _list_files(quality)),
+        ("completeness", "Per recording: what was announced beside what was found.", _list_completeness(quality)),
+    )
+    link = {
+        "key": make_key("report"),
+        "description": "A page on the disk of the machine that made it; browsers open it by its address, not by a "
+        "click.",
+        "link": (root / REPORTS / PAGE).resolve().as_uri(),
+        # Brackets would end the link's text in the Markdown that Prefect makes of it.
+        "link_text": "quality report of " + re.sub(r"[^\w .-]", "_", root.resolve().name),
+    }
+    return [FigureTable(make_key(what), meaning, rows) for what, meaning, rows in figures], link
 
 
 def tabulate_messages(root: Path, lake_id: str, result: RunResult) -> FigureTable:

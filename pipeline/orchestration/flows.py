@@ -114,8 +114,7 @@ def _run_request(request: RunRequest, lock_timeout_s: float = 0.0) -> State[Any]
         return Failed(message=_shorten(str(error).splitlines()), data=error)
     if REPORT in request.steps and not Planner(request.root, manifest, settings).find_outstanding(REPORT)[0]:
         tables, link = summarise_report(request.root)
-        show = partial(create_link_artifact, link_text=link.text, key=link.key, description=link.description)
-        result.notes += publish(tables) or attach(partial(show, link=link.address))
+        result.notes += publish(tables) or attach(partial(create_link_artifact, **link))
     messages = tabulate_messages(request.root, manifest.lake_id, result)
     for row in messages.rows:
         get_run_logger().log(logging.getLevelName(row["level"]), "%s: %s", row["kind"], row["message"])

@@ -65,7 +65,7 @@ def write_sample(
     aside, old = name_unfinished(out), name_unfinished(out)
     aside.mkdir()
     try:
-        built = build_sample(aside, formats, minutes, seed, progress or (lambda _: None))
+        rows, recordings = build_sample(aside, formats, minutes, seed, progress or (lambda _: None))
         _require_replaceable(out)
         if out.exists():
             out.rename(old)
@@ -73,12 +73,7 @@ def write_sample(
     finally:
         for leftover in (aside, old):
             shutil.rmtree(leftover, ignore_errors=True)
-    return SampleSummary(
-        files=tuple(out / name for name in built.files),
-        rows=built.rows,
-        recordings=built.recordings,
-        seconds=time.perf_counter() - began,
-    )
+    return SampleSummary(tuple(sorted(out.iterdir())), rows, recordings, time.perf_counter() - began)
 
 
 def _require_replaceable(out: Path) -> None:

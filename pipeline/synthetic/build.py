@@ -20,7 +20,6 @@ from tracklake.pipeline.synthetic.scenarios import (
     NGSIM_TEXT,
     HighdScenario,
     NgsimScenario,
-    Plan,
     Road,
     Traffic,
 )
@@ -48,39 +47,26 @@ noise and known defects were added. `tracklake sample` wrote them (seed {seed}, 
 
 
 @dataclass(frozen=True)
-class _Run:
-    """One carriageway to simulate; `index` is part of its random seed."""
+class _Job:
+    """One subset: its file, and the carriageway to simulate; `index` is part of its random seed."""
 
+    dataset: str
+    recording: str
+    subset: str
+    file: str
     index: int
     road: Road
     traffic: Traffic
     frames: int
 
 
-@dataclass(frozen=True)
-class _Job:
-    """The origin and the file of one subset."""
-
-    dataset: str
-    recording: str
-    subset: str
-    file: str
-    run: _Run
-
-
-@dataclass(frozen=True)
-class Built:
-    """The names of the written files, and the number of data lines in files of tracks and of recordings."""
-
-    files: tuple[str, ...]
-    rows: int
-    recordings: int
-
-
 def build_sample(
     folder: Path, formats: tuple[str, ...], minutes: float, seed: int, progress: Callable[[str], None]
-) -> Built:
-    """Write a whole sample into an empty folder; the arguments are those of `write_sample`."""
+) -> tuple[int, int]:
+    """Write a whole sample into an empty folder; the arguments are those of `write_sample`.
+
+    Returns the number of data lines in files of tracks, and of recordings.
+    """
     home = find_sumo()
     recordings = HIGHD if "highd" in formats else ()
     groups: list[tuple[str, str, tuple[NgsimScenario, ...]]] = [
@@ -110,11 +96,8 @@ def build_sample(
     progress("writing the truth")
     truth.build_truth(rows + truth.list_counts(found)).write_parquet(folder / TRUTH_FILE)
     (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes), encoding="utf-8")
-    return Built(
-        files=tuple(sorted(path.name for path in folder.iterdir())),
-        rows=sum(count.read for count in found.files if not count.file.endswith("Meta.csv")),
-        recordings=len(recordings) + sum(len(scenarios) for _, _, scenarios in groups),
-    )
+    lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
+    return lines, len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
 
 
 def _list_jobs(
@@ -124,17 +107,16 @@ def _list_jobs(
     for place, scenario in enumerate(HIGHD):
         frames = max(1, round(scenario.share * minutes * 60 * scenario.road.rate_hz))
         for side, traffic in (("upper", scenario.upper), ("lower", scenario.lower)):
-            run = _Run(2 * place + (side == "lower"), scenario.road, traffic, frames)
-            name = scenario.recording
-            jobs.append(_Job("highd", name, f"{name}-{side}", f"{name}_tracks.csv", run))
+            name, index = scenario.recording, 2 * place + (side == "lower")
+            file = f"{name}_tracks.csv"
+            jobs.append(_Job("highd", name, f"{name}-{side}", file, index, scenario.road, traffic, frames))
     jobs = jobs if recordings else []
     order = {each.start_time: 100 + i for i, each in enumerate(NGSIM_TEXT + NGSIM_SOCRATA + NGSIM_CSV)}
     for _, file, scenarios in groups:
         for each in scenarios:
             frames = max(1, round(each.share * minutes * 60 * FREEWAY.rate_hz))
             name = ngsim.name_recording(each.start_time)
-            run = _Run(order[each.start_time], FREEWAY, each.traffic, frames)
-            jobs.append(_Job("ngsim", name, name, file, run))
+            jobs.append(_Job("ngsim", name, name, file, order[each.start_time], FREEWAY, each.traffic, frames))
     return jobs
 
 
@@ -143,12 +125,12 @@ def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[s
         own_folder = folder / job.subset
         own_folder.mkdir()
         # SUMO's seed is a non-negative 32-bit number.
-        own_seed = int(np.random.default_rng([seed, job.run.index, 0]).integers(2**31))
-        return simulate(home, own_folder, job.run.road, job.run.traffic, frames=job.run.frames, seed=own_seed)
+        own_seed = int(np.random.default_rng([seed, job.index, 0]).integers(2**31))
+        return simulate(home, own_folder, job.road, job.traffic, frames=job.frames, seed=own_seed)
 
     with TemporaryDirectory(prefix="tracklake-sample-") as folder, ThreadPoolExecutor(AT_ONCE) as pool:
         # Congested traffic takes longest and starts first.
-        slowest = sorted(jobs, key=lambda job: job.run.traffic.bottleneck_mps is None)
+        slowest = sorted(jobs, key=lambda job: job.traffic.bottleneck_mps is None)
         waiting = {pool.submit(simulate_job, job, Path(folder)): job.subset for job in slowest}
         try:
             for done, future in enumerate(as_completed(waiting), start=1):
@@ -184,15 +166,14 @@ def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object
 
 def _damage_tracks(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, list[dict[str, object]]]:
     """Add noise and defects; also return the truth about them."""
-    random = np.random.default_rng([seed, job.run.index, 1])
+    random = np.random.default_rng([seed, job.index, 1])
     is_ngsim = job.dataset == "ngsim"
-    noisy = add_noise(tracks, job.run.road, MAST if is_ngsim else DRONE, random)
-    plan: Plan = job.run.traffic.plan
+    noisy = add_noise(tracks, job.road, MAST if is_ngsim else DRONE, random)
     injected = defects.inject_defects(
         noisy,
-        plan,
-        rate_hz=job.run.road.rate_hz,
-        on_ramp_lane=job.run.road.lanes + 2 if job.run.road.ramp else None,
+        job.traffic.plan,
+        rate_hz=job.road.rate_hz,
+        on_ramp_lane=job.road.lanes + 2 if job.road.ramp else None,
         unseen_leaders=is_ngsim,
         random=random,
     )
@@ -244,19 +225,14 @@ def _write_highd(
         damaged, declared = _damage_tracks(tracks, job, seed)
         both_damaged.append(damaged)
         rows += declared
-    files = highd.build_recording(scenario, *both_damaged, frames=pair[0].run.frames)
-    text = files.tracks
+    files = highd.build_recording(scenario, *both_damaged, frames=pair[0].frames)
     if scenario.damaged:
-        random = np.random.default_rng([seed, pair[0].run.index, 2])
+        random = np.random.default_rng([seed, pair[0].index, 2])
         dialect = damage.Dialect(header=True, separator=",", number_field=6)
-        lines, extra = damage.damage_lines(text.splitlines(), dialect, random)
+        lines, extra = damage.damage_lines(files["tracks"].splitlines(), dialect, random)
         rows += _list_line_defects(extra, "highd", scenario.recording, pair[0].file)
-        text = "\n".join(lines) + "\n"
-    for suffix, content in (
-        ("recordingMeta", files.recording_meta),
-        ("tracksMeta", files.tracks_meta),
-        ("tracks", text),
-    ):
+        files["tracks"] = "\n".join(lines) + "\n"
+    for suffix, content in files.items():
         (folder / f"{scenario.recording}_{suffix}.csv").write_bytes(content.encode())
     return rows
 
@@ -277,7 +253,7 @@ def _write_ngsim(
         damaged, declared = _damage_tracks(tracks, job, seed)
         written.append(ngsim.build_rows(damaged, scenario.start_time))
         rows += declared
-    random = np.random.default_rng([seed, jobs[0].run.index, 2])
+    random = np.random.default_rng([seed, jobs[0].index, 2])
     together = pl.concat(written)
     if kind == "ngsim-text":
         lines, dialect = ngsim.format_text(together), damage.Dialect(header=False, separator=None, number_field=5)

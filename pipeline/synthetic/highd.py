@@ -8,7 +8,7 @@ The simulated `y` and lateral speed are those of the body's middle, by which `la
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -38,27 +38,14 @@ NEIGHBORS = {
 }
 
 
-@dataclass(frozen=True)
-class Markings:
-    """y of the lane markings in the image, metres, top to bottom."""
-
-    upper: tuple[float, ...]
-    lower: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class HighdFiles:
-    """The content of a recording's three files."""
-
-    recording_meta: str
-    tracks_meta: str
-    tracks: str
+Markings = tuple[tuple[float, ...], tuple[float, ...]]
+"""y of the lane markings in the image, in m, top to bottom: of the upper and of the lower carriageway."""
 
 
 def build_markings(lanes: int, lane_width_m: float) -> Markings:
     """Build the markings of a site with the same number of lanes on both carriageways."""
     upper = tuple(round(UPPER_FIRST_MARKING_M + i * lane_width_m, 2) for i in range(lanes + 1))
-    return Markings(upper, tuple(round(upper[-1] + MEDIAN_M + i * lane_width_m, 2) for i in range(lanes + 1)))
+    return upper, tuple(round(upper[-1] + MEDIAN_M + i * lane_width_m, 2) for i in range(lanes + 1))
 
 
 def build_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_m: float) -> pl.DataFrame:
@@ -66,14 +53,14 @@ def build_rows(tracks: pl.DataFrame, markings: Markings, *, upper: bool, window_
 
     The generator's tracks have x from the entrance in the direction of travel; `lost` entries are removed.
     """
-    lanes = len(markings.upper) - 1
+    lanes = len(markings[0]) - 1
     sign = -1.0 if upper else 1.0
     x, y, length, width, speed, accel, lateral = (
         tracks[name].to_numpy() for name in ("x", "y", "length", "width", "speed", "accel", "lateral_speed")
     )
     vehicle, lane = tracks["vehicle"].to_numpy(), tracks["lane"].to_numpy().astype(np.int64)
     corner_x = np.round(window_m - x if upper else x - length, 2)
-    middle_y = markings.upper[-1] - y if upper else markings.lower[0] + y
+    middle_y = markings[0][-1] - y if upper else markings[1][0] + y
     front = window_m - corner_x if upper else corner_x + length
     around = find_surroundings(tracks.with_columns(pl.Series("x", front)))
     around = replace(around, leader=select_recorded_leaders(around.leader, tracks))
@@ -155,8 +142,10 @@ def describe_tracks(rows: pl.DataFrame, classes: Mapping[int, str], *, driving_d
     )  # fmt: skip
 
 
-def build_recording(scenario: HighdScenario, upper: pl.DataFrame, lower: pl.DataFrame, *, frames: int) -> HighdFiles:
-    """Build a recording's files from its carriageways; their tracks have the column `lost` and share no vehicle."""
+def build_recording(
+    scenario: HighdScenario, upper: pl.DataFrame, lower: pl.DataFrame, *, frames: int
+) -> dict[str, str]:
+    """Build a recording's files, by ending, from its carriageways, whose tracks have `lost` and share no vehicle."""
     markings = build_markings(scenario.road.lanes, scenario.road.lane_width_m)
     window = scenario.road.window_m
     rows, meta = [], []
@@ -183,11 +172,11 @@ def build_recording(scenario: HighdScenario, upper: pl.DataFrame, lower: pl.Data
         "numVehicles": str(tracks_meta.height),
         "numCars": str(int((tracks_meta["class"] == "Car").sum())),
         "numTrucks": str(int((tracks_meta["class"] == "Truck").sum())),
-        "upperLaneMarkings": ";".join(f"{value:.2f}" for value in markings.upper),
-        "lowerLaneMarkings": ";".join(f"{value:.2f}" for value in markings.lower),
+        "upperLaneMarkings": ";".join(f"{value:.2f}" for value in markings[0]),
+        "lowerLaneMarkings": ";".join(f"{value:.2f}" for value in markings[1]),
     }
-    return HighdFiles(
-        recording_meta=",".join(fields) + "\n" + ",".join(fields.values()) + "\n",
-        tracks_meta=tracks_meta.write_csv(float_precision=2),
-        tracks=pl.concat(rows).sort("id", "frame").write_csv(float_precision=2),
-    )
+    return {
+        "recordingMeta": ",".join(fields) + "\n" + ",".join(fields.values()) + "\n",
+        "tracksMeta": tracks_meta.write_csv(float_precision=2),
+        "tracks": pl.concat(rows).sort("id", "frame").write_csv(float_precision=2),
+    }

@@ -34,12 +34,9 @@ DECIMALS = {
     "Local_X": 3, "Local_Y": 3, "Global_X": 3, "Global_Y": 3, "v_Length": 1, "v_Width": 1, "v_Vel": 2, "v_Acc": 2,
     "Space_Headway": 2, "Time_Headway": 2,
 }  # fmt: skip
-PORTAL_COLUMNS = (
-    "Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y", "v_length",
-    "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID", "O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction",
-    "Movement", "Preceding", "Following", "Space_Headway", "Time_Headway", "Location",
-)  # fmt: skip
 ZONES = ("O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement")
+PORTAL_COLUMNS = tuple("v_length" if name == "v_Length" else name for name in COLUMNS[:14])
+PORTAL_COLUMNS += (*ZONES, *COLUMNS[14:], "Location")
 SEPARATED = ("Total_Frames", "Preceding", "Following", "Space_Headway", "Time_Headway")
 """Columns that the portal writes with thousands separators, quoted where one occurs."""
 TEXT_WIDTHS = (5, 6, 6, 14, 8, 9, 12, 12, 5, 5, 2, 6, 7, 3, 6, 6, 9, 8)

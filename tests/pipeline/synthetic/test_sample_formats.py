@@ -39,8 +39,8 @@ MARKINGS = highd.build_markings(2, 3.75)
 
 
 def test_markings_stand_where_the_image_has_them():
-    assert MARKINGS.upper == (8.5, 12.25, 16.0)
-    assert MARKINGS.lower == (20.2, 23.95, 27.7)
+    assert MARKINGS[0] == (8.5, 12.25, 16.0)
+    assert MARKINGS[1] == (20.2, 23.95, 27.7)
 
 
 def test_upper_carriageway_drives_left_in_the_image():
@@ -83,7 +83,7 @@ def test_recording_meta_adds_up():
     upper = tracks((1, 1, 10, 1.9, 1), (1, 2, 11.2, 1.9, 1))
     lower = tracks((2, 1, 50, 1.9, 1), (2, 2, 51.2, 5.6, 2), (2, 4, 53.6, 5.6, 2)).with_columns(v_class=pl.lit(3))
     files = highd.build_recording(scenario, upper, lower, frames=50)
-    header, values = files.recording_meta.splitlines()
+    header, values = files["recordingMeta"].splitlines()
     assert header == (
         "id,frameRate,locationId,speedLimit,month,weekDay,startTime,duration,totalDrivenDistance,totalDrivenTime,"
         "numVehicles,numCars,numTrucks,upperLaneMarkings,lowerLaneMarkings"
@@ -92,7 +92,7 @@ def test_recording_meta_adds_up():
     assert values == (
         "7,25,3,-1.00,09.2017,synthetic,08:38,2.000000e+00,4.80,0.20,2,1,1,8.50;12.25;16.00,20.20;23.95;27.70"
     )
-    meta = files.tracks_meta.splitlines()
+    meta = files["tracksMeta"].splitlines()
     assert meta[0] == (
         "id,width,height,initialFrame,finalFrame,numFrames,class,drivingDirection,traveledDistance,minXVelocity,"
         "maxXVelocity,meanXVelocity,minDHW,minTHW,minTTC,numLaneChanges"
@@ -100,7 +100,7 @@ def test_recording_meta_adds_up():
     assert meta[1] == "1,4.00,2.00,1,2,2,Car,1,1.20,30.00,30.00,30.00,-1.00,-1.00,-1.00,0"
     # A missing frame is not counted; one lane change.
     assert meta[2] == "2,4.00,2.00,1,4,3,Truck,2,3.60,30.00,30.00,30.00,-1.00,-1.00,-1.00,1"
-    assert files.tracks.splitlines()[1] == (
+    assert files["tracks"].splitlines()[1] == (
         "1,1,410.00,13.10,4.00,2.00,-30.00,-0.50,-1.00,0.00,412.00,8.00,0.00,0.00,0.00,0.00,0,0,0,0,0,0,0,0,3"
     )
 
