@@ -15,15 +15,7 @@ PURPLE, SKY, AMBER = "#cc79a7", "#56b4e9", "#e69f00"
 
 
 def make_config(*, background: str, padding: int, label: int, title: int, heading: int) -> dict[str, Any]:
-    """Make the configuration of a chart, as `altair.Chart.configure` takes it.
-
-    Args:
-        background: a colour, or `transparent`.
-        padding: pixels around the chart.
-        label: size of axis and legend labels, in pixels.
-        title: size of axis and legend titles, in pixels.
-        heading: size of the chart's own title, in pixels.
-    """
+    """Make the configuration of a chart, as `altair.Chart.configure` takes it; padding and letters are in pixels."""
     letters = {
         "labelColor": MUTED,
         "titleColor": MUTED,

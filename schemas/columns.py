@@ -129,10 +129,7 @@ class Table:
     """Declaration of one table of the lake.
 
     Args:
-        name: name in SQL.
-        meaning: description of one row.
         key: columns that are unique together and by which every file is sorted.
-        columns: declared columns, in order.
         partition: columns of the hive folders, which are in a file's path and not in the file.
     """
 
@@ -191,11 +188,7 @@ class Table:
         return frame.select(pl.col(name).cast(dtype) for name, dtype in self.dtypes.items())
 
     def validate(self, frame: pl.DataFrame, *, where: str) -> pl.DataFrame:
-        """Check a frame against every structural rule and return it.
-
-        Args:
-            frame: all columns of the table.
-            where: the recording or file it came from, for the message.
+        """Check a frame against every structural rule and return it; `where` names its recording or file.
 
         Raises:
             StructureError: naming the table, the place, each broken rule, how many rows break it and one of them.

@@ -45,11 +45,7 @@ class FileAccessError(TracklakeError):
 
 @contextmanager
 def explain_file_errors(path: Path, advice: str = "") -> Iterator[None]:
-    """Turn the operating system's errors on a file or folder into a message.
-
-    Args:
-        path: named in the message where the error names no file itself.
-        advice: a sentence that says what to do next.
+    """Turn the operating system's errors on a file or folder into a message, with a sentence on what to do next.
 
     Raises:
         FileAccessError: the block raised an OSError, other than that of a closed pipe.

@@ -27,12 +27,7 @@ The columns read, under the publishers' names and in their units. A line outside
 
 
 def format_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a Markdown table; a bar in a cell becomes a slash.
-
-    Args:
-        headings: titles of the columns.
-        rows: cells, as many as headings.
-    """
+    """Return the lines of a Markdown table; a bar in a cell becomes a slash."""
     cells = (headings, ("---",) * len(headings), *rows)
     return [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in cells]
 

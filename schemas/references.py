@@ -13,10 +13,8 @@ class Reference:
 
     Args:
         name: authors and year as texts cite them, for example `Deo and Trivedi (2018)`.
-        text: full reference: authors, year, title, place, pages.
         used_for: what tracklake takes from it.
         doi: digital object identifier; empty without one.
-        url: address, where there is no identifier.
     """
 
     name: str

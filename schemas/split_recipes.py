@@ -43,14 +43,9 @@ class SplitRecipe:
     """Parameters that a split is made by.
 
     Args:
-        name: of SPLIT_NAMES.
         train_share: how much of it trains, where there is no part `val`; that takes VALIDATION_SHARE of it.
         validation: whether there is a part `val`; csp-2018 has one whatever this says.
-        seed: of all that is random.
-        restarts: of the search.
-        block_s: length of a block of time.
         purge_s: time between two blocks that belongs to none.
-        rate_hz: of the samples' clock.
         history_s: what a sample needs before it, within its block.
         horizon_s: how far it looks ahead.
         min_future_s: what it needs after it, within its block.

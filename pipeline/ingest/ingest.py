@@ -169,15 +169,8 @@ def _make_job(dataset: str, title: str, files: Sequence[RawFile], recording: str
     job = make_job(
         f"ingest/{dataset}/{title}",
         version_of_stage=VERSION,
-        made_of={
-            "sources": sources,
-            "source_version": SOURCE_BY_NAME[dataset].version,
-        },
-        inputs={
-            "dataset": dataset,
-            "recording": recording,
-            "files": [file.to_dict() for file in files],
-        },
+        made_of={"sources": sources, "source_version": SOURCE_BY_NAME[dataset].version},
+        inputs={"dataset": dataset, "recording": recording, "files": [file.to_dict() for file in files]},
     )
     # Where they stand is remembered, and is no part of the fingerprint: a moved folder has the same content.
     placed = [{**source, "path": str(file.path)} for source, file in zip(sources, files, strict=True)]

@@ -74,10 +74,8 @@ class Retired:
     """A file that is no longer live, kept for readers that opened the lake before it was replaced.
 
     Args:
-        path: path relative to the lake's root.
         generation: number of the session in which it was replaced.
         void: whether it must not be used again, even for the same inputs: a rebuild makes everything again.
-        sha256: checksum of its bytes, if it is known.
     """
 
     path: str

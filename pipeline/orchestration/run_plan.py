@@ -36,11 +36,8 @@ class RunRequest:
     """The request of a user: plain values, fit to be a flow's parameters.
 
     Args:
-        lake: folder of the lake.
         steps: names of ALL_STEPS, in order.
         source: raw file or folder; needed for ingest.
-        dataset: read the source's files as this dataset's only.
-        settings: values of `pipeline.settings.Settings`, by name.
         replace: whether recordings may lose rows of files that the source does not hold.
         prune: remove recordings whose files once stood in the source, a folder, and are missing from it now.
         rebuild: make the whole lake again, whatever its schema version.
@@ -160,11 +157,7 @@ def survey_source(request: RunRequest) -> Discovery:
     settings = request.get_settings()
     mapping = None if settings.columns is None else load_mapping(settings.columns)
     discovery = discover(
-        request.origin,
-        dataset=request.dataset,
-        digest=digests,
-        mapping=mapping,
-        recording=settings.recording or "",
+        request.origin, dataset=request.dataset, digest=digests, mapping=mapping, recording=settings.recording or ""
     )
     digests.save()
     return discovery

@@ -46,8 +46,6 @@ class ColumnMapping(BaseModel):
         columns: name of a column in the file, or its number from 1, by NGSIM's name.
         units: units that are not NGSIM's own, by NGSIM's name.
         dataset: `ngsim` for a file made of NGSIM's; `custom` for recordings of the user's own.
-        rate_hz: frames per second.
-        site: name of the road; NGSIM's sites have known lanes.
         lanes: main lanes of the road, if it is none of NGSIM's.
     """
 

@@ -50,8 +50,6 @@ class LevelxFormat:
     """The three files of one dataset.
 
     Args:
-        fields: header of each kind of file.
-        raw: raw schema of each kind.
         choices: allowed values of text columns, in lower case, by kind.
         recording_id: recordingMeta's column of the recording's number.
         vehicle_id: the column of the vehicle's id in tracksMeta and tracks.

@@ -12,23 +12,9 @@ from tracklake.pipeline.sources.accounting import DUPLICATE, FILE, account_rows,
 from tracklake.pipeline.sources.assembly import assemble_subset
 from tracklake.pipeline.sources.column_mapping import NGSIM_RATE_HZ, ColumnMapping, suggest_mapping
 from tracklake.pipeline.sources.completeness import Announced, compare_counts
-from tracklake.pipeline.sources.csv import (
-    DIGITS_LOST,
-    REJECT_SCHEMA,
-    Chunk,
-    map_chunks,
-    read_chunks,
-    read_head,
-)
+from tracklake.pipeline.sources.csv import DIGITS_LOST, REJECT_SCHEMA, Chunk, map_chunks, read_chunks, read_head
 from tracklake.pipeline.sources.derived import IN_FULLER_FILE, split_derived
-from tracklake.pipeline.sources.ngsim_dialects import (
-    SITES,
-    Site,
-    find_origin,
-    find_site,
-    name_file,
-    name_recording,
-)
+from tracklake.pipeline.sources.ngsim_dialects import SITES, Site, find_origin, find_site, name_file, name_recording
 from tracklake.pipeline.sources.ngsim_heading import CSV_BARE, MAPPED, TEXT, Heading, detect, read_heading, refine
 from tracklake.pipeline.sources.ngsim_plausibility import (
     Verdict,

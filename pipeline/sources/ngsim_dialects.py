@@ -74,13 +74,7 @@ LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
 
 @dataclass(frozen=True)
 class Site:
-    """A recording site of NGSIM.
-
-    Args:
-        freeway: whether it is a freeway; else an arterial with several directions.
-        lanes: number of main lanes of a freeway.
-        day: local date of the recordings.
-    """
+    """A recording site of NGSIM, with the local date of its recordings; an arterial has several directions."""
 
     name: str
     freeway: bool

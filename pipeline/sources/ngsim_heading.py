@@ -45,7 +45,6 @@ class Heading:
 
     Args:
         names: names of all fields in the file's order; NGSIM's where they are known.
-        header_lines: number of lines before the first row.
         blanks: whether runs of blanks separate fields instead of commas.
         units: units that are not NGSIM's own, by NGSIM's name.
     """

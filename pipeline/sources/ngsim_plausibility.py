@@ -67,14 +67,9 @@ class Figures:
 
     Args:
         ms_per_frame: median step of Global_Time between consecutive frames of a vehicle, in its unit.
-        mean_ms_per_frame: the mean of these steps.
         one_time: the value of Global_Time if all rows have the same one.
         speed_ratio: median speed by positions over v_Vel, of moving vehicles.
         sideways: distance along Local_X over distance along Local_Y.
-        backwards: share of negative v_Vel.
-        lane_width: median distance between the middles of neighboring lanes.
-        length: median v_length of the vehicles.
-        width: median v_Width of the vehicles.
         leaders_ahead: share of the named leaders that are ahead.
         followers_behind: share of the named followers that are behind.
     """
@@ -199,9 +194,8 @@ def _measure_neighbors(rows: pl.DataFrame, role: str, *, sign: int = 1) -> float
 class Verdict:
     """What the figures of a file mean for reading it.
 
-    Args:
-        units: units that the file has and its header does not say, by column.
-        use_time: whether Global_Time tells recordings apart.
+    `units` are those that the file has and its header does not say, by column; `use_time` says whether Global_Time
+    tells recordings apart; notes are for the user.
     """
 
     problems: list[str] = field(default_factory=list)

@@ -95,13 +95,7 @@ def read_split(reader: LakeReader, split: str) -> tuple[pl.DataFrame, pl.DataFra
 
 
 def build_subset(
-    reader: SubsetReader,
-    blocks: pl.DataFrame,
-    left_out: pl.Series,
-    protocol: Protocol,
-    storage: str,
-    *,
-    drop_cut: bool,
+    reader: SubsetReader, blocks: pl.DataFrame, left_out: pl.Series, protocol: Protocol, storage: str, *, drop_cut: bool
 ) -> SubsetTensors:
     """Read a subset's tables and build its arrays; see `build_subset_tensors`."""
     return build_subset_tensors(

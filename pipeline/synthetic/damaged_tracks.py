@@ -15,10 +15,6 @@ class Defect:
     Args:
         name: late_start, overlap, backward, acceleration_spike, frozen_slow_speed, frame_gap, overlap_unseen,
             wrong_leader, wrong_headway, lane_flicker, position_jump.
-        vehicle: number of the vehicle.
-        first_frame: first frame of the damaged or missing entries.
-        last_frame: last frame of these entries.
-        entries: number of these entries.
         value: x_m of the first entry kept (late_start), depth in m (overlap, overlap_unseen), lowest speed in m/s
             (backward), acceleration in m/s2 (acceleration_spike), speed in m/s (frozen_slow_speed), error in m
             (wrong_headway, position_jump), wrong lane (lane_flicker).

@@ -24,11 +24,7 @@ HEADWAY_DIFFERENCE_M = 1.0
 NO_CHANGE_MPS2 = 0.00005
 LONGEST_M = 40.0
 """No vehicle of the sample is longer."""
-SIZES_M = {
-    "car": (2.4, 8.0, 1.2, 2.7),
-    "truck": (4.0, 26.0, 1.4, 3.2),
-    "motorcycle": (1.0, 3.2, 0.3, 1.6),
-}
+SIZES_M = {"car": (2.4, 8.0, 1.2, 2.7), "truck": (4.0, 26.0, 1.4, 3.2), "motorcycle": (1.0, 3.2, 0.3, 1.6)}
 """Least and greatest length, least and greatest width."""
 
 

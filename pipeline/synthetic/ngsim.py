@@ -138,10 +138,7 @@ def format_portal(rows: pl.DataFrame) -> list[str]:
     whole = separated.rename({"v_Length": "v_length"}).with_columns(
         *(pl.lit("").alias(name) for name in ZONES), Location=pl.lit(LOCATION)
     )
-    return [
-        ",".join(PORTAL_COLUMNS),
-        *whole.select(pl.concat_str(PORTAL_COLUMNS, separator=",")).to_series().to_list(),
-    ]
+    return [",".join(PORTAL_COLUMNS), *whole.select(pl.concat_str(PORTAL_COLUMNS, separator=",")).to_series().to_list()]
 
 
 def shuffle_rows(rows: pl.DataFrame, random: np.random.Generator) -> pl.DataFrame:

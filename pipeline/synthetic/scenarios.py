@@ -88,7 +88,6 @@ class HighdScenario:
     """One recording over two carriageways.
 
     Args:
-        share: its length in units of `minutes`.
         exponent: write the duration as a careless printf would (`5.400000e+01`), as some published files do.
         damaged: insert duplicates and malformed lines into the tracks file.
     """

@@ -10,13 +10,7 @@ from tracklake.schemas.origin import describe_synthetic
 
 @dataclass(frozen=True)
 class CspOptions:
-    """The options of an export beside the original's.
-
-    Args:
-        clean: whether late starts, gaps, overwritten neighbors and leaks are left out.
-        full_future: whether a sample needs 5 s of future.
-        dataset: the only dataset to export; None = all.
-    """
+    """The options of an export beside the original's; with a dataset only that is exported."""
 
     clean: bool = False
     full_future: bool = False

@@ -16,14 +16,7 @@ from importlib.resources import files
 
 @dataclass(frozen=True)
 class Macro:
-    """One table macro of the catalog.
-
-    Args:
-        name: how it is called.
-        parameters: their names, in order.
-        meaning: one sentence.
-        statement: the file's text: a header (the meaning, notes, the parameters, the columns) and CREATE MACRO.
-    """
+    """One table macro of the catalog: its name, parameters in order, meaning in a sentence, and the text of its file."""
 
     name: str
     parameters: tuple[str, ...]

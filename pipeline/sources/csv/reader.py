@@ -102,12 +102,7 @@ def read_chunks(file: RawFile, layout: Layout, *, chunk_bytes: int = CHUNK_BYTES
 
 
 def map_chunks(
-    file: RawFile,
-    layout: Layout,
-    work: Callable[[int, Chunk], Result],
-    *,
-    threads: int,
-    chunk_bytes: int = CHUNK_BYTES,
+    file: RawFile, layout: Layout, work: Callable[[int, Chunk], Result], *, threads: int, chunk_bytes: int = CHUNK_BYTES
 ) -> Iterator[Result]:
     """Apply a function of a chunk's number, from 0, and the chunk in parsing threads; yield its results in order.
 

@@ -21,10 +21,7 @@ LARGEST_WHOLE = 1 << 24
 class CspEntries:
     """The entries of one subset, (N,) each, sorted by track and frame.
 
-    Args:
-        frame: frame number, increasing within a track.
-        x_ft: lateral position in ft (NGSIM's Local_X).
-        y_ft: position along the road in ft (NGSIM's Local_Y).
+    Positions are in ft: x_ft is lateral (NGSIM's Local_X), y_ft along the road (Local_Y).
     """
 
     track_id: NDArray[np.int32]

@@ -8,12 +8,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from tracklake.pipeline.transforms.csp.entries import (
-    CspEntries,
-    assign_recorded_ids,
-    assign_run_ids,
-    to_csp_entries,
-)
+from tracklake.pipeline.transforms.csp.entries import CspEntries, assign_recorded_ids, assign_run_ids, to_csp_entries
 from tracklake.pipeline.transforms.csp.grid import OverwritingGrid, ResolvedGrid
 from tracklake.pipeline.transforms.csp.labels import Codes, code_maneuvers
 from tracklake.pipeline.transforms.csp.parts import (
@@ -50,7 +45,6 @@ class CspRecording:
     """The facts about a subset beside its tracks.
 
     Args:
-        dataset_id: row of `tracks`, from 1.
         last_lane: highest lane; higher ones count as this one. None = no limit.
         by_frame: whether the source's rows are sorted by frame and vehicle, not by vehicle and frame.
     """
@@ -76,8 +70,6 @@ class CspSubset:
     """A subset ready to be written.
 
     Args:
-        dataset_id: row of `tracks`, from 1.
-        kept: (N,) whether the entry is a sample.
         dropped: number of entries of each part that are no samples, by reason.
         left_out: number of entries that are in no file, by reason.
         positions: track_id, tick, x_m, lane of the entries if collisions are resolved, else None.

@@ -24,9 +24,9 @@ NO_VEHICLE = np.iinfo(np.int64).max
 class _Block:
     """The entries of some whole ticks, (E,) each, sorted by tick and x.
 
+    Positions are in whole units.
+
     Args:
-        x: position along the road in whole units.
-        y: position across the road in whole units.
         rank: number of vehicles of the tick with a smaller id.
         first: index of the tick's first vehicle in `vehicle_id`.
         vehicle_id: vehicles sorted by tick and id; a vehicle's index is its tick's first plus its rank.

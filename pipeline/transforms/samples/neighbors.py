@@ -201,10 +201,7 @@ def _find_reach(
 class _Pairs:
     """Origins of a chunk with their neighbors, (P,) each, sorted by origin, column and dx.
 
-    Args:
-        row: row of the cell; -1 = crowded out.
-        other: neighbor's index on the line.
-        dx: distance along the road in units.
+    `row` is -1 if crowded out, `other` the neighbor's index on the line, `dx` the distance along the road in units.
     """
 
     origin: NDArray[np.int32]

@@ -72,14 +72,8 @@ Estimator = Callable[[Cut], tuple[Floats, Floats]]
 class _Lines:
     """Lines frames = b0 + b1 * speed, fitted by ordinary least squares to n points each; all arrays are (B,).
 
-    Args:
-        n: number of points.
-        mean_speed_mps: mean of the speeds.
-        mean_frames: mean of the frames.
-        spread: sum of squared offsets of the speeds; 0 if they do not vary.
-        slope: b1.
-        variation: sum of squared offsets of the frames.
-        residual: sum of squared residuals.
+    The spread is the sum of squared offsets of the speeds (0 if they do not vary), the variation that of the frames,
+    and the slope b1.
     """
 
     n: Integers

@@ -34,7 +34,6 @@ class SubsetTensors:
     """The tensors of one subset; rows, samples and subsets are numbered from 0.
 
     Args:
-        arrays: arrays of `schemas.tensors.ARRAYS`.
         centre_m: origin of stored positions: along, across.
         max_error_m: largest rounding error of stored positions: along, across; 0 without rows.
         squared_error_m2: sums of the squared rounding errors: along, across.
@@ -52,12 +51,9 @@ class SubsetTensors:
 
 @dataclass(frozen=True)
 class _Runs:
-    """Gap-free runs of rows, in row order: consecutive ticks of one vehicle.
+    """Gap-free runs of rows, (R,) each, in row order: consecutive ticks of one vehicle.
 
-    Args:
-        first_row: (R,) first row of the run, increasing.
-        last_row: (R,) last row of the run.
-        key: (R,) vehicle and first tick as one number, increasing.
+    `key` is vehicle and first tick as one number, increasing.
     """
 
     first_row: Integers

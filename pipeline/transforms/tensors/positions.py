@@ -17,14 +17,7 @@ _ALONG, _ACROSS = "along the road", "across it"
 
 @dataclass(frozen=True)
 class Stored:
-    """Stored positions and their rounding errors.
-
-    Args:
-        steps: (N, 2) float32 in m, or int16 in steps.
-        centre_m: origin of int16 steps: along, across; (0, 0) for float32.
-        max_error_m: largest rounding error: along, across.
-        squared_error_m2: sum of the squared rounding errors: along, across.
-    """
+    """Stored positions, (N, 2) float32 in m or int16 in steps from a centre; rounding errors along and across the road."""
 
     steps: Singles | npt.NDArray[np.int16]
     centre_m: tuple[float, float]

@@ -9,13 +9,9 @@ from tracklake.schemas.arrays import Integers, find_run_starts
 
 @dataclass(frozen=True)
 class Scenes:
-    """C scenes with M vehicles in total, sorted by (block, tick).
+    """C scenes with M vehicles in total, sorted by (block, tick); rows increase within a scene; a sample of -1 is none.
 
-    Args:
-        offset: (C + 1,) vehicles of scene c are [offset[c], offset[c + 1]).
-        block: (C,) block of each scene.
-        row: (M,) rows of the vehicles, increasing within a scene.
-        sample: (M,) number of the vehicle's sample; -1 = none.
+    The vehicles of scene c are [offset[c], offset[c + 1]).
     """
 
     offset: Integers

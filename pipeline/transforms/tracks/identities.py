@@ -46,13 +46,10 @@ def identify_vehicles(
     and last frame lie on either side of it, else null. An id that was not split is left as recorded. No vehicle is its
     own leader or follower: if an entry names its own id and no other vehicle has it, there is none.
 
-    Args:
-        entries: source_id, frame, x_m, y_m, speed_mps, lane, leader_source_id, follower_source_id (0 or null = none)
-            and the constants, in any order (fastest if sorted by source_id and frame).
-        constants: columns that are equal in all entries of one vehicle.
-        frame_rate_hz: frame rate of the source.
-        announced: the constant with the number of entries of a vehicle.
-        one_way: whether all vehicles drive towards larger x_m, and none leaves and comes back.
+    The entries have source_id, frame, x_m, y_m, speed_mps, lane, leader_source_id, follower_source_id (0 or null =
+    none) and the constants, in any order (fastest if sorted by source_id and frame). `announced` is the constant with
+    the number of entries of a vehicle. With `one_way` all vehicles drive towards larger x_m, and none leaves and comes
+    back.
     """
     if not _is_sorted(entries):
         entries = entries.sort("source_id", "frame")
