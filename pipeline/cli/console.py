@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from tracklake.pipeline.cli.logs import LOG, chosen, log_shown
-from tracklake.pipeline.orchestration.progress import Reporter, Silent, reporting_to
+from tracklake.pipeline.orchestration.progress import Reporter, reporting_to
 from tracklake.schemas.text import make_visible, quote_shell
 
 
@@ -72,7 +72,7 @@ class Terminal:
     def show_stages(self) -> Iterator[None]:
         """Show one progress bar per stage while a block runs, or with --verbose lines of the log."""
         if not self.verbose or chosen.verbose:
-            with reporting_to(_Lines(Silent())):
+            with reporting_to(_Lines(Reporter())):
                 yield
             return
         columns = (
@@ -97,7 +97,7 @@ class Terminal:
             yield lambda share, loss: progress.update(bar, completed=share, loss=f"loss {loss:.3f}")
 
 
-class _Lines:
+class _Lines(Reporter):
     """Logs progress, and hands it on."""
 
     def __init__(self, shown: Reporter) -> None:
@@ -112,7 +112,7 @@ class _Lines:
         self._shown.advance(stage, title)
 
 
-class _Bars:
+class _Bars(Reporter):
     """Draws one bar per stage."""
 
     def __init__(self, progress: Progress) -> None:

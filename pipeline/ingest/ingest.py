@@ -13,7 +13,7 @@ from tracklake.pipeline.ingest.memory_budget import MemoryBudget
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_table
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
-from tracklake.pipeline.sources.accounting import count_reasons, to_rejects
+from tracklake.pipeline.sources.accounting import account_rows
 from tracklake.pipeline.sources.csv import measure_unpacked
 from tracklake.pipeline.sources.source import Canonical, Part
 from tracklake.pipeline.stages.stage import Job, make_commit, make_job
@@ -290,22 +290,11 @@ def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
 def _build_unassigned(root: Path, job: Job, file: RawFile) -> tuple[Files, dict[str, Any]]:
     dataset = job.inputs["dataset"]
     lines = pl.read_parquet(locate_spill(root, file) / REJECTS_FILE, glob=False)
-    log = {
-        "dataset": dataset,
-        "recording": None,
-        "file": file.name,
-        "sha256": file.sha256,
-        "dialect": file.dialect,
-        "rows_read": lines.height,
-        "rows_kept": 0,
-        "rows_dropped": lines.height,
-        "dropped_by_reason": count_reasons(lines),
-    }
-    rejects = to_rejects(lines.with_columns(file=pl.lit(file.name)), dataset, None)
+    log, rejects = account_rows(dataset, None, [Part(file, rejects=lines)], [0], [])
     values = {"dataset": dataset}
     files = {
         table.name: write_table(root, table, frame, values, job.fingerprint, where=file.name)
-        for table, frame in ((INGEST_LOG, pl.DataFrame([log], schema=INGEST_LOG.dtypes)), (REJECTS, rejects))
+        for table, frame in ((INGEST_LOG, log), (REJECTS, rejects))
     }
     info = {
         "notes": [f"{file.name}: {lines.height} lines belong to no recording and stand in rejects"],

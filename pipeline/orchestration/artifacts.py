@@ -38,7 +38,7 @@ class FigureTable:
     rows: list[dict[str, Any]]
 
 
-def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, str]]:
+def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, Any]]:
     """Return the tables of reports/quality.json, and the link to reports/index.html as Prefect takes it.
 
     Raises:
@@ -52,7 +52,7 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, str]]:
         ("ingestion", "Per source file: rows read = rows kept + rows dropped.", _list_files(quality)),
         ("completeness", "Per recording: what was announced beside what was found.", _list_completeness(quality)),
     )
-    link = {
+    link: dict[str, Any] = {
         "key": make_key("report"),
         "description": "A page on the disk of the machine that made it; browsers open it by its address, not by a "
         "click.",

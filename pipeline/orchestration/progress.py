@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 
-class Reporter(Protocol):
-    """Receives reports of what is going on."""
+class Reporter:
+    """Receives reports of what is going on, and shows none: for scripts, tests and workers."""
 
     def begin(self, stage: str, total: int) -> None:
         """Report that a stage starts on a number of recordings."""
@@ -15,17 +14,7 @@ class Reporter(Protocol):
         """Report that one of them is done."""
 
 
-class Silent:
-    """Shows no progress: for scripts, tests and workers."""
-
-    def begin(self, stage: str, total: int) -> None:
-        """Ignore that a stage starts."""
-
-    def advance(self, stage: str, title: str) -> None:
-        """Ignore that a recording is done."""
-
-
-_current: Reporter = Silent()
+_current = Reporter()
 
 
 def reporter() -> Reporter:

@@ -287,10 +287,9 @@ def explain_left_out(manifest: Manifest) -> list[str]:
         for subset in commit.info["subsets"]
         if not subset["freeway"]
     )
-    notes = []
-    if arterials:
-        notes.append(
-            f"repair, samples, split and tensors were left out for {', '.join(arterials)}: those stages are defined "
-            "for freeways, and these are directions of arterial streets; tracks, findings, report and SQL are complete"
-        )
-    return notes
+    if not arterials:
+        return []
+    return [
+        f"repair, samples, split and tensors were left out for {', '.join(arterials)}: those stages are defined for "
+        "freeways, and these are directions of arterial streets; tracks, findings, report and SQL are complete"
+    ]

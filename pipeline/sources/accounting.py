@@ -58,7 +58,7 @@ def _pack(key: Sequence[str]) -> pl.Expr:
 
 def account_rows(
     dataset: str,
-    recording: str,
+    recording: str | None,
     parts: Sequence[Part],
     rows_parsed: Sequence[int],
     dropped: Sequence[tuple[pl.DataFrame, str]],
@@ -86,11 +86,11 @@ def account_rows(
                 "rows_read": parsed + at_parsing.height,
                 "rows_kept": parsed - mine.height,
                 "rows_dropped": refused.height,
-                "dropped_by_reason": count_reasons(refused),
+                "dropped_by_reason": _count_reasons(refused),
             }
         )
         rejects.append(refused.with_columns(file=pl.lit(part.file.name)))
-    return pl.DataFrame(log, schema=INGEST_LOG.dtypes).sort(INGEST_LOG.key), to_rejects(
+    return pl.DataFrame(log, schema=INGEST_LOG.dtypes).sort(INGEST_LOG.key), _to_rejects(
         pl.concat(rejects), dataset, recording
     )
 
@@ -98,12 +98,12 @@ def account_rows(
 _LATER = {FILE: pl.Int64(), LINE: pl.Int64(), "reason": pl.String()}
 
 
-def count_reasons(rejects: pl.DataFrame) -> list[dict[str, object]]:
+def _count_reasons(rejects: pl.DataFrame) -> list[dict[str, object]]:
     """Count rejected rows by reason, as the log's list of structs."""
     return rejects.group_by("reason").agg(pl.len().cast(pl.Int64).alias("rows")).sort("reason").to_dicts()
 
 
-def to_rejects(rejects: pl.DataFrame, dataset: str, recording: str | None) -> pl.DataFrame:
+def _to_rejects(rejects: pl.DataFrame, dataset: str, recording: str | None) -> pl.DataFrame:
     """Turn rejected lines into rows of schemas.REJECTS, one per line."""
     return (
         rejects.with_columns(dataset=pl.lit(dataset), recording=pl.lit(recording, pl.String))

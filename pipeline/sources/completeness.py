@@ -39,20 +39,13 @@ class Announced:
     vehicles_by: str
 
 
-@dataclass(frozen=True)
-class Completeness:
-    """The comparison of announced with kept counts: schemas.COMPLETENESS, and notes about what is missing."""
-
-    table: pl.DataFrame
-    notes: tuple[str, ...]
-
-
 def compare_counts(
     dataset: Dataset, recording: str, subsets: Sequence[Subset], announced: Announced, log: pl.DataFrame
-) -> Completeness:
+) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Compare what was kept of one recording with the counts that metadata, rows or the publisher announce.
 
-    `log` has the rows of schemas.INGEST_LOG of the files that hold its entries.
+    Returns the rows of schemas.COMPLETENESS, and notes about what is missing. `log` has the rows of
+    schemas.INGEST_LOG of the files that hold its entries.
     """
     vehicles = pl.concat([VEHICLES.empty(), *(subset.vehicles for subset in subsets)])
     each = _compare_vehicles(vehicles, announced.vehicles)
@@ -71,7 +64,7 @@ def compare_counts(
     )
     about_totals = _describe_totals(recording, table, announced, dropped)
     about_vehicles = _describe_vehicles(recording, each, announced, dropped)
-    return Completeness(table, tuple(note for note in (about_totals, about_vehicles) if note is not None))
+    return table, tuple(note for note in (about_totals, about_vehicles) if note is not None)
 
 
 _COUNTS = {"expected": pl.Int64(), "found": pl.Int64()}

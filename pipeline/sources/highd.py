@@ -61,8 +61,10 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     ]
     found = tuple(subset for subset in subsets if subset is not None)
     of_tracks = log.filter(pl.col("dialect") == HIGHD_FORMAT.name_dialect(TRACKS))
-    completeness = compare_counts("highd", recording, found, _list_announced(read.meta, read.vehicles), of_tracks)
-    return Canonical(found, log, rejects, completeness.table, completeness.notes)
+    completeness, notes = compare_counts(
+        "highd", recording, found, _list_announced(read.meta, read.vehicles), of_tracks
+    )
+    return Canonical(found, log, rejects, completeness, notes)
 
 
 def read_metadata(files: Sequence[RawFile], recording: str) -> tuple[dict[str, Any], dict[int, int], pl.DataFrame]:

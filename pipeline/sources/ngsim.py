@@ -273,9 +273,9 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset = "ngsi
             subsets.append(_to_subset(entries, f"{recording}-{direction}", oriented_as, facts, files))
     totals = PUBLISHED_TOTALS.get(recording, {})
     announced = Announced(totals, totals_by=PUBLISHED, vehicles=None, vehicles_by=TOTAL_FRAMES)
-    completeness = compare_counts(dataset, recording, subsets, announced, log)
-    notes = (*_describe_subsets(subsets), *completeness.notes)
-    return Canonical(tuple(subsets), log, rejects, completeness.table, notes, row_order)
+    completeness, missing = compare_counts(dataset, recording, subsets, announced, log)
+    notes = (*_describe_subsets(subsets), *missing)
+    return Canonical(tuple(subsets), log, rejects, completeness, notes, row_order)
 
 
 def _to_subset(

@@ -25,6 +25,8 @@ BOTTLENECK_M = 300.0
 RAMP_M = 300.0
 LANE_CHANGE_S = 4.0
 PULSE_EVERY_S, PULSE_S, PULSE_MPS = 40.0, 15.0, 0.2
+SUMO_LANE_M = 3.2
+"""Width of SUMO's own lanes, in which posLat is measured, whatever the recorded road is given, in m."""
 MERGE_M = 80.0
 """Length over which the on-ramp's lane approaches the auxiliary lane, in m."""
 
@@ -258,11 +260,11 @@ def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
     on_ramp = placed["edge"].to_numpy() == "ramp"
     x = placed["x"].to_numpy()
     # Lane centres stand at whole numbers: 0 is the leftmost lane's.
-    across = placed["number"].to_numpy() - 1 - placed["posLat"].to_numpy() / _sumo_lane_width()
+    across = placed["number"].to_numpy() - 1 - placed["posLat"].to_numpy() / SUMO_LANE_M
     lower = np.floor(across)
     part = across - lower
     across = lower + part**2 * (3 - 2 * part)
-    lateral_speed = -placed["speedLat"].to_numpy() / _sumo_lane_width() * 6 * part * (1 - part)
+    lateral_speed = -placed["speedLat"].to_numpy() / SUMO_LANE_M * 6 * part * (1 - part)
     closing = np.clip((WEAVE_BEGINS_M - x) / MERGE_M, 0, 1)
     across = np.where(on_ramp, road.lanes + closing**2 * (3 - 2 * closing), across)
     tracks = placed.with_columns(
@@ -291,8 +293,3 @@ def compute_lanes(road: Road) -> pl.Expr:
     outermost = road.lanes + road.ramp
     inside = ((pl.col("y") / road.lane_width_m).floor().cast(pl.Int16) + 1).clip(1, outermost)
     return pl.when("on_ramp").then(pl.lit(road.lanes + 2)).otherwise(inside).cast(pl.Int16)
-
-
-def _sumo_lane_width() -> float:
-    """Metres; SUMO's own lanes, in which posLat is measured, whatever width the recorded road is given."""
-    return 3.2

@@ -6,7 +6,7 @@ sources or its rules, so that equal counts prove something.
 
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -109,7 +109,10 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
     markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
     for side, places in markings.items():
         found.surfaces[f"{recording}-{side}"] = Surface(float(facts[1]), tuple(places), headway_stands_in=False)
-    rows = _read_rows(folder / f"{recording}_tracks.csv", recording, found)
+    path = folder / f"{recording}_tracks.csv"
+    count = FileCount(path.name, "highd", recording)
+    rows = {(int(row[1]), int(row[0])): row for row in _read_rows(_lines(path)[1:], ",", 25, range(25), count)}
+    found.files.append(count)
     headings = find_headings(
         {key: (numbers[6], numbers[7]) for key, numbers in rows.items()}, direction, float(facts[1])
     )
@@ -140,29 +143,27 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry
 
 
-def _read_rows(path: Path, recording: str, found: Found) -> dict[tuple[int, int], list[float]]:
-    """Read the numbers of a tracks file by vehicle and frame, and count its lines."""
-    count = FileCount(path.name, "highd", recording)
+def _read_rows(
+    lines: Iterable[str], separator: str | None, fields: int, wanted: Iterable[int], count: FileCount
+) -> Iterator[list[float]]:
+    """Yield the wanted numbers of each line, without malformed and repeated ones; counts the lines."""
     seen = set()
-    rows: dict[tuple[int, int], list[float]] = {}
-    for line in _lines(path)[1:]:
+    wanted = tuple(wanted)
+    for line in lines:
         count.read += 1
-        parts = _usable(line, ",", 25)
+        parts = _usable(line, separator, fields)
         try:
-            numbers = [_number(part) for part in parts] if parts else None
+            numbers = [_number(parts[place]) for place in wanted] if parts else None
         except ValueError:
             numbers = None
         if numbers is None:
             count.malformed += 1
-            continue
-        if line in seen:
+        elif line in seen:
             count.duplicate += 1
-            continue
-        seen.add(line)
-        count.kept += 1
-        rows[int(numbers[1]), int(numbers[0])] = numbers
-    found.files.append(count)
-    return rows
+        else:
+            seen.add(line)
+            count.kept += 1
+            yield numbers
 
 
 def find_headings(
@@ -194,22 +195,8 @@ def read_ngsim(path: Path, recordings: dict[int, str], found: Found) -> None:
     # Behind the lane, the 25-column export has six more columns before Preceding.
     behind = 14 + (6 if fields == 25 else 0)
     count = FileCount(path.name, "ngsim", next(iter(recordings.values())) if len(recordings) == 1 else None)
-    seen = set()
-    for line in lines[1:] if header else lines:
-        count.read += 1
-        parts = _usable(line, "," if header else None, fields)
-        try:
-            numbers = [_number(part) for part in parts[:14] + parts[behind : behind + 4]] if parts else None
-        except ValueError:
-            numbers = None
-        if numbers is None:
-            count.malformed += 1
-            continue
-        if line in seen:
-            count.duplicate += 1
-            continue
-        seen.add(line)
-        count.kept += 1
+    wanted = (*range(14), *range(behind, behind + 4))
+    for numbers in _read_rows(lines[1:] if header else lines, "," if header else None, fields, wanted, count):
         recording = recordings[int(numbers[3]) - 100 * int(numbers[1])]
         found.entries.setdefault(("ngsim", recording, recording), {})[int(numbers[0]), int(numbers[1])] = Entry(
             front=numbers[5] * METRES_PER_FOOT,

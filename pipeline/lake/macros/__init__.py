@@ -16,7 +16,7 @@ from importlib.resources import files
 
 @dataclass(frozen=True)
 class Macro:
-    """One table macro of the catalog: its name, parameters in order, meaning in a sentence, and the text of its file."""
+    """One table macro of the catalog: its name, parameters in order, meaning in a sentence, and its file's text."""
 
     name: str
     parameters: tuple[str, ...]

@@ -95,7 +95,7 @@ def assign_recorded_ids(clock: pl.DataFrame, vehicles: pl.DataFrame) -> tuple[pl
     return once, named.height - once.height
 
 
-def assign_run_ids(clock: pl.DataFrame, block: NDArray[np.int32], *, highest_id: int) -> pl.DataFrame:
+def assign_run_ids(clock: pl.DataFrame, block: Integers, *, highest_id: int) -> pl.DataFrame:
     """Name tracks so that none has a gap: the first run of a vehicle keeps its id, later runs get unused ids.
 
     The Dataset class counts rows, not frames: across a gap it would mistake a second for a tenth of one.

@@ -7,7 +7,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.csp.entries import CspEntries
-from tracklake.schemas.arrays import Flags
+from tracklake.pipeline.transforms.splits.tables import find_blocks
+from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.columns import PARTS
 
 TRAIN, VAL, TEST = range(3)
@@ -69,7 +70,7 @@ def assign_parts_by_id(track_id: NDArray[np.int32]) -> Parts:
 
 def assign_parts_by_split(
     clock: pl.DataFrame, blocks: pl.DataFrame, *, first_frame: int, stride: float
-) -> tuple[Parts, NDArray[np.int32], Parts]:
+) -> tuple[Parts, Integers, Parts]:
     """Assign entries to parts by the lake's split, across which no vehicle, frame or history reaches.
 
     The clock has vehicle_id, tick; tick 0 is at `first_frame`, and `stride` source frames make a tick. Returns, (N,)
@@ -78,16 +79,8 @@ def assign_parts_by_split(
     """
     vehicle = clock["vehicle_id"].to_numpy()
     frame = first_frame + clock["tick"].to_numpy() * stride
-    block = np.full(clock.height, -1, np.int32)
-    codes = np.full(blocks.height + 1, NO_PART, np.int8)
-    names = ("first_frame", "last_frame", "first_vehicle_id", "last_vehicle_id", "part")
-    for number, (first, last, first_id, last_id, part) in enumerate(blocks.select(names).iter_rows()):
-        within = (frame >= first) & (frame <= last)
-        within &= (vehicle >= (first_id if first_id is not None else vehicle.min(initial=0))) & (
-            vehicle <= (last_id if last_id is not None else vehicle.max(initial=0))
-        )
-        block[within] = number
-        codes[number] = PARTS.index(part)
+    block = find_blocks(frame, vehicle, blocks, "the subset")
+    codes = np.array([*(PARTS.index(part) for part in blocks["part"]), NO_PART], np.int8)
     intended = codes[block]
     divided = (
         pl.DataFrame({"vehicle": vehicle, "part": intended})
@@ -102,8 +95,6 @@ def assign_parts_by_split(
 
 def find_drops(entries: CspEntries, *, full_future: bool) -> dict[str, Flags]:
     """Find the entries that the script's filter ('Filter edge cases') and --full-future drop: (N,) flags by reason.
-
-    The script keeps an entry at frame t if the 31st frame of its track is <= t and the last one > t + 1.
 
     The script keeps an entry at frame t if the 31st frame of its track is <= t and the last one > t + 1. With
     `full_future` a sample needs 50 rows after it. Reasons may overlap.

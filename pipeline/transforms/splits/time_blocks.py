@@ -104,13 +104,19 @@ def describe_blocks(
         blocks.join(
             subsets.select("dataset", "subset", "site", "direction", "lanes", "frame_rate_hz"), on=["dataset", "subset"]
         )
-        .join(visits.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
-        .join(weights.group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
-        .with_columns(pl.col("vehicles", "weight").fill_null(0))
+        .pipe(_add_counts, visits, weights)
         .with_columns(vehicles_per_lane_s=pl.col("vehicles") / pl.col("lanes") / seconds)
         .drop("lanes", "frame_rate_hz")
         .sort(key)
     )
+
+
+def _add_counts(units: pl.DataFrame, visits: pl.DataFrame, weights: pl.DataFrame) -> pl.DataFrame:
+    key = list(_BLOCK)
+    counts = visits.group_by(key).agg(vehicles=pl.len().cast(pl.Int64))
+    counted = units.join(counts, on=key, how="left")
+    counted = counted.join(weights.group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
+    return counted.with_columns(pl.col("vehicles", "weight").fill_null(0))
 
 
 def find_left_out(visits: pl.DataFrame, splits: pl.DataFrame) -> pl.DataFrame:
@@ -155,10 +161,5 @@ def recount_blocks(
 
     present = drop_removed(visits).group_by(*vehicle, "part").agg(pl.col("block").min())
     return (
-        units.drop("vehicles", "weight")
-        .join(parts, on=key)
-        .join(present.group_by(key).agg(vehicles=pl.len().cast(pl.Int64)), on=key, how="left")
-        .join(drop_removed(weights).group_by(key).agg(pl.col("weight").sum()), on=key, how="left")
-        .with_columns(pl.col("vehicles", "weight").fill_null(0))
-        .sort(key)
+        units.drop("vehicles", "weight").join(parts, on=key).pipe(_add_counts, present, drop_removed(weights)).sort(key)
     )

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import polars as pl
 
 from tracklake.pipeline.transforms.resample import join_key
+from tracklake.pipeline.transforms.splits.tables import find_blocks
 from tracklake.pipeline.transforms.tensors.positions import store_positions
 from tracklake.pipeline.transforms.tensors.scenes import find_scenes
 from tracklake.pipeline.transforms.tensors.vehicle_facts import find_sizes, mark_findings
@@ -162,7 +163,7 @@ def _keep_entries(
     vehicle_id = clock["vehicle_id"].to_numpy().astype(np.int64)
     segment = clock["segment"].to_numpy()
     frame = rates["first_frame"] + tick * (rates["frame_rate_hz"] / rates["rate_hz"])
-    block = _find_blocks(frame, vehicle_id, blocks, where)
+    block = find_blocks(frame, vehicle_id, blocks, where)
     part_of_block = _encode_names(blocks["part"], PARTS)
     if left_out is not None and len(left_out):
         block[np.isin(vehicle_id, left_out.to_numpy()) & (part_of_block[block] != PARTS.index("train"))] = -1
@@ -349,22 +350,6 @@ def _find_pairs(samples: pl.DataFrame, neighbors: pl.DataFrame, runs: _Runs, whe
             f"tick {tick}; make samples and neighbors again from these tracks"
         )
     return np.repeat(sample, np.diff(np.append(starts, len(key)))).astype(np.int64), row
-
-
-def _find_blocks(frame: npt.NDArray[np.floating], vehicle_id: Integers, blocks: pl.DataFrame, where: str) -> Integers:
-    """Find the row of `blocks` that holds each entry, (N,); -1 = none."""
-    found = np.full(len(frame), -1, dtype=np.int64)
-    for position, block in enumerate(blocks.iter_rows(named=True)):
-        # Positions between frames are floating-point, so a millionth of a frame is tolerated.
-        inside = (frame > block["first_frame"] - 1e-6) & (frame < block["last_frame"] + 1e-6)
-        if block["first_vehicle_id"] is not None:
-            inside &= vehicle_id >= block["first_vehicle_id"]
-        if block["last_vehicle_id"] is not None:
-            inside &= vehicle_id <= block["last_vehicle_id"]
-        if (inside & (found >= 0)).any():
-            raise ValueError(f"{where}: block {block['block']} of the split overlaps another one")
-        found[inside] = position
-    return found
 
 
 def _find_runs(vehicle_id: Integers, tick: Integers, segment: npt.NDArray[Any], block: Integers | None = None) -> _Runs:

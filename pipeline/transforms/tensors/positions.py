@@ -17,7 +17,7 @@ _ALONG, _ACROSS = "along the road", "across it"
 
 @dataclass(frozen=True)
 class Stored:
-    """Stored positions, (N, 2) float32 in m or int16 in steps from a centre; rounding errors along and across the road."""
+    """Stored positions, (N, 2) float32 in m or int16 steps from a centre; rounding errors along and across."""
 
     steps: Singles | npt.NDArray[np.int16]
     centre_m: tuple[float, float]
