@@ -51,12 +51,9 @@ def list_published() -> list[PublishedFigures]:
 def select_published(
     recordings: Sequence[RecordingFacts],
 ) -> tuple[list[PublishedFigures], list[IncomparableRecording]]:
-    """Select the published figures that a lake's recordings can be compared with.
+    """Select the published figures of complete recordings; also the recordings left out, each with the reason.
 
     Figures of a dataset need all its recordings.
-
-    Returns:
-        The figures; and the recordings of which figures exist that are left out, each with the reason.
     """
     gaps = {(row["dataset"], row["recording"]): explain_gap(row) for row in recordings}
     figures: list[PublishedFigures] = []

@@ -121,13 +121,7 @@ def read_statement(name: str) -> str:
 
 
 def query(connection: Connection, name: str, parameters: Parameters | None = None) -> list[Row]:
-    """Run `sql/<name>.sql` and return its rows as dictionaries of plain values.
-
-    Args:
-        connection: connection to a lake.
-        name: file name without its suffix.
-        parameters: values of the statement's $names.
-    """
+    """Run `sql/<name>.sql` and return its rows as dictionaries of plain values."""
     # Not on a cursor: it would be a connection of its own, without the caller's local settings and registered frames.
     result = connection.execute(read_statement(name), dict(parameters or {}))
     names = [column[0] for column in result.description or ()]
@@ -135,13 +129,7 @@ def query(connection: Connection, name: str, parameters: Parameters | None = Non
 
 
 def query_frame(connection: Connection, name: str, parameters: Parameters | None = None) -> pl.DataFrame:
-    """Run `sql/<name>.sql` and return its rows as a frame, for plots.
-
-    Args:
-        connection: connection to a lake.
-        name: file name without its suffix.
-        parameters: values of the statement's $names.
-    """
+    """Run `sql/<name>.sql` and return its rows as a frame, for plots."""
     return connection.execute(read_statement(name), dict(parameters or {})).pl()
 
 

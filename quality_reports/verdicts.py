@@ -37,13 +37,8 @@ def judge(
 ) -> list[Verdict]:
     """Judge every subset and then every dataset (subset null); the reasons that weigh most come first.
 
-    Rules of severity info never count.
-
-    Args:
-        subsets: rows of subsets.sql.
-        scores: rows of subset_scores.sql.
-        rules: rules with their findings, as `schemas.quality_tracks.RuleFindings`.
-        completeness: rows of completeness.sql.
+    Rules of severity info never count. From rows of subsets.sql, of subset_scores.sql and of completeness.sql, and the
+    rules with their findings.
     """
     scored = {(row["dataset"], row["subset"]): row for row in scores}
     found: dict[tuple[str, str], list[Row]] = {}

@@ -62,12 +62,7 @@ def trace(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def prepare(scene: Scene, names: Iterable[str]) -> pl.DataFrame:
-    """Add derived columns to a subset's tracks.
-
-    Args:
-        scene: subset whose tracks have the columns that the wanted ones read.
-        names: wanted columns of `tracks` or DERIVED.
-    """
+    """Add derived columns to a subset's tracks."""
     wanted = [name for name in dict.fromkeys(names) if name in DERIVED]
     return scene.tracks.with_columns(_as_series(name, DERIVED[name].build(scene)) for name in wanted)
 

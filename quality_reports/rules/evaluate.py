@@ -22,14 +22,7 @@ from tracklake.quality_reports.rules.scores import COLUMNS_SCORED, score_subset,
 
 @dataclass(frozen=True)
 class Judgement:
-    """Results of validation of a subset.
-
-    Args:
-        findings: `findings`.
-        vehicle_scores: `vehicle_scores`.
-        subset_scores: `subset_scores`, one row.
-        unchecked: rules that need a column which the source lacks.
-    """
+    """Rows of `findings`, `vehicle_scores` and `subset_scores` (one), and rules that need a column the source lacks."""
 
     findings: pl.DataFrame
     vehicle_scores: pl.DataFrame
@@ -45,11 +38,8 @@ def judge(
 ) -> Judgement:
     """Judge a subset by the rules.
 
-    Args:
-        scene: subset with the columns of `tracks_needed`.
-        lacking: columns that its source does not have (see `quality_reports.rules.scene.find_lacking`).
-        thresholds: overrides by name.
-        rules: rules to judge by.
+    The scene has the columns of `tracks_needed`; `lacking` are columns that its source does not have; thresholds
+    override by name.
 
     Raises:
         SubsetOrderError: see `quality_reports.rules.findings.find`.

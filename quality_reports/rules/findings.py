@@ -21,16 +21,9 @@ def find(
 ) -> pl.DataFrame:
     """Find every run of consecutive entries of one vehicle that breaks one rule.
 
-    Entries are consecutive when their frames differ by exactly 1; a frame gap ends a run.
-
-    Args:
-        tracks: ONE subset's entries, sorted by vehicle_id, frame, with the columns that the rules name (see
-            `quality_reports.rules.derived.prepare` for the derived ones).
-        rules: rules to check.
-        thresholds: overrides of the rules' thresholds by name.
-
-    Returns:
-        `findings`, sorted by rule, vehicle_id, first_frame; `worst` is the extreme of the rule's value.
+    Entries are consecutive when their frames differ by exactly 1; a frame gap ends a run. The tracks are ONE subset's
+    entries, sorted by vehicle_id, frame, with the columns that the rules name. Returns `findings`, sorted by rule,
+    vehicle_id, first_frame; `worst` is the extreme of the rule's value.
 
     Raises:
         SubsetOrderError: more than one subset, or not sorted.
@@ -72,14 +65,8 @@ def judge_subset(tracks: pl.DataFrame, *, max_backward_share: float = MAX_BACKWA
     """Decide whether a subset is excluded from samples and splits because its vehicles drive backwards.
 
     It is when MORE than `max_backward_share` of the vehicles have any entry with speed_mps < 0 (DESIGN section 5),
-    whatever the threshold of the rule `backward`.
-
-    Args:
-        tracks: ONE subset's entries: dataset, subset, vehicle_id, speed_mps; sorted by vehicle_id, frame.
-        max_backward_share: of the subset's vehicles, 0 to 1.
-
-    Returns:
-        `subset_status`: one row, or none where there are no entries.
+    whatever the threshold of the rule `backward`. The tracks are ONE subset's entries: dataset, subset, vehicle_id,
+    speed_mps, sorted by vehicle_id, frame; without entries there is no row.
 
     Raises:
         SubsetOrderError: more than one subset, or not sorted.

@@ -115,11 +115,7 @@ class Rule:
         return trace(self.reads)
 
     def broken(self, thresholds: Limits) -> pl.Expr:
-        """Return an expression: true where an entry breaks the rule, else false, never null.
-
-        Args:
-            thresholds: every threshold of the rule by name (see `quality_reports.rules.registry.resolve`).
-        """
+        """Return an expression: true where an entry breaks the rule, else false, never null."""
         return self.breaks(thresholds).fill_null(value=False)
 
     def measure(self, thresholds: Limits) -> pl.Expr:

@@ -150,12 +150,7 @@ class Scene:
 
 
 def find_lacking(vehicles: pl.DataFrame, facts: pl.DataFrame) -> frozenset[str]:
-    """Find the columns of `tracks`, `vehicles` and `subsets` that one subset's source does not have.
-
-    Args:
-        vehicles: the subset's `vehicles`.
-        facts: its row of `subsets`.
-    """
+    """Find the columns of `tracks`, `vehicles` and `subsets` that one subset's source does not have."""
     row = facts.row(0, named=True)
     lacking = set(row["columns_missing"])
     lacking |= {name for name in VEHICLE_COLUMNS if vehicles[name].null_count() == vehicles.height}

@@ -24,10 +24,7 @@ def score_vehicles(
 ) -> pl.DataFrame:
     """Return `vehicle_scores`: each vehicle's share of entries without error, and without error and warning.
 
-    Args:
-        entries: ONE subset's prepared entries, sorted by vehicle_id, frame.
-        rules: rules that could be checked.
-        thresholds: overrides by name.
+    The entries are ONE subset's prepared ones, sorted by vehicle_id, frame; thresholds override by name.
 
     Raises:
         ThresholdError: see `quality_reports.rules.registry.resolve`.
@@ -61,11 +58,8 @@ def score_subset(
 ) -> pl.DataFrame:
     """Return `subset_scores`: one row, or none where there are no entries.
 
-    Args:
-        entries: ONE subset's prepared entries, with those of COLUMNS_SCORED that its source has.
-        vehicle_scores: scores of its vehicles.
-        unchecked: rules that could not be checked.
-        thresholds: overrides by name; high_jerk_mps3 and jerk_flicker_changes count here.
+    The entries are ONE subset's prepared ones, with those of COLUMNS_SCORED that its source has; of the thresholds,
+    high_jerk_mps3 and jerk_flicker_changes count here.
 
     Raises:
         ThresholdError: see `quality_reports.rules.registry.resolve`.
