@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
-
 Dataset = Literal["ngsim", "highd", "custom"]
 DATASETS: tuple[Dataset, ...] = get_args(Dataset)
 Origin = Literal["recorded", "synthetic"]

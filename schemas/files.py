@@ -66,15 +66,14 @@ def write_output(target: Path, content: bytes | Callable[[BinaryIO], object]) ->
         return
     sys.stdout.flush()  # what was printed before stands before
     # Opened by its name, a file would be written from its start, under what others write through the descriptor.
-    with explain_file_errors(target), target.open("wb") if descriptor is None else _reopen(descriptor) as stream:
+    with (
+        explain_file_errors(target),
+        target.open("wb") if descriptor is None else os.fdopen(os.dup(descriptor), "wb") as stream,
+    ):
         if isinstance(content, bytes):
             stream.write(content)
         else:
             content(stream)
-
-
-def _reopen(descriptor: int) -> BinaryIO:
-    return os.fdopen(os.dup(descriptor), "wb")
 
 
 def _find_descriptor(target: Path) -> int | None:

@@ -6,7 +6,6 @@ from tracklake.schemas.columns import DATASET, PARTS, Table, column
 
 QUANTITIES = ("vehicles_per_lane_s", "speed", "left", "right", "brake")
 """Quantities whose distributions are compared: veh/lane/s, m/s, and 0 or 1 for each sample's maneuver."""
-
 _SPLIT = column(pl.String, "the split's name")
 _PART = column(pl.String, "one part: train or val", isin=PARTS)
 _OTHER = column(pl.String, "a later one: val or eval", isin=PARTS)

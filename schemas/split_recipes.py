@@ -33,7 +33,6 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 
 LEAKAGE_FREE = (FLOW_BALANCED, TIME_BLOCKS, BY_RECORDING)
 """Splits that claim that nothing of one part is reachable from another."""
-
 VALIDATION_SHARE = 0.1
 """Share of the part `val`, 0 to 1."""
 

@@ -10,7 +10,6 @@ INDEX_FILE = "index.json"
 
 TENSORS_VERSION = 5
 """Number of the folder's layout; it grows when older readers cannot read the files."""
-
 POSITION_STORAGES = ("float32", "int16-decimetres", "int16-centimetres")
 
 STORAGE = """\

@@ -29,13 +29,10 @@ from tracklake.schemas.text import make_visible
 
 TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
-
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""
-
 PROSE = (".txt", ".dat", *TABLES, ARCHIVE_SUFFIX, "")
 """Endings that other files share: an unrecognised file with one is skipped and named, not refused."""
-
 HASHES = ".hashes.json"
 """Name of the file in the lake that remembers raw files' hashes."""
 

@@ -29,7 +29,6 @@ REASONS_SHOWN = 3
 """Reasons named in the message about a recording of which every row was dropped."""
 MEMORY_BUDGET = MemoryBudget(256 << 20)
 """Raw text read at once, in bytes; a recording takes four times as much memory, and highD's longest has 240 MB."""
-
 _PLANNING_FACTS = ("subset", "freeway")
 """Columns of `subsets` that stages are planned with."""
 Files = dict[str, list[LakeFile]]

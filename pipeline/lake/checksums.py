@@ -21,7 +21,6 @@ class DamagedFile(NamedTuple):
 
 CHUNK = 1 << 20
 """Bytes read at once while a file is hashed."""
-
 _KNOWN: dict[tuple[int, int, int, int], str] = {}
 """Checksums of files that this process wrote or compared, by device, inode, size and time of change in ns."""
 _GUARD = threading.Lock()

@@ -34,7 +34,6 @@ LISTING = "files.json"
 """File in every folder of `write_folder` with the names and sizes of its files, to notice one half deleted."""
 ZSTD_LEVEL = 1
 """Compression level of Parquet files; level 3 writes a quarter less and takes half as long again."""
-
 TABLE_BY_NAME = {table.name: table for table in TABLES}
 
 

@@ -21,7 +21,6 @@ from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
 
 KEPT_GENERATIONS = 2
 """Generations for which a replaced file is kept, in writing sessions."""
-
 _HELD: set[int] = set()
 """Descriptors of the locks this process holds."""
 

@@ -50,7 +50,6 @@ LASTING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, 
 """Errors of the operating system that a second try does not cure: full disks, limits, missing rights."""
 LOCK_POLL_S = 1.0
 """Time between two looks at a lake that another process writes to, in seconds."""
-
 Results = Iterable[tuple[str, Any]]
 """Titles of tasks with their results or errors."""
 

@@ -10,7 +10,6 @@ from tracklake.schemas import INGEST_LOG, REJECTS
 
 FILE = "file_index"
 """Column with the number of a row's file among its recording's files."""
-
 DUPLICATE = "duplicate row"
 CONFLICT = "another row has the same vehicle and frame"
 
@@ -76,6 +75,7 @@ def account_rows(
         if not mine.is_empty():
             mine = mine.join(fetch_lines(part.file, mine[LINE]), on=LINE, how="left")
         refused = pl.concat([at_parsing, mine.select(*REJECT_SCHEMA)] if not mine.is_empty() else [at_parsing])
+        reasons = refused.group_by("reason").agg(pl.len().cast(pl.Int64).alias("rows")).sort("reason")
         log.append(
             {
                 "dataset": dataset,
@@ -86,7 +86,7 @@ def account_rows(
                 "rows_read": parsed + at_parsing.height,
                 "rows_kept": parsed - mine.height,
                 "rows_dropped": refused.height,
-                "dropped_by_reason": _count_reasons(refused),
+                "dropped_by_reason": reasons.to_dicts(),
             }
         )
         rejects.append(refused.with_columns(file=pl.lit(part.file.name)))
@@ -96,11 +96,6 @@ def account_rows(
 
 
 _LATER = {FILE: pl.Int64(), LINE: pl.Int64(), "reason": pl.String()}
-
-
-def _count_reasons(rejects: pl.DataFrame) -> list[dict[str, object]]:
-    """Count rejected rows by reason, as the log's list of structs."""
-    return rejects.group_by("reason").agg(pl.len().cast(pl.Int64).alias("rows")).sort("reason").to_dicts()
 
 
 def _to_rejects(rejects: pl.DataFrame, dataset: str, recording: str | None) -> pl.DataFrame:

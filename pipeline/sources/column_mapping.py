@@ -31,10 +31,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 
 ESSENTIAL = ("Vehicle_ID", "Frame_ID", "Local_X", "Local_Y", "v_Vel")
 """Columns without which a file is no recording; without Global_Time its frames tell one recording."""
-
 NGSIM_RATE_HZ = 10.0
 """Frames per second of all of NGSIM's recordings."""
-
 COLUMNS = tuple(name for name in RAW_NGSIM.columns if name != "line")
 """Columns that a mapping can name."""
 

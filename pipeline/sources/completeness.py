@@ -15,10 +15,8 @@ from tracklake.schemas.completeness import PUBLISHED
 
 VEHICLE = ["source_vehicle_id", "entries_announced"]
 """Columns that identify a vehicle of the source; on arterials its rows may lie in several subsets."""
-
 HOLD_NO_ENTRY = ("blank line", "repeated header")
 """Reasons of rejected lines that never held a row."""
-
 FAULTS = ("vehicles_without_rows", "vehicles_incomplete", "first_frames_differ", "last_frames_differ")
 """Measures that count faulty vehicles; the expected count is 0."""
 

@@ -36,10 +36,8 @@ HIGHD_FORMAT = LevelxFormat(
 
 FIRST_FRAME = 1
 """Number of a recording's first frame, where time_s = 0 even if the first vehicle appears later."""
-
 SYNTHETIC_DAY = "synthetic"
 """Value of recordingMeta's weekDay that marks a generated recording."""
-
 CARRIAGEWAYS = {UPPER: "upper", LOWER: "lower"}
 """Carriageways by drivingDirection."""
 

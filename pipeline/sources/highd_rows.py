@@ -8,7 +8,6 @@ from tracklake.schemas import TRACKS
 
 DIRECTION = "drivingDirection"
 """Column of tracksMeta with the vehicle's carriageway."""
-
 LANE = "laneId is no lane of the vehicle's carriageway, nor beside it"
 SPEED = "xVelocity is no speed on the vehicle's carriageway"
 

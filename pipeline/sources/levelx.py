@@ -20,12 +20,10 @@ from tracklake.schemas.columns import Dataset
 RECORDING, VEHICLES, TRACKS = "recordingMeta", "tracksMeta", "tracks"
 KINDS = (RECORDING, VEHICLES, TRACKS)
 """The three files of a recording, in the order in which they are read."""
-
 UNKNOWN_VEHICLE = "vehicle without a row in tracksMeta"
 
 MAX_UNKNOWN_SHARE = 0.01
 """Highest share of rows of unknown vehicles (damaged ids); above it the files do not belong together."""
-
 FileSet = tuple[tuple[str, str], dict[str, RawFile]]
 """(folder, number in the files' names) and the files by kind."""
 
@@ -125,7 +123,12 @@ class LevelxFormat:
         """Gather files by folder and number, then by kind; also return messages about files that fit nowhere."""
         gathered: dict[tuple[str, str], dict[str, RawFile]] = {}
         refusals = []
-        for file in sorted(files, key=lambda file: (not self._is_named_as_shipped(file), file.name)):
+
+        def sort_key(file: RawFile) -> tuple[bool, str]:
+            as_shipped = PurePosixPath(file.filename).stem.endswith(self.find_kind(file))
+            return not as_shipped, file.name
+
+        for file in sorted(files, key=sort_key):
             kind = self.find_kind(file)
             number = re.match(r"(\d+)_", file.filename)
             if number is None:
@@ -143,9 +146,6 @@ class LevelxFormat:
                 continue
             found[kind] = file
         return list(gathered.items()), refusals
-
-    def _is_named_as_shipped(self, file: RawFile) -> bool:
-        return PurePosixPath(file.filename).stem.endswith(self.find_kind(file))
 
     def read_recording(self, parts: Sequence[Part], recording: str) -> tuple[LevelxRecording, pl.DataFrame]:
         """Read a recording's three files, in the order of KINDS, and drop the rows of tracks that cannot be true.

@@ -46,19 +46,14 @@ CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
 DECIMALS = 6
 """Decimals that measurements are rounded to. The originals have three; files rewritten by other programs hold
 27.125999999999998 for 27.126, and must give the same tables and be recognised as repetitions."""
-
 CONSTANTS = ("Total_Frames", "v_length", "v_Width", "v_Class")
 """Columns that are equal in all rows of one vehicle, so they distinguish vehicles that share an id."""
-
 KEY = pl.col("Global_Time") - 100 * pl.col("Frame_ID").cast(pl.Int64)
 """Time of frame 0, ms: constant within a recording, which it identifies."""
-
 PARSING_THREADS = 3
 """Chunks of one file parsed at once; more threads cost memory and help little, since the parser is threaded too."""
-
 SAMPLE_BYTES = 1 << 20
 """Size of the first part of a file that is judged before the file is read, in bytes."""
-
 MAX_RECORDINGS = 200
 """Most recordings a file may hold: if the largest ones do not have half of its rows, times or frames are wrong."""
 

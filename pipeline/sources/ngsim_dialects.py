@@ -68,7 +68,6 @@ _OFTEN = {
 }
 GUESSES = {alias: name for name, aliases in _OFTEN.items() for alias in aliases}
 """Likely meanings of names that are not NGSIM's, for the mapping that a refusal suggests."""
-
 LOCATIONS = ("us-101", "i-80", "lankershim", "peachtree")
 
 
@@ -113,7 +112,6 @@ apart, the 3 h 15 min between its two periods.
 
 SYNTHETIC_MS = 42
 """Milliseconds past a tenth of a second at which all times of generated files lie; recorded ones lie on the tenth."""
-
 DAY_MS = 86_400_000
 UNKNOWN = "unknown"
 _LOCAL = ZoneInfo("America/Los_Angeles")

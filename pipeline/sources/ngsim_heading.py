@@ -18,16 +18,12 @@ from tracklake.schemas.raw_ngsim import RAW_NGSIM
 CSV, TEXT = "ngsim-csv", "ngsim-text"
 CSV_BARE, TEXT_HEADED, MAPPED = f"{CSV}-no-header", f"{TEXT}-header", "columns"
 """Dialects: with commas or blanks between the fields, with a header or without, or as the user maps the columns."""
-
 LINES = 25
 """First lines that are looked at."""
-
 FEWEST_KNOWN = 4
 """Fewest known names in the header of a file that is taken for a recording, and refused if others are missing."""
-
 WITH_UNIT = re.compile(r"^(.*?)\s*[\(\[](.*?)[\)\]]\s*$")
 """Pattern of a name with its unit behind it: `local_x(m)`."""
-
 SECONDS = re.compile(r"^\d+\.\d*[1-9]\d*$")
 """Pattern of a time in seconds, which has a fraction; times in ms are whole."""
 

@@ -15,10 +15,8 @@ from tracklake.schemas.columns import FOOT_M
 
 FEWEST = 30
 """Fewest rows or pairs of rows that a figure is taken from."""
-
 FRAME_MS = 100
 """Time between two frames, in ms."""
-
 FRAMES_PER_S = 1000 / FRAME_MS
 
 SWAPS = (
@@ -29,31 +27,22 @@ SWAPS = (
 
 MOVING = 5.0
 """Speed from which a vehicle counts as moving, in the file's unit."""
-
 LANE_WIDTH_FT, LANE_WIDTH_M = (9.0, 16.0), (2.7, 4.9)
 """Plausible distances between the middles of two lanes, in ft and in m."""
-
 MAIN_LANES = 5
 """Highest number of a lane that is neither a ramp nor an auxiliary lane at any site."""
-
 UNEVEN = 1.6
 """Highest ratio of one lane's width to the median of all."""
-
 OTHER_SIDE = 0.3
 """Share of leaders ahead, or of followers behind, below which the columns are not what they are called."""
-
 BACKWARDS = 0.3
 """Share of negative speeds from which v_Vel is no speed."""
-
 LENGTH_FT = (10.0, 33.0)
 """Plausible medians of the vehicles' lengths, in ft."""
-
 LENGTH_M = (3.0, 6.0)
 """Plausible medians of the vehicles' lengths, in m; a motorcycle of 7 ft is none of them."""
-
 TOLERANCE = 0.06
 """Largest relative difference between the ratio of two units and what was found."""
-
 POSITIONS = ("Local_X", "Local_Y", "Space_Headway")
 SIZES = ("v_length", "v_Width")
 
@@ -242,16 +231,12 @@ def find_order(rows: pl.DataFrame) -> dict[str, str] | None:
 
 CONSTANT = ("Total_Frames", "v_length", "v_Width", "v_Class")
 """Columns with one value for each vehicle."""
-
 CHANGES = 0.05
 """Share of pairs of frames in which a constant of the vehicle may change, since two vehicles can share an id."""
-
 LANE_CHANGES, LANES = 0.2, 20
 """Share of pairs of frames with a lane change, and number of a lane, above which Lane_ID is no lane."""
-
 HIGHEST_ACCEL = 30.0
 """Plausible median of the size of v_Acc, in ft/s2."""
-
 HEADWAY_ERROR = 0.25
 """Relative difference between a headway and what it is computed from, above which the column is none."""
 

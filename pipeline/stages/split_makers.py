@@ -51,10 +51,6 @@ def make_split(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     return _MAKERS[recipe.name](recipe, inputs)
 
 
-def _make_flow_balanced(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
-    return SplitResult(allocate_flow_balanced(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty())
-
-
 def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     blocks = cut_blocks(inputs.subsets, block_s=recipe.block_s, purge_s=recipe.purge_s)
     visits, weights = [pl.DataFrame(schema=VISITS)], [pl.DataFrame(schema=WEIGHTS)]
@@ -103,13 +99,13 @@ def _make_csp(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     return SplitResult(divide_by_id(inputs.subsets, vehicles, recipe), SPLIT_LEFT_OUT.empty())
 
 
-def _make_by_recording(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
-    return SplitResult(divide_by_recording(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty())
-
-
 _MAKERS: dict[str, Callable[[SplitRecipe, SplitInputs], SplitResult]] = {
-    FLOW_BALANCED: _make_flow_balanced,
+    FLOW_BALANCED: lambda recipe, inputs: SplitResult(
+        allocate_flow_balanced(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty()
+    ),
     TIME_BLOCKS: _make_time_blocks,
     CSP_2018: _make_csp,
-    BY_RECORDING: _make_by_recording,
+    BY_RECORDING: lambda recipe, inputs: SplitResult(
+        divide_by_recording(inputs.subsets, recipe), SPLIT_LEFT_OUT.empty()
+    ),
 }

@@ -17,7 +17,6 @@ from tracklake.schemas.hashing import hash_values
 
 INGEST = "ingest"
 """Name of the stage that makes the recordings; every other stage works on what it committed."""
-
 Scope = Literal["recording", "freeway recording", "lake"]
 
 

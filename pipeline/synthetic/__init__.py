@@ -18,7 +18,6 @@ from tracklake.schemas.files import name_unfinished
 ALL_FORMATS = FORMATS
 DEFAULT_MINUTES = 1.0
 """Length of the recordings in minutes, unless set."""
-
 __all__ = ["ALL_FORMATS", "DEFAULT_FORMATS", "DEFAULT_MINUTES", "SampleSummary", "SumoError", "write_sample"]
 
 

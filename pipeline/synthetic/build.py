@@ -27,10 +27,8 @@ from tracklake.pipeline.synthetic.sumo import find_sumo, simulate, stop_programs
 
 AT_ONCE = 2
 """Simulations that run at the same time; each is a process with one thread."""
-
 STOP_POLL_S = 0.05
 """Time between two attempts to end what is still simulated, in seconds."""
-
 BOM = b"\xef\xbb\xbf"
 TRUTH_FILE = "truth.parquet"
 README_FILE = "README.md"

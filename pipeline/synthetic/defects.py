@@ -22,16 +22,12 @@ from tracklake.schemas.arrays import find_run_starts
 
 LATE_START_M = (20.0, 200.0)
 """Range of positions at which late starts begin, in m."""
-
 NEAREST_LEADER_M = 20.0
 """Largest gap of a vehicle that is shifted into its leader, in m; a larger shift would be no tracking error."""
-
 DRIFT_S = 2.0
 """Time in which a vehicle drifts into its leader, and out again, in s."""
-
 CLEAR_M = 0.05
 """Least distance of a gap from 0, so that rounding in the file does not decide whether vehicles overlap, in m."""
-
 ROLLING_MPS = 1.6
 """Highest speed of vehicles that roll back, in m/s; their acceleration stays below 3.05 m/s2."""
 

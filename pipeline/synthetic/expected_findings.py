@@ -12,7 +12,6 @@ from statistics import median
 
 Key = tuple[int, int]
 """Key of an entry: vehicle and frame."""
-
 HIGH_ACCELERATION_MPS2 = 3.05
 LOW_SPEED_MPS = 1.524
 JUMP_M = 2.0

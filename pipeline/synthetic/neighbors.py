@@ -13,7 +13,6 @@ Number = TypeVar("Number", bound=np.generic)
 
 NO_ROW = -1
 """Row number that means none."""
-
 ENDS = (pl.col("x"), pl.col("x") - pl.col("length"))
 """Positions of a vehicle's front and rear."""
 

@@ -11,10 +11,8 @@ from tracklake.schemas.arrays import Floats
 
 CALM_MPS = 2.0
 """Speed below which the noise of speeds and accelerations fades out, in m/s; a standing vehicle has none."""
-
 SLOW_MPS = 1.7
 """Speed below which accelerations are at least LEAST_ACCEL_MPS2, in m/s."""
-
 LEAST_ACCEL_MPS2 = 0.02
 """Least acceleration of slow vehicles, in m/s2, so that only injected defects have exactly 0."""
 

@@ -4,10 +4,8 @@ from dataclasses import dataclass, field
 
 FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata")
 """Raw formats that the generator writes."""
-
 DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata")
 """Formats of a sample, unless set."""
-
 LEAST_MINUTES = 0.1
 MOST_MINUTES = 15.0
 """Longest unit of the recordings' length, in minutes; the NGSIM-like recordings begin 15 minutes apart."""
@@ -122,7 +120,6 @@ RAMP_VISIBLE_M = 60.0
 WEAVE_BEGINS_M = 180.0
 WEAVE_ENDS_M = 430.0
 """Positions at which the on-ramp comes into view, becomes the auxiliary lane, and ends, in m."""
-
 _MISREAD = Plan(jumps=1, wrong_leaders=1, wrong_headways=2, lane_flickers=2)
 
 HIGHD = (

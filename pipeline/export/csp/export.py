@@ -36,16 +36,12 @@ from tracklake.schemas.protocols import LAST_LANES
 
 FILES = ("TrainSet.mat", "ValSet.mat", "TestSet.mat")
 """Names of the files, in the order of `schemas.columns.PARTS`."""
-
 LARGEST_BYTES = 2**31 - 1
 """Largest size of a variable in a .mat file of version 5, in bytes; SciPy writes no other version."""
-
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 """Columns of tracks that the export reads."""
-
 DESCRIBED = ("dataset", "subset", "recording", "origin")
 """Facts of each data set that the card lists."""
-
 _NEEDS = "A sample needs lanes, 3.0 s of track before it and 0.2 s after; DESIGN describes what --clean drops."
 
 

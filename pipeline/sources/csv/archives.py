@@ -16,13 +16,10 @@ from tracklake.schemas.text import make_visible
 
 ZIP_MAGICS = (b"PK\x03\x04", b"PK\x05\x06", b"PK\x07\x08")
 """First bytes of a zip archive, of an empty one, and of one in several volumes."""
-
 ARCHIVE_SUFFIX = ".zip"
 """Ending of a zip archive's name."""
-
 MACOS_FOLDER = "__MACOSX"
 """Folder that macOS adds to archives; it is ignored like a hidden file."""
-
 ENCRYPTED = 1
 """Bit in a member's flags that says it is encrypted."""
 

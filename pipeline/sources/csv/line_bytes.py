@@ -8,10 +8,8 @@ import pyarrow as pa
 
 LINE = "line"
 """Column of line numbers, counted from 1."""
-
 BOM = b"\xef\xbb\xbf"
 """UTF-8's byte order mark."""
-
 CACHED_BYTES = 1 << 19
 """Size of a block for byte-wise work, in bytes: it stays in a core's cache, which halves the time."""
 

@@ -15,13 +15,10 @@ from tracklake.pipeline.sources.csv.line_bytes import BOM
 
 BLOCK_BYTES = 1 << 20
 """Size of a block that is converted at once, in bytes."""
-
 FEWEST_SEPARATORS = 4
 """Fewest semicolons or tabs in the first line that can separate its fields."""
-
 UTF_16 = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 """Codecs by byte order mark."""
-
 POINT, COMMA = re.compile(rb"^[+-]?\d*\.\d+$"), re.compile(rb"^[+-]?\d*,\d+$")
 """Patterns of numbers with a decimal point and with a decimal comma."""
 

@@ -8,10 +8,8 @@ from tracklake.pipeline.sources.csv.line_bytes import cut_at_lines
 QUOTE, COMMA, POINT, ZERO, NINE = (ord(character) for character in '",.09')
 BLOCK_BYTES = 1 << 21
 """Size of a block, in bytes; larger than CACHED_BYTES since most of the work is on the few quotes' positions."""
-
 LONGEST_GROUP = 3
 """Most digits before or after a thousands separator."""
-
 LONGEST_FRACTION = 4
 """Most digits after the decimal point of a number that is unquoted."""
 

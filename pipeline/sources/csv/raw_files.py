@@ -21,22 +21,16 @@ from tracklake.schemas.hashing import hash_chunks
 
 CHUNK_BYTES = 12 << 20
 """Size of a chunk that is read and parsed at once, in bytes."""
-
 HASH_BYTES = 1 << 20
 """Size of a block that is hashed at once, in bytes."""
-
 MAX_TEXT_RATIO = 40
 """Highest ratio of text to file size; more than that is the same rows again and again, and would fill the memory."""
-
 FREE_TEXT_BYTES = 256 << 20
 """Text that every file may hold, however small it is, in bytes."""
-
 HEAD_BYTES = 8192
 """First bytes by which encoding and separators are recognised."""
-
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip file."""
-
 GZIP_RATIO = 6
 """Highest compression ratio that gzip reaches on trajectories."""
 

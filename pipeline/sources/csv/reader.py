@@ -31,25 +31,18 @@ Result = TypeVar("Result")
 
 REJECT_SCHEMA = {LINE: pl.Int64(), "reason": pl.String(), "text": pl.String()}
 """Columns of the lines that were not kept."""
-
 THOUSANDS = r"^[+-]?(\d+|\d{1,3}(,\d{3})+)(\.\d+)?$"
 """Pattern of a number that may carry thousands separators: it fits `1,156`, not `1,15`."""
-
 EXPONENT = r"^[+-]?\d(?:\.(\d*))?[eE]([+-]?\d{1,2})$"
 """Pattern of a number in scientific notation; its groups are the fraction and the exponent."""
-
 DIGITS_LOST = "digits lost in scientific notation (a spreadsheet rounded it)"
 """Reason to reject a whole number of which not all digits were written."""
-
 NULL_WORDS = ("nan", "na", "n/a", "#n/a", "<na>", "null", "none")
 """Words in lower case that programs write for a missing value."""
-
 EXACT_WHOLE = 1 << 53
 """Lowest number above which double precision skips whole numbers."""
-
 UNNAMED = "#"
 """Mark before the number of an unwanted field whose own name is missing or taken."""
-
 WELL_QUOTED = r'^("[^"]*"|[^",]*)(,("[^"]*"|[^",]*))*$'
 """Pattern of a line whose quotes surround whole fields."""
 

@@ -13,13 +13,10 @@ from tracklake.pipeline.sources.source import SourceError
 
 BLOCK_ROWS = 1 << 16
 """Rows converted at once."""
-
 MATRIX_COLUMNS = (18, 19, 24, 25)
 """Numbers of columns of a matrix that can hold NGSIM's rows: the 18 fields, with an index, and the longer exports."""
-
 EXACT_WHOLE = float(1 << 53)
 """Lowest number above which double precision skips whole numbers."""
-
 PARQUET, FEATHER, MATLAB, MATLAB_7_3 = MAGICS = (b"PAR1", b"ARROW1", b"MATLAB 5.0", b"MATLAB 7.3")
 """First bytes of the files that this module knows."""
 

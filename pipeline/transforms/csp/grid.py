@@ -16,19 +16,14 @@ from tracklake.schemas.samples import CELLS
 
 ROWS = 13
 """Cells in a column of the grid."""
-
 REACH_FT = np.float32(90)
 """Distance along the road within which vehicles are neighbors, in ft."""
-
 CELL_FT = np.float32(15)
 """Length of a cell, in ft."""
-
 COLUMNS = (-1, 0, 1)
 """Lanes of the grid's columns, relative to the own lane: left, own, right."""
-
 CHUNK_ROWS = 1 << 14
 """Origins whose grids are filled at once; their arrays stay in the processor's cache."""
-
 Rows = NDArray[np.int32]
 
 

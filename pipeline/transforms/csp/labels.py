@@ -7,16 +7,12 @@ from tracklake.pipeline.transforms.csp.entries import CspEntries
 
 LANE_ROWS = 40
 """Rows before and after an entry whose lanes are compared with its own."""
-
 BRAKE_ROWS_BEHIND = 30
 """Rows of the past speed's window."""
-
 BRAKE_ROWS_AHEAD = 50
 """Rows of the future speed's window."""
-
 BRAKE_RATIO = 0.8
 """Ratio of future to past speed below which a vehicle brakes."""
-
 KEEP, LEFT, RIGHT = 1, 2, 3
 NORMAL, BRAKE = 1, 2
 

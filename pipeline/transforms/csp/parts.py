@@ -13,19 +13,14 @@ from tracklake.schemas.columns import PARTS
 
 TRAIN, VAL, TEST = range(3)
 """Codes of the parts: positions in `schemas.columns.PARTS`."""
-
 NO_PART = -1
 """Code of an entry that is in no part."""
-
 HISTORY_ROWS = 31
 """Rows of a full history, 3 s at 10 Hz and the entry itself; the script stops at shorter tracks."""
-
 FULL_FUTURE_ROWS = 50
 """Rows of a full future, 5 s at 10 Hz: all that the Dataset class reads ahead."""
-
 TRAIN_SHARE, TRAIN_VAL_SHARE = np.float32(0.7), np.float32(0.8)
 """Shares of the highest vehicle id at which the validation and the test set begin."""
-
 NO_LANE, EXCLUDED, SAME_ID, ID_ZERO = "no_lane", "excluded_subset", "same_id_and_frame", "id_zero"
 OUTSIDE_SPLIT, IN_TWO_PARTS = "outside_split", "in_two_parts"
 SHORT_TRACK, SHORT_HISTORY, SHORT_FUTURE, NO_FULL_FUTURE = (
@@ -117,14 +112,9 @@ def keep_samples(part: Parts, drops: Mapping[str, Flags]) -> tuple[Flags, dict[s
     counts = {}
     for reason in REASONS:
         if reason in drops:
-            counts[reason] = count_parts(part[kept & drops[reason]])
+            counts[reason] = np.bincount(part[kept & drops[reason]], minlength=len(PARTS)).tolist()
             kept &= ~drops[reason]
     return kept, counts
-
-
-def count_parts(part: Parts) -> list[int]:
-    """Count the entries of each part."""
-    return [int(count) for count in np.bincount(part, minlength=len(PARTS))]
 
 
 ORIGINAL_ORDER = ("us-101-0750", "us-101-0805", "us-101-0820", "i-80-1600", "i-80-1700", "i-80-1715")

@@ -32,10 +32,8 @@ from tracklake.schemas.samples import CELLS
 
 RATE_HZ = 10
 """Rate of the script's clock, in Hz."""
-
 COLUMNS = 8 + CELLS
 """Columns of `traj`: data set, vehicle, frame, x, y, lane, lateral and longitudinal code, the 39 cells."""
-
 BLOCK_ROWS = 1 << 16
 """Samples assembled at once."""
 

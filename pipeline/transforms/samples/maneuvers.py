@@ -9,16 +9,12 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 
 LANE_WINDOW_S = 4
 """Time before and after an entry at which lanes are compared with its own, in s."""
-
 BRAKE_HISTORY_S = 3
 """Window of the past mean speed, in s."""
-
 BRAKE_FUTURE_S = 5
 """Window of the future mean speed, in s."""
-
 BRAKE_RATIO = (4, 5)
 """Ratio of future to past mean speed below which a vehicle brakes: 0.8 as a fraction."""
-
 UNITS_PER_M = 1e7
 """Units of displacement per m. A millimetre and a thousandth of a foot are whole numbers of units, so rounding does not
 decide whether a ratio is exactly 0.8."""

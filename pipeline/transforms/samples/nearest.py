@@ -15,7 +15,6 @@ from tracklake.schemas.arrays import Flags, Floats, Integers
 
 BLOCK_ROWS = 1 << 13
 """Entries searched at once, in whole ticks; their arrays stay in the processor's cache."""
-
 NO_VEHICLE = np.iinfo(np.int64).max
 """Key that sorts after every vehicle's."""
 

@@ -13,20 +13,15 @@ from tracklake.schemas.samples import CELLS
 
 ROWS = 13
 """Cells of a column, from behind to ahead; row 6 is alongside."""
-
 COLUMNS = CELLS // ROWS
 """Columns of the grid: lane - 1, lane and lane + 1."""
-
 UNITS_PER_M = 10_000_000
 """Units of position per m. A millimetre and a thousandth of a foot are whole numbers of units, so that 'exclusive' and
 'half away from zero' are exact."""
-
 CELL_UNITS = 45_720_000
 """Length of a cell in units: 4.572 m, 15 feet."""
-
 REACH_UNITS = 274_320_000
 """Distance in units within which vehicles are neighbors: 27.432 m, 90 feet, exclusive."""
-
 CHUNK_ROWS = 1 << 15
 """Origins whose pairs are made at once; their arrays stay in the processor's cache."""
 

@@ -30,14 +30,12 @@ DROP_REASONS = {
 
 TRACK_COLUMNS = ("vehicle_id", "frame", "x_m", "y_m", "lane")
 """Columns of tracks that `draw_samples` reads."""
-
 SAMPLE_COLUMNS = ("vehicle_id", "tick", "frame", "lane", "lateral_maneuver", "longitudinal_maneuver")
 
 NO_NEIGHBORS = Neighborhood(NEIGHBORS.empty(), collisions=0, crowded_out=0)
 
 PUBLISHED_HZ = 10
 """Rate of the entries over which published collisions in the grid are counted, in Hz."""
-
 PIECE_ROWS = 1 << 16
 """Entries tested and labelled at once; their arrays stay in the processor's cache."""
 

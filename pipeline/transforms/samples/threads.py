@@ -7,7 +7,6 @@ from typing import TypeVar
 THREADS = 2
 """Threads per call; more gain little, since each needs the interpreter between computations and several recordings are
 processed at once."""
-
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 

@@ -38,13 +38,10 @@ def allocate_flow_balanced(subsets: pl.DataFrame, recipe: SplitRecipe) -> Alloca
 
     Up to 18 subsets (11 with a validation part) every allocation is tried: the optimum. Beyond, a local search starts
     from `restarts` random allocations of about the right shares and takes the best of all flips (one subset to another
-    part) and swaps (two subsets of different parts) until none improves. It then starts twice as often from the best
-    allocation with a dozen subsets exchanged, which halves the remaining difference of three parts. The sums behind the
-    two moments are additive over subsets, so a step over all moves is a few array operations. Why it suffices: with
-    values of standard deviation s a swap shifts the moments of an eval part of n / 5 subsets by about 5 s / n, and
-    there are about n^2 / 6 swaps, so a descent in the plane of the two moments ends about 12 s / n^2 from the target
-    and the best of R descents about 12 s / (n^2 sqrt R). For 117 subsets and s = 0.1 that is 6e-6. No difference is
-    below 0, so the difference found bounds its distance from the optimum.
+    part) and swaps (two subsets of different parts) until none improves; then twice as often from the best allocation
+    with a dozen subsets exchanged. With values of standard deviation s, a swap shifts the moments of an eval part of
+    n / 5 subsets by about 5 s / n, and there are about n^2 / 6 swaps: the best of R descents ends about
+    12 s / (n^2 sqrt R) from the target, for 117 subsets and s = 0.1 at 6e-6.
 
     `subsets` have one row per freeway subset that is not excluded, in any order: the columns of
     `splits.tables.COLUMNS`, and `block` if a subset has several rows. `weight` is the number of kept samples (of

@@ -12,22 +12,16 @@ from tracklake.schemas.arrays import Flags, Floats
 
 TOLERANCE = 5
 """Largest deviation of a part's share of the vehicles from its target, in thousandths."""
-
 EXHAUSTIVE_STATES = 2**18
 """Largest number of allocations that are all tried: 18 subsets in two parts, 11 in three."""
-
 MAX_SWAPS = 50_000
 """Swaps scored in one step of the search; more (beyond about 500 subsets) are sampled."""
-
 KICKS, KICKED = 2, 12
 """Descents per random start from the best allocation so far, and subsets whose parts are exchanged before each."""
-
 TIE = 1e-8
 """Difference of vehicles_per_lane_s below which two are equal; sums of squares carry no more digits."""
-
 VEHICLES, FILLED, WEIGHT, FLOW, FLOW2 = range(5)
 """Columns of `Problem.facts`."""
-
 Indices = npt.NDArray[np.intp]
 
 

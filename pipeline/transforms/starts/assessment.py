@@ -18,7 +18,6 @@ from tracklake.schemas.start_assessments import START_ASSESSMENTS
 POSITIONS_M = tuple(20.0 * number for number in range(1, 11))
 """Distances of the cuts from the cut-off, in m. Late starts are known up to 200 m; steps of 20 m show how estimates
 worsen with distance, and are long compared with a vehicle's way in a frame."""
-
 TRACKS_AT_ONCE = 128
 """Cut tracks compared with all references at once, which limits the memory."""
 

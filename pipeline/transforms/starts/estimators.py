@@ -18,10 +18,8 @@ NEAREST = 10
 --minutes 2 --seed 11`), so that no recording that it is measured on has a part in them: of 10, 12, 16, 20 and 30
 references, 0, 10 and 30 s, and 2, 2.5 and 3 errors, those with the least excess. All cover at least 0.9994 of the
 missing time there."""
-
 LANE_APART_S = 10.0
 """Time that a lane between two vehicles counts as in `estimate_locally`, in s."""
-
 ERRORS = 2.0
 """Margin of `estimate_locally` in standard errors of prediction."""
 

@@ -18,19 +18,14 @@ from tracklake.schemas.vehicles import VEHICLE_STARTS
 
 ELIGIBLE_AFTER_S = 1.0
 """Least time from the recording's first frame to a track's first entry that shows it was not yet on the road, in s."""
-
 CUTOFF_STEP_M = 2.0
 """Step between candidates for the cut-off, in m."""
-
 LEAST_REFERENCES = 10
 """Least number of references for a regression; with fewer the subset's mean speed is used."""
-
 SIGMAS = 2.0
 """Margin of a missing start in standard deviations."""
-
 REACH_M = 40.0
 """Distance along the road within which a missing vehicle is a would-be neighbor, in m."""
-
 ROUNDING_M = 1e-6
 """Tolerance of inclusive bounds, in m; far below the precision of a position (1 mm)."""
 

@@ -25,7 +25,6 @@ from tracklake.schemas.tensors import ARRAYS, MOST_TICKS, POSITION_STORAGES, Arr
 
 Arrays = dict[str, np.ndarray]
 """Arrays by their names in `schemas.tensors.ARRAYS`, with its dtypes and shapes."""
-
 MOST_ROWS = 2**31 - 1
 """Largest number of rows or samples, which are numbered by Int32."""
 

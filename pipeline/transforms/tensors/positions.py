@@ -11,7 +11,6 @@ from tracklake.schemas.tensors import STEPS_M
 
 REACH = 2**15 - 1
 """Largest number of steps in int16."""
-
 _ALONG, _ACROSS = "along the road", "across it"
 
 

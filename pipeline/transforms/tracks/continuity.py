@@ -14,20 +14,15 @@ from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges, fin
 NEAR_M = 2.0
 """Largest distance of an entry from its predicted position in the next frame if several vehicles share an id, in m:
 less than a lane's width, since it may be another vehicle. Entries farther away are left to the second step."""
-
 FASTEST_MPS = 60.0
 """Highest speed at which a vehicle may have moved while it was not seen, in m/s."""
-
 SLACK_M = 20.0
 """Tolerance of reachable positions, and of positions farther back, in m: far more than positions err by."""
-
 RANKS = 8
 """Entries of the next frame ahead of and behind an entry that it is compared with: all of them if up to nine vehicles
 share an id in a frame, and more than any vehicle overtakes within one frame."""
-
 DOUBT_MPS = 1.0
 """Cost of each second of absence in m, so that a track continues at its first reappearance."""
-
 RETURNS = 64
 """Later pieces that are tested as the continuation of a piece."""
 

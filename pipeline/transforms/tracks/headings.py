@@ -7,7 +7,6 @@ from tracklake.schemas.arrays import Floats
 
 SMOOTHED_S = 0.2
 """Time over which velocities are averaged, in s: the entries within half of it before and after."""
-
 MOVING_MPS = 2.0
 """Least smoothed speed at which the velocity tells where a vehicle points, in m/s."""
 

@@ -10,10 +10,8 @@ from tracklake.schemas.columns import FOOT_M
 
 UPPER, LOWER = 1, 2
 """Codes of highD's drivingDirection: the upper carriageway drives to the image's left, the lower one to its right."""
-
 EAST, NORTH, WEST, SOUTH = 1, 2, 3, 4
 """Codes of NGSIM's Direction on arterials, where Local_Y runs north and Local_X east."""
-
 DIRECTIONS = {EAST: "east", NORTH: "north", WEST: "west", SOUTH: "south"}
 """Names of NGSIM's directions by code."""
 
