@@ -24,6 +24,11 @@ MAX_NAMED = 3
 MAX_NAME_CHARS = 40
 """Longest part of the lake's folder name in a key, in characters."""
 
+FILE_COLUMNS = ("dataset", "file", "recording", "dialect", "rows_read", "rows_kept", "rows_dropped")
+"""Figures of each source file that a run shows."""
+COUNT_COLUMNS = ("dataset", "recording", "measure", "authority", "expected", "found", "agrees")
+"""Figures of what was announced that a run shows."""
+
 
 @dataclass(frozen=True)
 class FigureTable:
@@ -49,8 +54,16 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, Any]]:
     figures = (
         ("findings", "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
         ("subsets", "Per subset: its size, and the entries that break each rule.", _list_subsets(quality)),
-        ("ingestion", "Per source file: rows read = rows kept + rows dropped.", _list_files(quality)),
-        ("completeness", "Per recording: what was announced beside what was found.", _list_completeness(quality)),
+        (
+            "ingestion",
+            "Per source file: rows read = rows kept + rows dropped.",
+            _select(quality["ingestion"]["files"], FILE_COLUMNS),
+        ),
+        (
+            "completeness",
+            "Per recording: what was announced beside what was found.",
+            _select(quality["completeness"], COUNT_COLUMNS),
+        ),
     )
     link: dict[str, Any] = {
         "key": make_key("report"),
@@ -125,6 +138,10 @@ def _make_slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:MAX_NAME_CHARS].strip("-")
 
 
+def _select(rows: list[dict[str, Any]], names: tuple[str, ...]) -> list[dict[str, Any]]:
+    return [{name: row[name] for name in names} for row in rows]
+
+
 def _list_findings(quality: dict[str, Any]) -> list[dict[str, Any]]:
     counted = ("runs", "vehicles", "entries", "entry_share", "worst")
     return [
@@ -152,13 +169,3 @@ def _list_subsets(quality: dict[str, Any]) -> list[dict[str, Any]]:
         | {name: entries.get((name, row["dataset"], row["subset"])) for name in names}
         for row in quality["subsets"]
     ]
-
-
-def _list_files(quality: dict[str, Any]) -> list[dict[str, Any]]:
-    shown = ("dataset", "file", "recording", "dialect", "rows_read", "rows_kept", "rows_dropped")
-    return [{name: row[name] for name in shown} for row in quality["ingestion"]["files"]]
-
-
-def _list_completeness(quality: dict[str, Any]) -> list[dict[str, Any]]:
-    shown = ("dataset", "recording", "measure", "authority", "expected", "found", "agrees")
-    return [{name: row[name] for name in shown} for row in quality["completeness"]]

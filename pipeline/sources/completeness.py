@@ -49,7 +49,7 @@ def compare_counts(
     each = _compare_vehicles(vehicles, announced.vehicles)
     dropped = _count_dropped(log)
     table = (
-        pl.LazyFrame(_list_measures(vehicles, each, announced), schema_overrides=_COUNTS)
+        pl.LazyFrame(_list_measures(vehicles, each, announced), schema=_COUNTS, orient="row")
         .with_columns(
             dataset=pl.lit(dataset),
             recording=pl.lit(recording),
@@ -65,39 +65,30 @@ def compare_counts(
     return table, tuple(note for note in (about_totals, about_vehicles) if note is not None)
 
 
-_COUNTS = {"expected": pl.Int64(), "found": pl.Int64()}
+_COUNTS = {"measure": pl.String(), "authority": pl.String(), "expected": pl.Int64(), "found": pl.Int64()}
 
 
-def _list_measures(vehicles: pl.DataFrame, each: pl.DataFrame, announced: Announced) -> list[dict[str, object]]:
-    """List authority, expected and found count of every measure."""
+def _list_measures(
+    vehicles: pl.DataFrame, each: pl.DataFrame, announced: Announced
+) -> list[tuple[str, str, int | None, int | None]]:
+    """List every measure with its authority, expected and found count."""
     whole = {
         "vehicles": vehicles["source_vehicle_id"].n_unique(),
         "cars": vehicles.filter(pl.col("class") == "car").height,
         "trucks": vehicles.filter(pl.col("class") == "truck").height,
         "entries": int(vehicles["entries"].sum()),
     }
-    rows: list[dict[str, object]] = [
-        {"measure": measure, "authority": announced.totals_by, "expected": expected, "found": whole[measure]}
-        for measure, expected in announced.totals.items()
+    known, by = not each.is_empty(), announced.vehicles_by
+    expected, found = (int(each[name].sum()) if known else None for name in ("entries_announced", "entries"))
+    return [
+        *((name, announced.totals_by, count, whole[name]) for name, count in announced.totals.items()),
+        ("entries", by, expected, found),
+        *(
+            (name, by, 0, int(each[name].sum()) if each[name].count() else None)
+            for name in FAULTS
+            if name in each.columns
+        ),
     ]
-    known = not each.is_empty()
-    rows.append({
-        "measure": "entries",
-        "authority": announced.vehicles_by,
-        "expected": int(each["entries_announced"].sum()) if known else None,
-        "found": int(each["entries"].sum()) if known else None,
-    })  # fmt: skip
-    rows += [
-        {
-            "measure": measure,
-            "authority": announced.vehicles_by,
-            "expected": 0,
-            "found": int(each[measure].sum()) if each[measure].count() else None,
-        }
-        for measure in FAULTS
-        if measure in each.columns
-    ]
-    return rows
 
 
 def _compare_vehicles(vehicles: pl.DataFrame, announced: pl.DataFrame | None) -> pl.DataFrame:

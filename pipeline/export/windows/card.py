@@ -9,7 +9,7 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.export.windows.files import build_schema, list_npz_arrays
+from tracklake.pipeline.export.windows.files import list_columns, list_npz_arrays
 from tracklake.pipeline.export.windows.result import WindowsExport
 from tracklake.pipeline.sources import SOURCES
 from tracklake.schemas.columns import PARTS
@@ -23,26 +23,6 @@ ABSOLUTE = """\
 Positions are in m on the carriageway: x of the front centre along the direction of travel, y from the carriageway's
 left edge, positive to the driver's right. `origin` is the sample's last position.
 """
-COLUMNS = {
-    "dataset": "ngsim or highd",
-    "subset": "one carriageway of one recording",
-    "vehicle_id": "unique within the subset",
-    "tick": "tick of the sample",
-    "time_s": "time since the recording's first frame, s",
-    "lane": "1 is the driver's leftmost; null = unknown",
-    "lateral_maneuver": "keep, left or right",
-    "longitudinal_maneuver": "normal or brake",
-    "origin_x_m": "x of the sample's last position on the carriageway, m",
-    "origin_y_m": "y of the sample's last position on the carriageway, m",
-    "history_x_m": "x up to the sample's tick, m",
-    "history_y_m": "y up to the sample's tick, m",
-    "future_x_m": "x after the sample's tick, m; null = unknown",
-    "future_y_m": "y after the sample's tick, m; null = unknown",
-    "neighbor_cell": "cell of each neighbor, 13 * column + row (left, own, right lane; row 12 ahead), increasing",
-    "neighbor_id": "vehicle_id of each neighbor",
-    "neighbor_history_x_m": "x of each neighbor up to the sample's tick, m; null = unknown",
-    "neighbor_history_y_m": "y of each neighbor up to the sample's tick, m; null = unknown",
-}
 LOADING = {
     "parquet": """\
 ```python
@@ -168,8 +148,8 @@ def _bound_errors(index: Mapping[str, Any], *, absolute: bool) -> str:
 def _describe_columns(export: WindowsExport, folder: TensorFolder) -> list[str]:
     """Build a table of columns or arrays: name, type, meaning."""
     if export.format == "parquet":
-        schema = build_schema(folder)
-        rows = [f"| {field.name} | {_name_type(str(field.type))} | {COLUMNS[field.name]} |" for field in schema]
+        columns = list_columns(folder).items()
+        rows = [f"| {name} | {_name_type(str(dtype))} | {meaning} |" for name, (dtype, meaning) in columns]
         return ["| column | type | meaning |", "| --- | --- | --- |", *rows]
     rows = [
         f"| {name} | {dtype} | {json.dumps(shape).replace(chr(34), '')} | {meaning} |"

@@ -17,7 +17,7 @@ from tracklake.schemas.arrays import Flags, Singles
 from tracklake.schemas.columns import DATASETS, LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.training.data.tensor_folder import TensorFolder
 
-AXES = ("x_m", "y_m")
+AXES = ("x", "y")
 
 
 class ParquetWindows:
@@ -28,7 +28,7 @@ class ParquetWindows:
         self.folder = folder
         # Values of a dictionary must differ; no two data sets share a subset's name.
         self.dataset_of = np.array([DATASETS.index(subset["dataset"]) for subset in folder.index["subsets"]])
-        self.schema = build_schema(folder)
+        self.schema = pa.schema([(name, dtype) for name, (dtype, _) in list_columns(folder).items()])
         self.writer = pq.ParquetWriter(path, self.schema, compression="zstd")
 
     def __enter__(self) -> Self:
@@ -55,41 +55,44 @@ class ParquetWindows:
             "longitudinal_maneuver": _encode_names(LONGITUDINAL_MANEUVERS, batch.longitudinal),
         }
         for axis, name in enumerate(AXES):
-            columns[f"origin_{name}"] = np.ascontiguousarray(batch.origin[:, axis])
-            columns[f"history_{name}"] = _build_lists(batch.history[..., axis])
-            columns[f"future_{name}"] = _build_lists(batch.future[..., axis], batch.future_mask)
+            columns[f"origin_{name}_m"] = np.ascontiguousarray(batch.origin[:, axis])
+            columns[f"history_{name}_m"] = _build_lists(batch.history[..., axis])
+            columns[f"future_{name}_m"] = _build_lists(batch.future[..., axis], batch.future_mask)
         columns["neighbor_cell"] = pa.ListArray.from_arrays(neighbor_offset, batch.neighbor_cell)
         columns["neighbor_id"] = pa.ListArray.from_arrays(neighbor_offset, windows.neighbor_id)
         for axis, name in enumerate(AXES):
             inner = _build_lists(batch.neighbor_history[..., axis], batch.neighbor_mask)
-            columns[f"neighbor_history_{name}"] = pa.ListArray.from_arrays(neighbor_offset, inner)
+            columns[f"neighbor_history_{name}_m"] = pa.ListArray.from_arrays(neighbor_offset, inner)
         arrays = [pa.array(columns[field.name]).cast(field.type) for field in self.schema]
         self.writer.write_table(pa.Table.from_arrays(arrays, schema=self.schema))
 
 
-def build_schema(folder: TensorFolder) -> pa.Schema:
-    """Build the schema of the Parquet files."""
+def list_columns(folder: TensorFolder) -> dict[str, tuple[pa.DataType, str]]:
+    """List type and meaning of every column of the Parquet files."""
     history = pa.list_(pa.float32(), folder.protocol.history_ticks)
     future = pa.list_(pa.float32(), folder.protocol.horizon_ticks)
     text = pa.dictionary(pa.int32(), pa.string())
-    return pa.schema(
-        [
-            ("dataset", text),
-            ("subset", text),
-            ("vehicle_id", pa.int32()),
-            ("tick", pa.int32()),
-            ("time_s", pa.float64()),
-            ("lane", pa.int16()),
-            ("lateral_maneuver", text),
-            ("longitudinal_maneuver", text),
-            *((f"origin_{name}", pa.float32()) for name in AXES),
-            *((f"history_{name}", history) for name in AXES),
-            *((f"future_{name}", future) for name in AXES),
-            ("neighbor_cell", pa.list_(pa.int8())),
-            ("neighbor_id", pa.list_(pa.int32())),
-            *((f"neighbor_history_{name}", pa.list_(history)) for name in AXES),
-        ]
+    cells = "cell of each neighbor, 13 * column + row (left, own, right lane; row 12 ahead), increasing"
+    origin, neighbors = (
+        "of the sample's last position on the carriageway, m",
+        "of each neighbor up to the sample's tick, m",
     )
+    return {
+        "dataset": (text, "ngsim or highd"),
+        "subset": (text, "one carriageway of one recording"),
+        "vehicle_id": (pa.int32(), "unique within the subset"),
+        "tick": (pa.int32(), "tick of the sample"),
+        "time_s": (pa.float64(), "time since the recording's first frame, s"),
+        "lane": (pa.int16(), "1 is the driver's leftmost; null = unknown"),
+        "lateral_maneuver": (text, "keep, left or right"),
+        "longitudinal_maneuver": (text, "normal or brake"),
+        **{f"origin_{axis}_m": (pa.float32(), f"{axis} {origin}") for axis in AXES},
+        **{f"history_{axis}_m": (history, f"{axis} up to the sample's tick, m") for axis in AXES},
+        **{f"future_{axis}_m": (future, f"{axis} after the sample's tick, m; null = unknown") for axis in AXES},
+        "neighbor_cell": (pa.list_(pa.int8()), cells),
+        "neighbor_id": (pa.list_(pa.int32()), "vehicle_id of each neighbor"),
+        **{f"neighbor_history_{axis}_m": (pa.list_(history), f"{axis} {neighbors}; null = unknown") for axis in AXES},
+    }
 
 
 def _encode_names(names: Sequence[str], codes: npt.NDArray[np.integer]) -> pa.DictionaryArray:
