@@ -9,12 +9,7 @@ MAX_DEPTH = 50
 
 
 def read_json(path: Path) -> Any:  # noqa: ANN401  (whatever a file holds)
-    """Read a JSON document from a file.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is no JSON, or nested too deeply.
-    """
+    """Read a JSON document from a file, which raises an OSError or, where it is none, a ValueError."""
     return parse_json(path.read_text(encoding="utf-8"))
 
 

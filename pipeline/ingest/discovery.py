@@ -302,11 +302,7 @@ class Digests:
         self._changed = False
 
     def __call__(self, file: RawFile) -> str:
-        """Return the sha256 of a file's bytes.
-
-        Raises:
-            SourceError: it is a member of a damaged archive.
-        """
+        """Return the sha256 of a file's bytes."""
         stat = file.path.stat()
         key = "/".join([str(file.path.resolve()), *([] if file.member is None else [file.member])])
         state = [stat.st_size, stat.st_mtime_ns]

@@ -45,11 +45,7 @@ def forget_checksums() -> None:
 
 
 def verify_files(root: Path, files: Iterable[LakeFile]) -> None:
-    """Refuse files whose content is not what was committed; each is read once per process.
-
-    Raises:
-        DamagedFileError: one is missing or differs.
-    """
+    """Refuse files whose content is not what was committed; each is read once per process."""
     for file in files:
         reason = find_damage(root, file)
         if reason is not None:

@@ -16,11 +16,7 @@ def find_lake(path: Path) -> Path | None:
 
 
 def refuse_lake(out: Path | None) -> None:
-    """Refuse an --out inside of any lake, whose files it would replace or be deleted with.
-
-    Raises:
-        LakeError: it lies in a lake.
-    """
+    """Refuse an --out inside of any lake, whose files it would replace or be deleted with."""
     lake = None if out is None else find_lake(out)
     if lake is not None:
         raise LakeError(

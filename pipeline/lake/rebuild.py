@@ -22,11 +22,7 @@ def start_rebuild(root: Path) -> Manifest:
     """Return the manifest that takes a lake's place, not stored yet: without commits, under a new id.
 
     Readers of the old tables find their files for two more generations, like those of any replaced file. Nothing of
-    them is used again, and none is overwritten: see `files.find_free_path`.
-
-    Raises:
-        LakeMissingError: no manifest there.
-        LakeError: not a manifest of ours.
+    them is used again, and none is overwritten: see `files.find_free_path`. Raises what `read_document` does.
     """
     document = read_document(root)
     if document["schema_version"] == SCHEMA_VERSION:

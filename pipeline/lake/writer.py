@@ -152,12 +152,7 @@ def follow_move(root: Path) -> None:
 
 
 def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
-    """Raise what `open_for_writing` would raise now, before anything expensive is started for it.
-
-    Raises:
-        LakeLockedError: another process holds the lock.
-        LakeError: the folder holds other things than a lake.
-    """
+    """Raise what `open_for_writing` would raise now, before anything expensive is started for it."""
     refuse_foreign(root, rebuild=rebuild)
     if (root / LOCK).exists():
         descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)

@@ -81,12 +81,7 @@ class FlowFailedError(TracklakeError):
 
 
 def _plan_here(request: RunRequest) -> RunPlan:
-    """Plan a request that no command has planned: that of a deployment.
-
-    Raises:
-        SourceError: nothing in the source can be used.
-        LakeError: there is no lake to work on.
-    """
+    """Plan a request that no command has planned: that of a deployment."""
     if INGEST not in request.steps:
         load(request.root)
         return plan_run(request, None)

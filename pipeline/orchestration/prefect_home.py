@@ -58,11 +58,7 @@ def find_home_fault() -> str | None:
 
 
 def make_temporary_folder() -> Path:
-    """Return the folder that stands in for Prefect's own until this process ends.
-
-    Raises:
-        TracklakeError: none can be made.
-    """
+    """Return the folder that stands in for Prefect's own until this process ends."""
     return Path(_make_temporary().name)
 
 

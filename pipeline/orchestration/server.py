@@ -142,9 +142,6 @@ def _embed_server() -> str:
     The server that Prefect would start by itself is a process of its own, which outlives one that is killed. This one
     ends with us, whatever happens, and spares a second interpreter's start. It is never stopped before: Prefect sends
     its last logs and events to it while the interpreter exits.
-
-    Raises:
-        PrefectError: it does not start.
     """
     import uvicorn
     from prefect.server.api.server import create_app

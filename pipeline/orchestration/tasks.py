@@ -211,11 +211,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
 
 
 def _await_writer(stack: ExitStack, request: RunRequest, timeout_s: float) -> Writer:
-    """Open the lake for writing, as soon as no other process writes to it.
-
-    Raises:
-        LakeLockedError: another process still does after the timeout.
-    """
+    """Open the lake for writing, as soon as no other process writes to it."""
     limit = time.monotonic() + timeout_s
     told = False
     while True:

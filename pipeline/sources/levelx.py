@@ -176,11 +176,7 @@ class LevelxFormat:
         return LevelxRecording(meta, known, rejected, rows_parsed, dropped), entries
 
     def read_metadata(self, files: Sequence[RawFile], recording: str) -> tuple[dict[str, Any], pl.DataFrame]:
-        """Read the row of recordingMeta, and the rows of tracksMeta, one per vehicle: a recording's first two files.
-
-        Raises:
-            SourceError: a file cannot be read or belongs to another recording.
-        """
+        """Read the row of recordingMeta, and the rows of tracksMeta, one per vehicle: a recording's first two files."""
         meta = self._check_meta(self._read(files[0]), files[0], recording)
         vehicles, _ = self._split_vehicles(self._read(files[1]).frame, files[1])
         return meta, vehicles

@@ -121,11 +121,7 @@ def _tells_recordings(heading: Heading, mapping: ColumnMapping | None) -> bool:
 
 
 def _inspect(file: RawFile, heading: Heading, mapping: ColumnMapping | None) -> tuple[Heading, Verdict]:
-    """Judge the first rows of a file before any is written; returns how to read it.
-
-    Raises:
-        SourceError: the columns are not what they are called.
-    """
+    """Judge the first rows of a file before any is written; returns how to read it."""
     tells = _tells_recordings(heading, mapping)
     layout = heading.to_layout()
     layout = replace(layout, required=layout.required - {"Global_Time"})

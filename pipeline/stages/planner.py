@@ -34,21 +34,13 @@ class Planner:
         return self._jobs[name]
 
     def find_outstanding(self, name: str) -> tuple[list[Job], set[str]]:
-        """Return the jobs of a stage that are not done, and the keys of its commits that it would not make now.
-
-        Raises:
-            StageError: a stage before it has to run first.
-        """
+        """Return the jobs of a stage that are not done, and the keys of its commits that it would not make now."""
         jobs = self.plan(name)
         stale = {commit.key for commit in self._manifest.of_stage(name)} - {job.key for job in jobs}
         return find_pending(self._root, self._manifest, jobs), stale
 
     def require(self, name: str) -> Mapping[str, Commit]:
-        """Return the commits of a stage by key, each as the stage would make it now.
-
-        Raises:
-            StageError: the stage has not run, or ran on other inputs or with other settings than now.
-        """
+        """Return the commits of a stage by key, each as the stage would make it now."""
         if name not in self._commits:
             if name == INGEST:
                 self._commits[name] = {commit.key: commit for commit in _find_recordings(self._manifest)}

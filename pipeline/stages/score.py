@@ -72,11 +72,7 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
 
 
 def _read_score(path: Path) -> dict[str, Any] | None:
-    """Return part and rows of a run's metrics.json; None where the part had no samples.
-
-    Raises:
-        StaleRunError: the file is damaged.
-    """
+    """Return part and rows of a run's metrics.json; None where the part had no samples."""
     from tracklake.training.runs.run_folder import AGAIN, StaleRunError
 
     try:

@@ -128,11 +128,7 @@ def measure_leakage(
 
 
 def refuse_leaks(measured: Mapping[SplitRecipe, Leakage]) -> None:
-    """Refuse a split that shares something although it claims that it does not.
-
-    Raises:
-        StageError: naming the split, what is shared and how much.
-    """
+    """Refuse a split that shares something although it claims that it does not."""
     for recipe, leakage in measured.items():
         leaks = leakage.find_leaks(recipe.window_s) if recipe.claims_no_leakage else []
         if leaks:

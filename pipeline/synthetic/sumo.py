@@ -83,11 +83,7 @@ class SumoError(TracklakeError):
 
 
 def find_sumo() -> Path:
-    """Find the folder that holds SUMO's binaries.
-
-    Raises:
-        SumoError: saying what to install.
-    """
+    """Find the folder that holds SUMO's binaries; without one a SumoError says what to install."""
     spec = find_spec("sumo")
     for place in (spec.submodule_search_locations or []) if spec else []:
         if (Path(place) / "bin" / "sumo").exists() or (Path(place) / "bin" / "sumo.exe").exists():

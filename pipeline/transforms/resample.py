@@ -48,9 +48,6 @@ def put_on_clock(tracks: pl.DataFrame, *, first_frame: int, frame_rate_hz: float
     Returns the given ones of CLOCK_DTYPES, sorted by vehicle_id, tick; `frame` is null if no source frame falls on the
     tick. `segment` numbers the gap-free runs of source frames, so ticks are consecutive within a segment. A skipped
     frame starts a new segment even if no tick falls on that frame.
-
-    Raises:
-        TracklakeError: the clock is faster than the source.
     """
     stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
     frames, ticks = stride.numerator, stride.denominator

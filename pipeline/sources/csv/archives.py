@@ -40,11 +40,7 @@ def is_archive(path: Path) -> bool:
 
 
 def list_members(archive: RawFile, suffixes: Sequence[str]) -> ArchiveContents:
-    """List the files of an archive; `suffixes` are endings of raw files, in lower case.
-
-    Raises:
-        SourceError: the archive is damaged.
-    """
+    """List the files of an archive; `suffixes` are endings of raw files, in lower case."""
     with _directory(archive) as directory:
         infos = [info for info in directory.infolist() if _is_visible_file(info.filename)]
     times = Counter(_inner_path(info.filename) for info in infos)
@@ -85,11 +81,7 @@ def open_member(file: RawFile) -> BufferedReader:
 
 
 def measure_member(file: RawFile, *, packed: bool = False) -> int:
-    """Return a member's size in bytes, unpacked or as it is in the archive.
-
-    Raises:
-        SourceError: the archive is damaged.
-    """
+    """Return a member's size in bytes, unpacked or as it is in the archive."""
     with _directory(file) as directory:
         member = directory.getinfo(file.member or "")
         return member.compress_size if packed else member.file_size

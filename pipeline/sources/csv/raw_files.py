@@ -70,21 +70,13 @@ def open_raw(file: RawFile) -> Iterator[BinaryIO]:
 
 
 def hash_raw(file: RawFile) -> str:
-    """Hash a file's bytes with sha256: a gzip file as it is, an archive's member unpacked.
-
-    Raises:
-        SourceError: a zip archive is damaged, or its member cannot be read.
-    """
+    """Hash a file's bytes with sha256: a gzip file as it is, an archive's member unpacked."""
     with _open_packed(file) as handle:
         return hash_chunks(iter(lambda: _read_block(handle, HASH_BYTES, file), b""))
 
 
 def measure_unpacked(file: RawFile) -> int:
-    """Measure the size of a file's text in bytes; that of a gzip file is estimated.
-
-    Raises:
-        SourceError: a zip archive is damaged, or its member cannot be read.
-    """
+    """Measure the size of a file's text in bytes; that of a gzip file is estimated."""
     with _open_packed(file) as handle, _explain_damage(file):
         is_gzip = _is_gzip(handle)
     size = file.path.stat().st_size if file.member is None else measure_member(file)

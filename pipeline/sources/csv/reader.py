@@ -100,9 +100,6 @@ def map_chunks(
     """Apply a function of a chunk's number, from 0, and the chunk in parsing threads; yield its results in order.
 
     `threads` chunks are parsed and worked on at once; one more is held in memory.
-
-    Raises:
-        SourceError: a compressed file is damaged or cut short.
     """
     line = 1
     numbers = count()

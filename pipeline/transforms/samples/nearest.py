@@ -50,9 +50,6 @@ def find_nearest(clock: pl.DataFrame, k: int, origins: Flags | None = None) -> p
     The clock has vehicle_id, tick, x_m, y_m: one row per (vehicle, tick), in any order. `origins` are (N,) flags, None
     = all; every row can be a neighbor. Returns `nearest`, a list of vehicle ids (Int32) per origin, in the order of
     their rows.
-
-    Raises:
-        ValueError: k is less than 1.
     """
     if k < 1:
         raise ValueError(f"cannot list the {k} nearest: expected at least 1")
