@@ -173,14 +173,9 @@ def collect(
 ) -> Quality:
     """Gather every number of the report: what `quality.json` holds and the pages show.
 
-    The result depends neither on the clock nor on the order of rows.
-
-    Args:
-        connection: connection to a lake; its views may be empty.
-        provenance: facts worth citing (lake, versions, settings); `thresholds`, where present, are the overrides that
-            validation used for most recordings, `thresholds_elsewhere` those of the other recordings.
-        rules: rules that validation used.
-        scores: results of evaluation, as `schemas.quality.ModelScores`.
+    The result depends neither on the clock nor on the order of rows. `provenance` are facts worth citing (lake,
+    versions, settings); its `thresholds` are the overrides that validation used for most recordings,
+    `thresholds_elsewhere` those of others. Scores are those of `schemas.quality.ModelScores`.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.

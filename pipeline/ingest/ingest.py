@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,20 +36,6 @@ Files = dict[str, list[LakeFile]]
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
 
-@dataclass(frozen=True)
-class FileContents:
-    """The contents of a file that holds several recordings, as the manifest remembers them by its sha256."""
-
-    dataset: str
-    version: int
-    rows_read: int
-    recordings: list[str]
-    unassigned: int
-    columns: str
-    recording: str
-    notes: tuple[str, ...]
-
-
 def find_unread_files(discovery: Discovery, manifest: Manifest) -> list[tuple[Source, RawFile]]:
     """Return files that hold several recordings and whose contents the manifest does not know."""
     return [
@@ -74,7 +60,7 @@ def locate_spill(root: Path, file: RawFile) -> Path:
 
 
 def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
-    """Spill one file that holds several recordings; returns its FileContents as a dict.
+    """Spill one file that holds several recordings; returns its contents, as the manifest keeps them by its sha256.
 
     Raises:
         SourceError: not one of its rows could be read.
@@ -87,18 +73,16 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
     if not spilled.recordings:
         raise SourceError(_explain_unreadable(file, spilled.rows_read, spilled.rejects))
     spilled.rejects.write_parquet(folder / REJECTS_FILE)
-    return vars(
-        FileContents(
-            dataset=dataset,
-            version=source.version,
-            rows_read=spilled.rows_read,
-            recordings=sorted(spilled.recordings),
-            unassigned=spilled.rejects.height if len(spilled.recordings) > 1 else 0,
-            columns=file.columns,
-            recording=file.recording,
-            notes=spilled.notes,
-        )
-    )
+    return {
+        "dataset": dataset,
+        "version": source.version,
+        "rows_read": spilled.rows_read,
+        "recordings": sorted(spilled.recordings),
+        "unassigned": spilled.rejects.height if len(spilled.recordings) > 1 else 0,
+        "columns": file.columns,
+        "recording": file.recording,
+        "notes": spilled.notes,
+    }
 
 
 def _explain_unreadable(file: RawFile, rows_read: int, rejects: pl.DataFrame) -> str:

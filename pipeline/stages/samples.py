@@ -7,8 +7,6 @@ from tracklake.pipeline.transforms.samples.selection import TRACK_COLUMNS, draw_
 from tracklake.schemas import (
     FINDINGS,
     MISSING_STARTS,
-    NEIGHBORS,
-    SAMPLE_COUNTS,
     SAMPLE_DROPS,
     SAMPLES,
     SUBSET_STATUS,
@@ -33,18 +31,10 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
         **reader.clock,
     )
     notes = []
-    if drawn.samples.is_empty():
-        reasons = drawn.sample_drops.sort("entries", descending=True)["reason"].to_list()
+    if drawn[SAMPLES].is_empty():
+        reasons = drawn[SAMPLE_DROPS].sort("entries", descending=True)["reason"].to_list()
         notes.append(f"{reader.subset}: no samples ({', '.join(reasons) or 'no entries'})")
-    return StageResult(
-        {
-            SAMPLES: drawn.samples,
-            SAMPLE_DROPS: drawn.sample_drops,
-            SAMPLE_COUNTS: drawn.sample_counts,
-            NEIGHBORS: drawn.neighbors,
-        },
-        notes=notes,
-    )
+    return StageResult(drawn, notes=notes)
 
 
 STAGE = Stage(

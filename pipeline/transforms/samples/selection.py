@@ -1,7 +1,6 @@
 """Selection of samples: the entries on a protocol's clock that can be prediction origins."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from tracklake.pipeline.transforms.samples.neighbors import Neighborhood, count_
 from tracklake.pipeline.transforms.samples.threads import map_in_threads
 from tracklake.pipeline.transforms.starts.late_starts import find_would_be_neighbors
 from tracklake.schemas.arrays import Flags, bound_runs
+from tracklake.schemas.columns import Table
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
 
@@ -40,16 +40,6 @@ PIECE_ROWS = 1 << 16
 """Entries tested and labelled at once; their arrays stay in the processor's cache."""
 
 
-@dataclass(frozen=True)
-class SampleTables:
-    """The tables of one subset's samples; samples and drops add up to the counts' `entries_on_clock`."""
-
-    samples: pl.DataFrame
-    sample_drops: pl.DataFrame
-    sample_counts: pl.DataFrame
-    neighbors: pl.DataFrame
-
-
 def draw_samples(
     tracks: pl.DataFrame,
     vehicle_starts: pl.DataFrame,
@@ -63,7 +53,7 @@ def draw_samples(
     frame_rate_hz: float,
     excluded: bool,
     last_lane: int | None = None,
-) -> SampleTables:
+) -> dict[Table, pl.DataFrame]:
     """Keep or drop every entry on the protocol's clock, label the samples and find their neighbors (DESIGN section 7).
 
     `tracks` have TRACK_COLUMNS, sorted by vehicle_id, frame; `vehicle_starts` vehicle_id, early; `findings` vehicle_id,
@@ -175,8 +165,8 @@ def _build_tables(
     found: Neighborhood,
     all_collisions: int | None,
     names: dict[str, str],
-) -> SampleTables:
-    """Build the tables of one subset."""
+) -> dict[Table, pl.DataFrame]:
+    """Build the tables of one subset; samples and drops add up to the entries on the clock."""
     constants = [pl.lit(value).alias(name) for name, value in names.items()]
     dropped = [{**names, "reason": reason, "entries": entries} for reason, entries in sorted(drops.items()) if entries]
     counts = {
@@ -188,9 +178,9 @@ def _build_tables(
         "all_collisions": all_collisions,
         "crowded_out": found.crowded_out,
     }
-    return SampleTables(
-        samples=SAMPLES.conform(samples.lazy().with_columns(constants)).collect(),
-        sample_drops=pl.DataFrame(dropped, schema=SAMPLE_DROPS.dtypes),
-        sample_counts=pl.DataFrame([counts], schema=SAMPLE_COUNTS.dtypes),
-        neighbors=NEIGHBORS.conform(found.neighbors.lazy().with_columns(constants)).collect(),
-    )
+    return {
+        SAMPLES: SAMPLES.conform(samples.lazy().with_columns(constants)).collect(),
+        SAMPLE_DROPS: pl.DataFrame(dropped, schema=SAMPLE_DROPS.dtypes),
+        SAMPLE_COUNTS: pl.DataFrame([counts], schema=SAMPLE_COUNTS.dtypes),
+        NEIGHBORS: NEIGHBORS.conform(found.neighbors.lazy().with_columns(constants)).collect(),
+    }

@@ -10,6 +10,7 @@ from slow_context import fill_grid, judge, label, list_nearest, put_on_clock
 from tracklake.pipeline.transforms.samples.selection import draw_samples
 from tracklake.schemas.missing_starts import MISSING_STARTS
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
 
 INT32_MAX = 2**31 - 1
 RATES = [(25.0, 10), (25.0, 5), (10.0, 10), (10.0, 5)]
@@ -147,19 +148,19 @@ def test_agrees_with_loops_over_entries(scene, data, rates):
         collisions, crowded_out = collisions + moved, crowded_out + homeless
 
     drawn = draw_from(entries, protocol, frame_rate_hz, early=early, findings=findings)
-    assert drawn.samples.drop("protocol", "dataset", "subset").rows() == samples
-    assert dict(drawn.sample_drops.select("reason", "entries").iter_rows()) == drops
-    found = drawn.neighbors.drop("protocol", "dataset", "subset")
+    assert drawn[SAMPLES].drop("protocol", "dataset", "subset").rows() == samples
+    assert dict(drawn[SAMPLE_DROPS].select("reason", "entries").iter_rows()) == drops
+    found = drawn[NEIGHBORS].drop("protocol", "dataset", "subset")
     assert found.rows() == [(*row[:4], float(np.float32(row[4] / 2000))) for row in around]
     counts = (len(clock), len(samples), len(around), collisions, crowded_out)
-    assert drawn.sample_counts.drop("protocol", "dataset", "subset", "all_collisions").row(0) == counts
+    assert drawn[SAMPLE_COUNTS].drop("protocol", "dataset", "subset", "all_collisions").row(0) == counts
 
 
 def test_the_scenes_give_samples_and_collisions():
     """Fifteen on one spot of a lane: around each are 14 for 13 cells, of whom 13 find their cell taken."""
     entries = [(vehicle, frame, 1000 * frame, 0, 1) for vehicle in range(15) for frame in range(1, 10)]
     drawn = draw_from(entries, Protocol("short", rate_hz=10, history_s=0.4, nearest=3), 10.0)
-    assert drawn.samples["tick"].unique().to_list() == [4, 5, 6]
-    assert drawn.samples["nearest"].to_list()[:6:3] == [[1, 2, 3], [0, 2, 3]]
+    assert drawn[SAMPLES]["tick"].unique().to_list() == [4, 5, 6]
+    assert drawn[SAMPLES]["nearest"].to_list()[:6:3] == [[1, 2, 3], [0, 2, 3]]
     names = ("entries_on_clock", "samples", "neighbors", "collisions", "crowded_out")
-    assert drawn.sample_counts.select(names).row(0) == (135, 45, 45 * 13, 45 * 13, 45)
+    assert drawn[SAMPLE_COUNTS].select(names).row(0) == (135, 45, 45 * 13, 45 * 13, 45)

@@ -76,21 +76,21 @@ def draw(
         excluded=excluded,
         last_lane=last_lane,
     )
-    SAMPLES.validate(drawn.samples, where="test")
-    SAMPLE_DROPS.validate(drawn.sample_drops, where="test")
-    NEIGHBORS.validate(drawn.neighbors, where="test")
-    drops = dict(drawn.sample_drops.select("reason", "entries").iter_rows())
-    SAMPLE_COUNTS.validate(drawn.sample_counts, where="test")
+    SAMPLES.validate(drawn[SAMPLES], where="test")
+    SAMPLE_DROPS.validate(drawn[SAMPLE_DROPS], where="test")
+    NEIGHBORS.validate(drawn[NEIGHBORS], where="test")
+    drops = dict(drawn[SAMPLE_DROPS].select("reason", "entries").iter_rows())
+    SAMPLE_COUNTS.validate(drawn[SAMPLE_COUNTS], where="test")
     assert set(drops) <= set(DROP_REASONS)
-    counts = drawn.sample_counts.row(0, named=True)
-    assert counts["samples"] == drawn.samples.height
-    assert counts["neighbors"] == drawn.neighbors.height
-    assert drawn.samples.height + sum(drops.values()) == counts["entries_on_clock"]
+    counts = drawn[SAMPLE_COUNTS].row(0, named=True)
+    assert counts["samples"] == drawn[SAMPLES].height
+    assert counts["neighbors"] == drawn[NEIGHBORS].height
+    assert drawn[SAMPLES].height + sum(drops.values()) == counts["entries_on_clock"]
     return drawn, drops
 
 
 def count(drawn, name):
-    return drawn.sample_counts[name].item()
+    return drawn[SAMPLE_COUNTS][name].item()
 
 
 def drive(vehicle, frames, *, lane=1, x_m=0.0):
@@ -103,20 +103,22 @@ def test_lanes_beyond_the_last_count_as_the_last():
         2, range(21), lane=8, x_m=20
     )
     drawn, _ = draw(entries)
-    assert set(drawn.samples.filter(vehicle_id=1)["lateral_maneuver"]) == {"right"}
-    assert set(drawn.neighbors.filter(vehicle_id=1)["cell"]) == {26 + 10}, "the right lane, from frame 10 on"
+    assert set(drawn[SAMPLES].filter(vehicle_id=1)["lateral_maneuver"]) == {"right"}
+    assert set(drawn[NEIGHBORS].filter(vehicle_id=1)["cell"]) == {26 + 10}, "the right lane, from frame 10 on"
     folded, _ = draw(entries, last_lane=6)
-    assert set(folded.samples["lateral_maneuver"]) == {"keep"}
-    assert set(folded.samples["lane"]) == {6}
-    ahead = folded.neighbors.filter(vehicle_id=1)
-    assert (ahead.height, set(ahead["cell"])) == (folded.samples.filter(vehicle_id=1).height, {13 + 10}), "the own lane"
+    assert set(folded[SAMPLES]["lateral_maneuver"]) == {"keep"}
+    assert set(folded[SAMPLES]["lane"]) == {6}
+    ahead = folded[NEIGHBORS].filter(vehicle_id=1)
+    assert (ahead.height, set(ahead["cell"])) == (folded[SAMPLES].filter(vehicle_id=1).height, {13 + 10}), (
+        "the own lane"
+    )
 
 
 def test_collisions_are_counted_over_all_entries_at_10_hz():
     """Three vehicles within 2 m of each other in 21 frames: each of the 63 grids has two others in one cell."""
     entries = drive(1, range(21)) + drive(2, range(21), x_m=1) + drive(3, range(21), x_m=2)
     drawn, _ = draw(entries)
-    assert (count(drawn, "all_collisions"), count(drawn, "collisions")) == (63, drawn.samples.height)
+    assert (count(drawn, "all_collisions"), count(drawn, "collisions")) == (63, drawn[SAMPLES].height)
     excluded, _ = draw(entries, excluded=True)
     assert (count(excluded, "all_collisions"), count(excluded, "collisions")) == (63, 0)
     slower, _ = draw(entries, frame_rate_hz=5.0)
@@ -128,8 +130,8 @@ def test_collisions_are_counted_over_all_entries_at_10_hz():
 def test_history_and_future_are_inclusive():
     """Ticks 0 to 10: ticks 0 and 1 lack history, tick 10 lacks a future."""
     drawn, drops = draw(drive(1, range(21)))
-    assert drawn.samples["tick"].to_list() == list(range(2, 10))
-    assert drawn.samples["frame"].to_list() == list(range(4, 20, 2))
+    assert drawn[SAMPLES]["tick"].to_list() == list(range(2, 10))
+    assert drawn[SAMPLES]["frame"].to_list() == list(range(4, 20, 2))
     assert drops == {"short_history": 2, "short_future": 1}
 
 
@@ -137,43 +139,43 @@ def test_history_and_future_are_inclusive():
 def test_three_seconds_are_16_positions_at_5_hz_and_31_at_10_hz(rate_hz, history):
     protocol = Protocol(name="p", rate_hz=rate_hz)
     last_of_history = (history - 1) * 10 // rate_hz  # frames at 10 Hz; 0.2 s more are needed
-    assert draw(drive(1, range(last_of_history + 2)), protocol=protocol)[0].samples.is_empty()
+    assert draw(drive(1, range(last_of_history + 2)), protocol=protocol)[0][SAMPLES].is_empty()
     drawn, drops = draw(drive(1, range(last_of_history + 3)), protocol=protocol)
-    assert drawn.samples["tick"].to_list() == [history - 1]
+    assert drawn[SAMPLES]["tick"].to_list() == [history - 1]
     assert drops == {"short_history": history - 1, "short_future": 2 * rate_hz // 10}
 
 
 def test_a_full_future_is_a_parameter():
     drawn, drops = draw(drive(1, range(150)), protocol=Protocol(name="full", min_future_s=5.0))
-    assert drawn.samples["tick"].to_list() == list(range(15, 50))  # ticks 0 to 74
+    assert drawn[SAMPLES]["tick"].to_list() == list(range(15, 50))  # ticks 0 to 74
     assert drops == {"short_history": 15, "short_future": 25}
 
 
 def test_a_gap_begins_history_and_ends_future_anew():
     """Frames 10 and 11 are missing: ticks 0 to 4 and 6 to 10."""
     drawn, drops = draw(drive(1, [*range(10), *range(12, 21)]))
-    assert drawn.samples["tick"].to_list() == [2, 3, 8, 9]
+    assert drawn[SAMPLES]["tick"].to_list() == [2, 3, 8, 9]
     assert drops == {"short_history": 4, "short_future": 2}
 
 
 def test_a_vehicle_that_returns_is_not_joined_to_the_next():
     drawn, drops = draw([*drive(1, [*range(3), *range(40, 43)]), *drive(2, range(43, 46))])
-    assert drawn.samples.is_empty()
+    assert drawn[SAMPLES].is_empty()
     assert drops == {"short_history": 5}  # ticks 0, 1; 20, 21; 22
 
 
 def test_early_vehicles_give_no_samples_but_are_neighbors():
     drawn, drops = draw([*drive(1, range(21)), *drive(2, range(21), x_m=10.0)], early=(2,))
     assert drops == {"short_history": 4, "short_future": 2, "early_vehicle": 8}
-    assert drawn.samples["vehicle_id"].unique().to_list() == [1]
-    assert drawn.neighbors["neighbor_id"].to_list() == [2] * 8
-    assert drawn.neighbors["cell"].to_list() == [13 + 8] * 8  # 10 / 4.572 = 2.19
+    assert drawn[SAMPLES]["vehicle_id"].unique().to_list() == [1]
+    assert drawn[NEIGHBORS]["neighbor_id"].to_list() == [2] * 8
+    assert drawn[NEIGHBORS]["cell"].to_list() == [13 + 8] * 8  # 10 / 4.572 = 2.19
 
 
 def test_would_be_neighbors_give_no_samples_at_those_frames():
     """A vehicle is missing on frames 7 to 11: ticks 4 and 5."""
     drawn, drops = draw(drive(1, range(21)), missing=[(9, 2, 0.0, 10.0, 12, 7)])
-    assert drawn.samples["tick"].to_list() == [2, 3, 6, 7, 8, 9]
+    assert drawn[SAMPLES]["tick"].to_list() == [2, 3, 6, 7, 8, 9]
     assert drops["would_be_neighbor"] == 2
 
 
@@ -193,15 +195,15 @@ def test_one_unknown_lane_is_enough_to_pass_the_subset_by():
     entries[3] = (*entries[3][:3], None)
     drawn, drops = draw(entries)
     assert drops == {"no_lane": 11}
-    assert drawn.samples.is_empty()
-    assert drawn.neighbors.is_empty()
+    assert drawn[SAMPLES].is_empty()
+    assert drawn[NEIGHBORS].is_empty()
 
 
 def test_labels_and_clock_of_interpolated_samples():
     """25 to 10 Hz: odd ticks lie between frames. The lane changes to the right at frame 150."""
     entries = [(1, frame, 1.2 * frame, 1 if frame < 150 else 2) for frame in range(1, 301)]
     drawn, _ = draw(entries, protocol=Protocol(name="csp10", rate_hz=10), first_frame=1, frame_rate_hz=25.0)
-    samples = drawn.samples
+    samples = drawn[SAMPLES]
     assert samples.select("tick", "frame").head(3).rows() == [(30, 76), (31, None), (32, 81)]
     assert samples.filter(pl.col("lane") == 2)["tick"].min() == 60  # frame 151; tick 59 lies at 148.5
     changes = samples.filter(lateral_maneuver="right")["tick"]
@@ -214,8 +216,8 @@ def test_collisions_are_counted_for_samples_only():
     """Three vehicles on one spot to the right; the lone sample is vehicle 1 at tick 2."""
     entries = [*drive(1, range(7)), *(e for v in (2, 3, 4) for e in drive(v, range(4, 7), lane=2))]
     drawn, _ = draw(entries)
-    assert drawn.samples.select("vehicle_id", "tick").rows() == [(1, 2)]
-    assert drawn.neighbors.select("neighbor_id", "cell").rows() == [(4, 31), (2, 32), (3, 33)]
+    assert drawn[SAMPLES].select("vehicle_id", "tick").rows() == [(1, 2)]
+    assert drawn[NEIGHBORS].select("neighbor_id", "cell").rows() == [(4, 31), (2, 32), (3, 33)]
     assert (count(drawn, "collisions"), count(drawn, "crowded_out")) == (2, 0)
 
 
@@ -238,10 +240,10 @@ def test_findings_of_errors_drop_what_they_touch_where_the_protocol_says_so(firs
     findings = [(1, "error", first, last)]
     kept = [frame for frame in range(4, 39, 2) if frame not in dropped]
     drawn, drops = draw(drive(1, range(41)), findings=findings, protocol=ERRORS)
-    assert drawn.samples["frame"].to_list() == kept
+    assert drawn[SAMPLES]["frame"].to_list() == kept
     assert drops.get("error_finding", 0) == len(dropped)
     ignoring, _ = draw(drive(1, range(41)), findings=findings, protocol=replace(ERRORS, drop_error_findings=False))
-    assert ignoring.samples.height == 18
+    assert ignoring[SAMPLES].height == 18
 
 
 def test_findings_of_others_and_of_less_than_errors_drop_nothing():
@@ -249,12 +251,12 @@ def test_findings_of_others_and_of_less_than_errors_drop_nothing():
     drawn, drops = draw(
         tracks, findings=[(0, "error", 0, 40), (1, "warning", 0, 40), (2, "error", 0, 40)], protocol=ERRORS
     )
-    assert drawn.samples.height == 36
+    assert drawn[SAMPLES].height == 36
     assert "error_finding" not in drops
     drawn, drops = draw(tracks, findings=[(INT32_MAX, "error", 0, 40), (INT32_MAX, "error", 3, 3)], protocol=ERRORS)
-    assert drawn.samples["vehicle_id"].unique().to_list() == [1]
+    assert drawn[SAMPLES]["vehicle_id"].unique().to_list() == [1]
     assert drops["error_finding"] == 18
-    assert drawn.neighbors["neighbor_id"].unique().to_list() == [INT32_MAX]  # its track stays
+    assert drawn[NEIGHBORS]["neighbor_id"].unique().to_list() == [INT32_MAX]  # its track stays
 
 
 @pytest.mark.parametrize(
@@ -270,7 +272,7 @@ def test_a_tick_between_two_frames_is_made_of_both(frame, ticks):
         first_frame=1,
         frame_rate_hz=25.0,
     )
-    assert [tick for tick in range(2, 39) if tick not in drawn.samples["tick"].to_list()] == list(ticks)
+    assert [tick for tick in range(2, 39) if tick not in drawn[SAMPLES]["tick"].to_list()] == list(ticks)
     assert drops["error_finding"] == len(ticks)
 
 
@@ -289,7 +291,7 @@ def test_no_entries_and_one_entry():
     drawn, drops = draw([])
     assert (count(drawn, "entries_on_clock"), drops) == (0, {})
     for excluded in (False, True):
-        assert draw([], excluded=excluded)[0].samples.is_empty()
+        assert draw([], excluded=excluded)[0][SAMPLES].is_empty()
     _, drops = draw([(INT32_MAX, 0, 5.0, 0)])
     assert drops == {"short_history": 1}
     drawn, drops = draw([(1, 1, 5.0, 0)])  # not on the clock
@@ -299,8 +301,8 @@ def test_no_entries_and_one_entry():
 def test_the_default_protocol():
     """20 s at 25 Hz are 100 ticks at 5 Hz: 15 without history, 1 without a future."""
     drawn, drops = draw(drive(1, range(1, 501)), protocol=CSP, first_frame=1, frame_rate_hz=25.0)
-    assert drawn.samples["protocol"].unique().to_list() == ["csp"]
-    assert drawn.samples["frame"].to_list() == list(range(76, 496, 5))
+    assert drawn[SAMPLES]["protocol"].unique().to_list() == ["csp"]
+    assert drawn[SAMPLES]["frame"].to_list() == list(range(76, 496, 5))
     assert drops == {"short_history": 15, "short_future": 1}
 
 
@@ -350,10 +352,10 @@ def test_agrees_with_a_loop_over_entries(entries, early, windows):
         else:
             kept.append((vehicle, frame // 2))
     drawn, found = draw(entries, early=early, missing=missing)
-    assert drawn.samples.select("vehicle_id", "tick").rows() == kept
+    assert drawn[SAMPLES].select("vehicle_id", "tick").rows() == kept
     assert found == drops
     others = {(v, f // 2) for v, f, _, _ in entries if f % 2 == 0}
-    for vehicle, tick, other in drawn.neighbors.select("vehicle_id", "tick", "neighbor_id").iter_rows():
+    for vehicle, tick, other in drawn[NEIGHBORS].select("vehicle_id", "tick", "neighbor_id").iter_rows():
         assert (vehicle, tick) in kept
         assert (other, tick) in others
         assert other != vehicle
@@ -367,8 +369,8 @@ def test_dense_traffic_gives_every_table_its_types():
         for frame in range(120)
     ]
     drawn, drops = draw(entries, protocol=CSP)
-    assert drawn.samples.height == 60 * (60 - 15 - 1)
+    assert drawn[SAMPLES].height == 60 * (60 - 15 - 1)
     assert drops == {"short_history": 60 * 15, "short_future": 60}
     # Positions relative to one another never change, so every vehicle has as many neighbors at each of its samples.
-    assert drawn.neighbors.height % 44 == 0
-    assert drawn.neighbors.height > 0
+    assert drawn[NEIGHBORS].height % 44 == 0
+    assert drawn[NEIGHBORS].height > 0
