@@ -16,14 +16,7 @@ from tracklake.training.data.tensor_folder import TensorFolder
 def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *, published: bool) -> tuple[str, ...]:
     """Print what is synthetic, and which datasets have no published figures beside them and why.
 
-    Args:
-        terminal: terminal of the command.
-        root: folder of the lake.
-        folder: tensors of the lake.
-        published: whether published figures are wanted.
-
-    Returns:
-        Datasets that published figures may stand beside; none unless wanted.
+    Returns the datasets that published figures may stand beside; none unless they are wanted.
     """
     terminal.print_origin(describe_synthetic(folder.origins))
     if not published:

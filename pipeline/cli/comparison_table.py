@@ -61,18 +61,7 @@ TABLES_SHOWN = {
 def compare_lakes(terminal: Terminal, root: Path, other: Path) -> dict[str, Any]:
     """Compare a lake with another, write reports/compare.html, and print what changed.
 
-    Args:
-        terminal: terminal of the command.
-        root: folder of the lake now, in whose reports the page is written.
-        other: folder of the lake then.
-
-    Returns:
-        What `quality_reports.pages.lake_differences.compare` returns as `comparison`, and the page as
-        `comparison_page`.
-
-    Raises:
-        LakeMissingError: no lake there.
-        LakeError: a live file is missing or unreadable.
+    Returns the `comparison` and the `comparison_page`, which is written into the reports of the lake now.
     """
     compared_at = datetime.now(tz=UTC).isoformat(timespec="seconds")
     # A missing report is no difference between the lakes' data.

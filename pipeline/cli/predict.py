@@ -174,13 +174,7 @@ def _open_forecasters(
 ) -> list[Forecaster]:
     """Open the models named, or the newest runs that fit the tensors; constant velocity first, where there is room.
 
-    Args:
-        terminal: terminal of the command, for the runs that are skipped.
-        names: runs and models named by the user.
-        folder: tensors to predict.
-        models: folder of the runs.
-        parts: parts of the split that are predicted.
-        alone: whether constant velocity is left out beside others.
+    With `alone`, constant velocity is left out beside others.
     """
     found = [open_forecaster(name, folder, models, parts) for name in dict.fromkeys(names)]
     if not names:

@@ -35,13 +35,9 @@ ACCURACIES = {"lateral": "lateral %", "longitudinal": "braking %"}
 def show_evaluations(terminal: Terminal, one: Evaluation, table: pl.DataFrame, by: Sequence[str]) -> None:
     """Print the headline errors of all models at the protocol's seconds, and more of them at the last one.
 
-    Published figures follow ours of the same data set; a part with several data sets has a table for each.
-
-    Args:
-        terminal: terminal of the command.
-        one: any of the evaluations, which share part, split and protocol.
-        table: rows of `schemas.evaluations.EVALUATIONS`, of any horizons.
-        by: groups of further tables: maneuver, findings, dataset, vehicle.
+    Published figures follow ours of the same data set; a part with several data sets has a table for each. The
+    evaluations share part, split and protocol with `one`; `by` are groups of further tables: maneuver, findings,
+    dataset, vehicle.
     """
     table = table.filter(pl.col("seconds").is_in([tick / one.protocol.rate_hz for tick in one.protocol.scored_ticks]))
     headline = HEADLINE_FIGURES[one.protocol.headline]

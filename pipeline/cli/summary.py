@@ -100,12 +100,7 @@ def _describe_balance(quality: dict[str, Any]) -> str:
 def show_assessment(terminal: Terminal, root: Path) -> list[dict[str, Any]]:
     """Print coverage and excess of the estimated windows, beside those of other estimators.
 
-    Args:
-        terminal: terminal of the command.
-        root: folder of the lake.
-
-    Returns:
-        Rows of assessed_subsets.sql over the whole lake, one per estimator; none where no track could be cut.
+    Returns the rows of assessed_subsets.sql over the whole lake, one per estimator; none where no track could be cut.
     """
     with connect(root) as connection:
         rows = query(connection, "assessed_subsets", {"estimators": list(ESTIMATORS)})
