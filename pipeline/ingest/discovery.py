@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path, PurePosixPath
 
@@ -71,16 +71,16 @@ def discover(
     search.refusals += unreadable
     for path in candidates:
         search.sort_file(_open_raw(path, source))
-    search.hash_files()
+    recognised = search.hash_files()
     units: list[tuple[Source, Unit]] = []
     refusals = search.refusals
     for item in search.sources:
-        grouping = item.group(search.recognised[item.name])
+        grouping = item.group(recognised[item.name])
         units += [(item, unit) for unit in grouping.units]
         refusals += grouping.refusals
     if not units and not refusals:
         raise SourceError(_explain_nothing(source, candidates, search.sources))
-    return Discovery(tuple(units), tuple(refusals), tuple(search.skipped), tuple(chain(*search.recognised.values())))
+    return Discovery(tuple(units), tuple(refusals), tuple(search.skipped), tuple(chain(*recognised.values())))
 
 
 def recognise(source: Path, dataset: str) -> list[RawFile]:
@@ -92,34 +92,21 @@ def recognise(source: Path, dataset: str) -> list[RawFile]:
     search = _Search([item for item in SOURCES if item.name == dataset], source, digest=lambda _file: "")
     for path in _list_candidates(source)[0]:
         search.sort_file(_open_raw(path, source))
-    return search.found
+    return [file for _, file in search.found]
 
 
+@dataclass
 class _Search:
-    """The results of a search that is going on."""
+    """The results of a search of a source that is going on; files are hashed when all are found."""
 
-    def __init__(
-        self,
-        sources: list[Source],
-        source: Path,
-        digest: Callable[[RawFile], str],
-        mapping: ColumnMapping | None = None,
-        recording: str = "",
-    ) -> None:
-        self.sources = sources
-        self._mapping = mapping
-        self._recording = recording
-        self.recognised: dict[str, list[RawFile]] = {item.name: [] for item in sources}
-        self.refusals: list[str] = []
-        self.skipped: list[str] = []
-        self._single = source if source.is_file() else None
-        self._digest = digest
-        self._found: list[tuple[Source, RawFile]] = []
-
-    @property
-    def found(self) -> list[RawFile]:
-        """The recognised files, before they are hashed."""
-        return [file for _, file in self._found]
+    sources: list[Source]
+    source: Path
+    digest: Callable[[RawFile], str]
+    mapping: ColumnMapping | None = None
+    recording: str = ""
+    found: list[tuple[Source, RawFile]] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
 
     def sort_file(self, file: RawFile) -> None:
         """Sort a file of the source, or the members of an archive, into recognised, refused and skipped."""
@@ -144,7 +131,7 @@ class _Search:
             self._skip_or_refuse(archive, _explain_archive(archive, contents, self.sources))
 
     def _count_results(self) -> tuple[int, int]:
-        return len(self._found), len(self.refusals)
+        return len(self.found), len(self.refusals)
 
     def _detect_source(self, file: RawFile) -> None:
         try:
@@ -152,24 +139,25 @@ class _Search:
         except NoTableError as unknown:
             self._skip_or_refuse(file, str(unknown))
             return
-        file = replace(file, recording=self._recording)
-        if self._mapping is not None and read_heading(head, file.name, self._mapping) is not None:
-            mapped = replace(file, dialect=MAPPED, columns=self._mapping.model_dump_json(exclude_defaults=True))
-            self._found += [(item, mapped) for item in self.sources if item.name == self._mapping.dataset]
+        file = replace(file, recording=self.recording)
+        if self.mapping is not None and read_heading(head, file.name, self.mapping) is not None:
+            mapped = replace(file, dialect=MAPPED, columns=self.mapping.model_dump_json(exclude_defaults=True))
+            self.found += [(item, mapped) for item in self.sources if item.name == self.mapping.dataset]
             return
         found = ((item, dialect) for item in self.sources if (dialect := item.detect(head, file.name)) is not None)
         source, dialect = next(found, (None, ""))
         if source is None:
-            self._skip_or_refuse(file, _explain_unknown(file.name, head, self.sources, self._mapping))
+            self._skip_or_refuse(file, _explain_unknown(file.name, head, self.sources, self.mapping))
             return
-        self._found.append((source, replace(file, dialect=dialect)))
+        self.found.append((source, replace(file, dialect=dialect)))
 
-    def hash_files(self) -> None:
-        """Hash the files that were found; the second of two with the same bytes is refused."""
+    def hash_files(self) -> dict[str, list[RawFile]]:
+        """Hash the files that were found, by source; the second of two with the same bytes is refused."""
+        recognised: dict[str, list[RawFile]] = {item.name: [] for item in self.sources}
         seen: dict[str, str] = {}
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
-            hashes = [threads.submit(self._digest, file) for _, file in self._found]
-        for (source, file), hashed in zip(self._found, hashes, strict=True):
+            hashes = [threads.submit(self.digest, file) for _, file in self.found]
+        for (source, file), hashed in zip(self.found, hashes, strict=True):
             with self._refusing(file):
                 sha256 = hashed.result()
                 if sha256 in seen and source.spill is not None:
@@ -177,7 +165,8 @@ class _Search:
                         f"{file.name}: the same bytes as {seen[sha256]}, which was read; remove one of the two."
                     )
                 seen[sha256] = file.name
-                self.recognised[source.name].append(replace(file, sha256=sha256))
+                recognised[source.name].append(replace(file, sha256=sha256))
+        return recognised
 
     @contextmanager
     def _refusing(self, file: RawFile) -> Iterator[None]:
@@ -193,7 +182,7 @@ class _Search:
 
     def _skip_or_refuse(self, file: RawFile, refusal: str) -> None:
         """Skip an unrecognised file where its ending promises no data and the user did not name it; else refuse it."""
-        named_by_user = file.member is None and file.path == self._single
+        named_by_user = file.member is None and file.path == self.source
         if PurePosixPath(file.filename).suffix.lower() in PROSE and not named_by_user:
             self.skipped.append(file.name)
         else:
