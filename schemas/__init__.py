@@ -1,18 +1,33 @@
 """Declarations of every table of the lake and of quality.json; nothing heavier than polars and pandera is imported."""
 
-from tracklake.schemas.columns import StructureError, Table, column
-from tracklake.schemas.completeness import COMPLETENESS
-from tracklake.schemas.findings import FINDINGS
-from tracklake.schemas.ingestion import INGEST_LOG, REJECTS
-from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
-from tracklake.schemas.samples import NEIGHBORS, SAMPLE_COUNTS, SAMPLE_DROPS, SAMPLES
-from tracklake.schemas.scores import SUBSET_SCORES, VEHICLE_SCORES
-from tracklake.schemas.split_leakage import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS
-from tracklake.schemas.splits import SPLIT_BALANCE, SPLIT_LEFT_OUT, SPLIT_RECIPES, SPLITS
-from tracklake.schemas.start_assessments import START_ASSESSMENTS
-from tracklake.schemas.subsets import SUBSET_STATUS, SUBSETS
-from tracklake.schemas.tracks import TRACKS
-from tracklake.schemas.vehicles import VEHICLE_STARTS, VEHICLES
+from tracklake.schemas.columns import StructureError as StructureError
+from tracklake.schemas.columns import Table as Table
+from tracklake.schemas.columns import column as column
+from tracklake.schemas.completeness import COMPLETENESS as COMPLETENESS
+from tracklake.schemas.findings import FINDINGS as FINDINGS
+from tracklake.schemas.ingestion import INGEST_LOG as INGEST_LOG
+from tracklake.schemas.ingestion import REJECTS as REJECTS
+from tracklake.schemas.missing_starts import MISSING_STARTS as MISSING_STARTS
+from tracklake.schemas.missing_starts import START_CUTOFFS as START_CUTOFFS
+from tracklake.schemas.samples import NEIGHBORS as NEIGHBORS
+from tracklake.schemas.samples import SAMPLE_COUNTS as SAMPLE_COUNTS
+from tracklake.schemas.samples import SAMPLE_DROPS as SAMPLE_DROPS
+from tracklake.schemas.samples import SAMPLES as SAMPLES
+from tracklake.schemas.scores import SUBSET_SCORES as SUBSET_SCORES
+from tracklake.schemas.scores import VEHICLE_SCORES as VEHICLE_SCORES
+from tracklake.schemas.split_leakage import SPLIT_CONTEXT as SPLIT_CONTEXT
+from tracklake.schemas.split_leakage import SPLIT_LEAKAGE as SPLIT_LEAKAGE
+from tracklake.schemas.split_leakage import SPLIT_SHIFTS as SPLIT_SHIFTS
+from tracklake.schemas.splits import SPLIT_BALANCE as SPLIT_BALANCE
+from tracklake.schemas.splits import SPLIT_LEFT_OUT as SPLIT_LEFT_OUT
+from tracklake.schemas.splits import SPLIT_RECIPES as SPLIT_RECIPES
+from tracklake.schemas.splits import SPLITS as SPLITS
+from tracklake.schemas.start_assessments import START_ASSESSMENTS as START_ASSESSMENTS
+from tracklake.schemas.subsets import SUBSET_STATUS as SUBSET_STATUS
+from tracklake.schemas.subsets import SUBSETS as SUBSETS
+from tracklake.schemas.tracks import TRACKS as TRACKS
+from tracklake.schemas.vehicles import VEHICLE_STARTS as VEHICLE_STARTS
+from tracklake.schemas.vehicles import VEHICLES as VEHICLES
 
 SCHEMA_VERSION = 2
 """Version of the tables below; it grows when an older lake can no longer be read."""
@@ -44,36 +59,3 @@ TABLES: tuple[Table, ...] = (
     SPLIT_CONTEXT,
     SPLIT_SHIFTS,
 )
-
-__all__ = [
-    "COMPLETENESS",
-    "FINDINGS",
-    "INGEST_LOG",
-    "MISSING_STARTS",
-    "NEIGHBORS",
-    "REJECTS",
-    "SAMPLES",
-    "SAMPLE_COUNTS",
-    "SAMPLE_DROPS",
-    "SCHEMA_VERSION",
-    "SPLITS",
-    "SPLIT_BALANCE",
-    "SPLIT_CONTEXT",
-    "SPLIT_LEAKAGE",
-    "SPLIT_LEFT_OUT",
-    "SPLIT_RECIPES",
-    "SPLIT_SHIFTS",
-    "START_ASSESSMENTS",
-    "START_CUTOFFS",
-    "SUBSETS",
-    "SUBSET_SCORES",
-    "SUBSET_STATUS",
-    "TABLES",
-    "TRACKS",
-    "VEHICLES",
-    "VEHICLE_SCORES",
-    "VEHICLE_STARTS",
-    "StructureError",
-    "Table",
-    "column",
-]

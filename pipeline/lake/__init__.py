@@ -1,52 +1,33 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
-from tracklake.pipeline.lake.checksums import DamagedFile, find_damaged_files, verify_files
-from tracklake.pipeline.lake.errors import (
-    DamagedFileError,
-    LakeError,
-    LakeLockedError,
-    LakeMissingError,
-    LakeVersionError,
-    QueryError,
-)
-from tracklake.pipeline.lake.files import find_free_path, is_intact, scan, write_folder, write_table
-from tracklake.pipeline.lake.location import find_lake, refuse_lake
-from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest, load
-from tracklake.pipeline.lake.query import LakeResult, connect, query, query_errors
-from tracklake.pipeline.lake.rebuild import list_ingested
-from tracklake.pipeline.lake.session_end import is_settled
-from tracklake.pipeline.lake.writer import Writer, follow_move, open_for_writing, refuse_foreign, refuse_if_busy
-
-__all__ = [
-    "Commit",
-    "DamagedFile",
-    "DamagedFileError",
-    "LakeError",
-    "LakeFile",
-    "LakeLockedError",
-    "LakeMissingError",
-    "LakeResult",
-    "LakeVersionError",
-    "Manifest",
-    "QueryError",
-    "Writer",
-    "connect",
-    "find_damaged_files",
-    "find_free_path",
-    "find_lake",
-    "follow_move",
-    "is_intact",
-    "is_settled",
-    "list_ingested",
-    "load",
-    "open_for_writing",
-    "query",
-    "query_errors",
-    "refuse_foreign",
-    "refuse_if_busy",
-    "refuse_lake",
-    "scan",
-    "verify_files",
-    "write_folder",
-    "write_table",
-]
+from tracklake.pipeline.lake.checksums import DamagedFile as DamagedFile
+from tracklake.pipeline.lake.checksums import find_damaged_files as find_damaged_files
+from tracklake.pipeline.lake.checksums import verify_files as verify_files
+from tracklake.pipeline.lake.errors import DamagedFileError as DamagedFileError
+from tracklake.pipeline.lake.errors import LakeError as LakeError
+from tracklake.pipeline.lake.errors import LakeLockedError as LakeLockedError
+from tracklake.pipeline.lake.errors import LakeMissingError as LakeMissingError
+from tracklake.pipeline.lake.errors import LakeVersionError as LakeVersionError
+from tracklake.pipeline.lake.errors import QueryError as QueryError
+from tracklake.pipeline.lake.files import find_free_path as find_free_path
+from tracklake.pipeline.lake.files import is_intact as is_intact
+from tracklake.pipeline.lake.files import scan as scan
+from tracklake.pipeline.lake.files import write_folder as write_folder
+from tracklake.pipeline.lake.files import write_table as write_table
+from tracklake.pipeline.lake.location import find_lake as find_lake
+from tracklake.pipeline.lake.location import refuse_lake as refuse_lake
+from tracklake.pipeline.lake.manifest import Commit as Commit
+from tracklake.pipeline.lake.manifest import LakeFile as LakeFile
+from tracklake.pipeline.lake.manifest import Manifest as Manifest
+from tracklake.pipeline.lake.manifest import load as load
+from tracklake.pipeline.lake.query import LakeResult as LakeResult
+from tracklake.pipeline.lake.query import connect as connect
+from tracklake.pipeline.lake.query import query as query
+from tracklake.pipeline.lake.query import query_errors as query_errors
+from tracklake.pipeline.lake.rebuild import list_ingested as list_ingested
+from tracklake.pipeline.lake.session_end import is_settled as is_settled
+from tracklake.pipeline.lake.writer import Writer as Writer
+from tracklake.pipeline.lake.writer import follow_move as follow_move
+from tracklake.pipeline.lake.writer import open_for_writing as open_for_writing
+from tracklake.pipeline.lake.writer import refuse_foreign as refuse_foreign
+from tracklake.pipeline.lake.writer import refuse_if_busy as refuse_if_busy

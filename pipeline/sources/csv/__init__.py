@@ -3,39 +3,22 @@
 This is the only entry point: other packages import the names below and none of the modules in here.
 """
 
-from tracklake.pipeline.sources.csv.archives import ARCHIVE_SUFFIX, ArchiveContents, is_archive, list_members
-from tracklake.pipeline.sources.csv.line_bytes import BOM, LINE
-from tracklake.pipeline.sources.csv.raw_files import fetch_lines, hash_raw, measure_unpacked, read_head
-from tracklake.pipeline.sources.csv.reader import (
-    DIGITS_LOST,
-    NULL_WORDS,
-    REJECT_SCHEMA,
-    UNNAMED,
-    Chunk,
-    Layout,
-    map_chunks,
-    read_chunks,
-)
-from tracklake.pipeline.sources.csv.table_files import NoTableError
-
-__all__ = [
-    "ARCHIVE_SUFFIX",
-    "BOM",
-    "DIGITS_LOST",
-    "LINE",
-    "NULL_WORDS",
-    "REJECT_SCHEMA",
-    "UNNAMED",
-    "ArchiveContents",
-    "Chunk",
-    "Layout",
-    "NoTableError",
-    "fetch_lines",
-    "hash_raw",
-    "is_archive",
-    "list_members",
-    "map_chunks",
-    "measure_unpacked",
-    "read_chunks",
-    "read_head",
-]
+from tracklake.pipeline.sources.csv.archives import ARCHIVE_SUFFIX as ARCHIVE_SUFFIX
+from tracklake.pipeline.sources.csv.archives import ArchiveContents as ArchiveContents
+from tracklake.pipeline.sources.csv.archives import is_archive as is_archive
+from tracklake.pipeline.sources.csv.archives import list_members as list_members
+from tracklake.pipeline.sources.csv.line_bytes import BOM as BOM
+from tracklake.pipeline.sources.csv.line_bytes import LINE as LINE
+from tracklake.pipeline.sources.csv.raw_files import fetch_lines as fetch_lines
+from tracklake.pipeline.sources.csv.raw_files import hash_raw as hash_raw
+from tracklake.pipeline.sources.csv.raw_files import measure_unpacked as measure_unpacked
+from tracklake.pipeline.sources.csv.raw_files import read_head as read_head
+from tracklake.pipeline.sources.csv.reader import DIGITS_LOST as DIGITS_LOST
+from tracklake.pipeline.sources.csv.reader import NULL_WORDS as NULL_WORDS
+from tracklake.pipeline.sources.csv.reader import REJECT_SCHEMA as REJECT_SCHEMA
+from tracklake.pipeline.sources.csv.reader import UNNAMED as UNNAMED
+from tracklake.pipeline.sources.csv.reader import Chunk as Chunk
+from tracklake.pipeline.sources.csv.reader import Layout as Layout
+from tracklake.pipeline.sources.csv.reader import map_chunks as map_chunks
+from tracklake.pipeline.sources.csv.reader import read_chunks as read_chunks
+from tracklake.pipeline.sources.csv.table_files import NoTableError as NoTableError
