@@ -101,3 +101,19 @@ def cut_runs(values: NDArray[np.int32], rows: int) -> list[tuple[int, int]]:
     runs = np.searchsorted(starts, np.arange(0, values.size, rows), side="right") - 1
     cuts = [int(start) for start in np.unique(starts[runs])]
     return list(zip(cuts, [*cuts[1:], values.size], strict=True)) if cuts else []
+
+
+def find_blocks(frame: NDArray[np.floating], vehicle_id: Integers, blocks: pl.DataFrame, where: str) -> Integers:
+    """Find the row of `blocks` that holds each entry, (N,); -1 = none."""
+    found = np.full(len(frame), -1, dtype=np.int64)
+    for position, block in enumerate(blocks.iter_rows(named=True)):
+        # Positions between frames are floating-point, so a millionth of a frame is tolerated.
+        inside = (frame > block["first_frame"] - 1e-6) & (frame < block["last_frame"] + 1e-6)
+        if block["first_vehicle_id"] is not None:
+            inside &= vehicle_id >= block["first_vehicle_id"]
+        if block["last_vehicle_id"] is not None:
+            inside &= vehicle_id <= block["last_vehicle_id"]
+        if (inside & (found >= 0)).any():
+            raise ValueError(f"{where}: block {block['block']} of the split overlaps another one")
+        found[inside] = position
+    return found

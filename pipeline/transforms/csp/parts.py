@@ -7,7 +7,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.pipeline.transforms.csp.entries import CspEntries
-from tracklake.pipeline.transforms.splits.tables import find_blocks
+from tracklake.pipeline.transforms.resample import find_blocks
 from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.columns import PARTS
 

@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 
-from tracklake.schemas.arrays import Integers
 from tracklake.schemas.splits import SPLIT_BALANCE, SPLITS
 
 COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -105,19 +103,3 @@ def _compute_moments(members: pl.DataFrame) -> tuple[float, float] | tuple[None,
         return None, None
     mean = float(np.average(values, weights=weight))
     return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weight)))
-
-
-def find_blocks(frame: npt.NDArray[np.floating], vehicle_id: Integers, blocks: pl.DataFrame, where: str) -> Integers:
-    """Find the row of `blocks` that holds each entry, (N,); -1 = none."""
-    found = np.full(len(frame), -1, dtype=np.int64)
-    for position, block in enumerate(blocks.iter_rows(named=True)):
-        # Positions between frames are floating-point, so a millionth of a frame is tolerated.
-        inside = (frame > block["first_frame"] - 1e-6) & (frame < block["last_frame"] + 1e-6)
-        if block["first_vehicle_id"] is not None:
-            inside &= vehicle_id >= block["first_vehicle_id"]
-        if block["last_vehicle_id"] is not None:
-            inside &= vehicle_id <= block["last_vehicle_id"]
-        if (inside & (found >= 0)).any():
-            raise ValueError(f"{where}: block {block['block']} of the split overlaps another one")
-        found[inside] = position
-    return found

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from tracklake.pipeline.transforms.resample import join_key
-from tracklake.pipeline.transforms.splits.tables import find_blocks
+from tracklake.pipeline.transforms.resample import find_blocks, join_key
 from tracklake.pipeline.transforms.tensors.positions import store_positions
 from tracklake.pipeline.transforms.tensors.scenes import find_scenes
 from tracklake.pipeline.transforms.tensors.vehicle_facts import find_sizes, mark_findings
