@@ -100,8 +100,10 @@ def list_unfinished(folder: Path) -> list[Path]:
 
 
 def sync(path: Path) -> None:
-    """Make the bytes of a file, or the renames in a folder, survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Make the bytes of a file, or the renames in a folder, survive a power cut; Windows opens no folders."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)  # Windows syncs what it may write
     try:
         os.fsync(descriptor)
     finally:

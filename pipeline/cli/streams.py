@@ -39,6 +39,8 @@ def guard_streams() -> None:
             os.dup2(os.open(os.devnull, os.O_RDWR if number == 2 else os.O_RDONLY), number)
     if sys.stderr is None:
         sys.stderr = open(2, "w")  # noqa: SIM115  (it stays open as long as the process)
+    if os.name == "nt" and sys.stdout is not None and sys.stdout.isatty():
+        return  # a console of Windows takes text, not bytes
     encoding, errors = ("utf-8", "strict") if sys.stdout is None else (sys.stdout.encoding, sys.stdout.errors)
     raw = BufferedWriter(StandardOutput(1, "w", closefd=False))
     sys.stdout = TextIOWrapper(raw, encoding=encoding, errors=errors, line_buffering=raw.isatty())

@@ -44,8 +44,11 @@ def name_table_file(table: Table, values: Mapping[str, str], fingerprint: str) -
 
 
 def escape_name(value: str) -> str:
-    """Return a text as a part of a file's name; what would end the name or be a pattern is percent-encoded."""
-    return re.sub(r"[^\w.\- ]", lambda found: quote(found[0], safe=""), value)
+    """Return a text as a part of a file's name; what would end the name or be a pattern is percent-encoded.
+
+    So are dots and blanks at its end, which Windows drops.
+    """
+    return re.sub(r"[^\w.\- ]|[. ]$", lambda found: quote(found[0], safe="").replace(".", "%2E"), value)
 
 
 def read_partition(table: Table, path: str) -> dict[str, str]:
@@ -259,7 +262,9 @@ def find_orphans(root: Path, manifest: Manifest) -> list[Path]:
 def list_files(root: Path, folders: Iterable[str]) -> set[str]:
     """Return the paths, relative to the lake, of all files in some of its folders."""
     found = (walked for name in folders for walked in os.walk(f"{root}/{name}"))
-    return {f"{folder}/{file}".removeprefix(f"{root}/") for folder, _, files in found for file in files}
+    # No `Path` for each: there are thousands. `os.sep` is a backslash on Windows, whereas the manifest has slashes.
+    begin = len(str(root)) + 1
+    return {f"{folder}/{file}"[begin:].replace(os.sep, "/") for folder, _, files in found for file in files}
 
 
 def remove_files(root: Path, files: Iterable[Path]) -> None:

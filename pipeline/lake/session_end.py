@@ -15,8 +15,8 @@ SESSION = ".session"
 """File of the lake with its place and the checksums of manifest and catalog at the end of the last session."""
 LOCATION = "location"
 """Key of the lake's folder in that file."""
-LOCK = ".lock"
-"""Name of the lock's file in the lake; it names the process that writes, and is empty after a session's end."""
+WRITER = ".writer"
+"""File of the lake that names the process that writes; it stays where a session is broken off."""
 
 
 def record_end(root: Path) -> None:
@@ -26,10 +26,7 @@ def record_end(root: Path) -> None:
 
 def is_settled(root: Path, manifest: Manifest) -> bool:
     """Return whether the last session came to its end, nothing has changed since, and none is going on."""
-    try:
-        return not (root / LOCK).stat().st_size and has_ended(root, manifest)
-    except OSError:
-        return False
+    return not (root / WRITER).exists() and has_ended(root, manifest)
 
 
 def has_ended(root: Path, manifest: Manifest) -> bool:

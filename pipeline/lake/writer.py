@@ -1,6 +1,5 @@
 """The writer of a lake, one at a time: the lock, commits, and the removal of files that are no longer needed."""
 
-import fcntl
 import os
 import shutil
 import threading
@@ -15,23 +14,14 @@ from tracklake.pipeline.lake.checksums import forget_checksums
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
 from tracklake.pipeline.lake.rebuild import start_rebuild
-from tracklake.pipeline.lake.session_end import LOCK
+from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
 
 KEPT_GENERATIONS = 2
 """Generations for which a replaced file is kept, in writing sessions."""
-_HELD: set[int] = set()
-"""Descriptors of the locks this process holds."""
-
-
-def _release_locks() -> None:
-    """Close the locks that a forked child shares with its parent, or it would keep them after the parent's end."""
-    while _HELD:
-        os.close(_HELD.pop())
-
-
-os.register_at_fork(after_in_child=_release_locks)
+LOCK = ".lock"
+"""Name of the empty file in the lake that the writer holds locked."""
 
 
 class Writer:
@@ -119,27 +109,20 @@ class Writer:
 def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     """Lock a lake (making it where there is none) and yield its writer; its catalog is brought up to date at the end.
 
-    The lock is the kernel's: it goes with the process, however that ends, and is not inherited by children. With
-    `rebuild` nothing is live at first, whatever schema version the lake is of.
+    The lock goes with the process, however that ends, and is not inherited by children. With `rebuild` nothing is live at
+    first, whatever schema version the lake is of.
 
     Raises:
         LakeLockedError: another process holds the lock.
         LakeError: the folder holds other things than a lake, or cannot be written to.
     """
     refuse_foreign(root, rebuild=rebuild)
-    descriptor = _open_lock(root)
-    try:
-        _acquire_lock(root, descriptor)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
+    with _hold_lock(root):
+        (root / WRITER).write_text(f"process {os.getpid()}", encoding="utf-8")
         writer = _open_writer(root, rebuild=rebuild)
         yield writer
         writer.finish()
-        os.ftruncate(descriptor, 0)
-    finally:
-        if descriptor in _HELD:  # not in a forked child, which closed it
-            _HELD.discard(descriptor)
-            os.close(descriptor)
+        (root / WRITER).unlink()
 
 
 def follow_move(root: Path) -> None:
@@ -155,34 +138,32 @@ def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
     """Raise what `open_for_writing` would raise now, before anything expensive is started for it."""
     refuse_foreign(root, rebuild=rebuild)
     if (root / LOCK).exists():
-        descriptor = os.open(root / LOCK, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            _acquire_lock(root, descriptor)
-        finally:
-            os.close(descriptor)
+        with _hold_lock(root):
+            pass
 
 
-def _open_lock(root: Path) -> int:
+@contextmanager
+def _hold_lock(root: Path) -> Iterator[None]:
+    """Hold the lock of a lake, whose folder is made where there is none."""
+    from filelock import FileLock, Timeout  # its import takes 50 ms, for which no query should wait
+
     try:
         root.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as denied:
-        raise LakeError(
-            f"{root}: no lake can be written there ({denied.strerror}). Name another folder with --lake."
-        ) from denied
-    _HELD.add(descriptor)
-    return descriptor
-
-
-def _acquire_lock(root: Path, descriptor: int) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+        held = FileLock(root / LOCK, thread_local=False).acquire(blocking=False)
+    except Timeout:
+        holder = ""
+        with suppress(OSError):
+            holder = (root / WRITER).read_text(encoding="utf-8")
         raise LakeLockedError(
             f"{root}: {holder or 'another process'} is writing to this lake. "
             "Wait for it to end, or write to another lake with --lake. Readers need not wait."
         ) from None
+    except OSError as denied:
+        raise LakeError(
+            f"{root}: no lake can be written there ({denied.strerror}). Name another folder with --lake."
+        ) from denied
+    with held:
+        yield
 
 
 def _open_writer(root: Path, *, rebuild: bool) -> Writer:

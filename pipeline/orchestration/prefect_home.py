@@ -1,7 +1,6 @@
 """The folder in which Prefect keeps its own state, looked at before Prefect is imported."""
 
 import os
-import resource
 import tempfile
 from functools import cache
 from importlib import import_module
@@ -33,7 +32,11 @@ def import_flows() -> ModuleType:
 
 
 def _provide_descriptors() -> None:
-    """Raise the limit of open files as far as this process may."""
+    """Raise the limit of open files as far as this process may; Windows has no such limit."""
+    try:
+        import resource
+    except ImportError:
+        return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MANY_FILES if hard == resource.RLIM_INFINITY else min(hard, MANY_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:

@@ -120,7 +120,7 @@ def test_nothing_to_do_is_said_only_where_all_agrees(command, small, state):
     raw, root = small
     if state == "staging":
         (root / ".staging").mkdir()
-        (root / ".lock").write_text("process 1")
+        (root / ".writer").write_text("process 1")
         shutil.rmtree(root / "tracks")
     else:
         (root / "catalog.duckdb").unlink()

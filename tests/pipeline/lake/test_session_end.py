@@ -84,7 +84,7 @@ def check_settled(root: Path) -> None:
     assert is_settled(root, manifest)
     assert (root / "catalog.duckdb").read_text().split() == sorted(manifest.live_paths())
     assert find_files(root) == manifest.live_paths() | {item.path for item in manifest.retired}
-    assert not (root / ".lock").read_bytes()
+    assert not (root / ".writer").exists()
     assert not (root / ".staging").exists()
     assert not list_unfinished(root)
     check_folder(root)
@@ -167,7 +167,7 @@ def test_a_catalog_that_is_spoilt_is_made_again(tmp_path: Path):
 
 
 LEFTOVERS = (
-    ".lock",
+    ".writer",
     "catalog.duckdb.wal",
     ".staging/spilled/x.arrow",
     f".manifest.json.{'a' * 32}.tmp",
@@ -188,7 +188,7 @@ def test_whatever_is_left_lying_is_noticed_and_removed(tmp_path: Path, left: str
     assert not is_settled(tmp_path, load(tmp_path))
     change_nothing(tmp_path)
     check_settled(tmp_path)
-    assert not (tmp_path / left).exists() or left == ".lock"
+    assert not (tmp_path / left).exists()
 
 
 @pytest.mark.usefixtures("quick")
