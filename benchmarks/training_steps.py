@@ -104,8 +104,8 @@ def measure_steps(folder: str, model: str, batches: str, step: str, seconds: flo
     """Train for so long."""
     import torch
 
+    from tracklake.pipeline.cli.memory import keep_freed_memory
     from tracklake.training.models import find_model
-    from tracklake.training.runs.memory import keep_freed_memory
 
     if step.endswith("kept"):
         keep_freed_memory()

@@ -24,14 +24,12 @@ from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
     claim_folder,
     read_checkpoint,
-    refuse_other_run,
     restore,
     save_checkpoint,
 )
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
-from tracklake.training.runs.memory import keep_freed_memory
 from tracklake.training.runs.progress import COLUMNS, Row, TrainingState, open_log
-from tracklake.training.runs.run_folder import describe_run, save_run
+from tracklake.training.runs.run_folder import describe_run, refuse_other_run, save_run
 
 if TYPE_CHECKING:
     import torch
@@ -66,20 +64,20 @@ class TrainingInterruptedError(KeyboardInterrupt):
 
 def train(
     model: str,
-    tensors: Path,
-    out: Path,
+    tensors: str | Path,
+    out: str | Path,
     config: TrainConfig | None = None,
     progress: Progress | None = None,
     *,
     resume: bool | None = None,
     without_evaluation: bool = False,
 ) -> dict[str, Any]:
-    """Train a model on the training part, evaluate it on the evaluation part, and write the run.
+    """Train a model on the training part, evaluate it on the evaluation part, write the run and return its metrics.
 
-    The evaluation part is read once, after the last step, and decides nothing.
+    The evaluation part is read once, after the last step, and decides nothing; `evaluation` is null where it is empty.
 
     Args:
-        model: name in the registry. A model that needs no training is evaluated and written all the same.
+        model: name in the registry, or a user's own by `module:Class`; one that does not learn is only evaluated.
         tensors: the tensor folder.
         out: the run's folder, replaced after the training; until then its checkpoint and logs are hidden beside it.
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
@@ -87,18 +85,12 @@ def train(
         resume: True: resume from the checkpoint; False: start over; None: start, unless there is a checkpoint.
         without_evaluation: whether to train also where the evaluation part has no samples.
 
-    Returns:
-        Content of `metrics.json`: see `_describe_training`, and `evaluation`, null where there is no such part.
-
     Raises:
         UnfinishedError: `resume` does not fit the checkpoint, or another process is training the run.
-        DivergedError, NotFiniteError: the loss, or the trained network's predictions, are not finite.
-        FutureInputError: the model sees what comes after the tick at which it predicts; no checkpoint is left.
         TrainingInterruptedError: Ctrl-C; the message names the checkpoint.
-        TracklakeError: model, settings, tensors, checkpoint or time do not allow a training; the message says why.
+        TracklakeError: the training is not possible, diverged, or saw the future; the message says why.
     """
-    entry = find_model(model)
-    folder = TensorFolder.open(tensors)
+    entry, folder, out = find_model(model), TensorFolder.open(tensors), Path(out)
     if not entry.learns:
         return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
     require_torch(model)
@@ -258,7 +250,8 @@ def make_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> R
     import torch
 
     if device.type != "cpu":
-        return make_device_reader(folder, reads, device)
+        copied = DeviceFolder(folder, device)
+        return lambda samples: read_on_device(copied, torch.from_numpy(samples).to(device), reads)
 
     def read(samples: Integers) -> tuple[Any, Any]:
         observed, truth = read_samples(folder, samples, reads)
@@ -267,21 +260,12 @@ def make_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> R
     return read
 
 
-def make_device_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> Read:
-    """Return the function that reads batches from arrays that stand on a device as a whole."""
-    import torch
-
-    copied = DeviceFolder(folder, device)
-    return lambda samples: read_on_device(copied, torch.from_numpy(samples).to(device), reads)
-
-
 @contextmanager
 def _isolate_torch(plan: Plan) -> Iterator[None]:
     """Set threads and random state as the plan says, and restore the caller's afterwards."""
     import torch
 
     cuda = [plan.device] if plan.device.type == "cuda" else []
-    keep_freed_memory()
     threads = torch.get_num_threads()
     torch.set_num_threads(plan.config.threads or threads)
     try:

@@ -11,8 +11,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from tracklake.pipeline.cli.logs import choose_file, choose_verbose
+from tracklake.pipeline.cli.memory import keep_freed_memory
 from tracklake.pipeline.cli.streams import guard_streams
-from tracklake.training.runs.memory import keep_freed_memory
 
 COMMANDS = {
     "run": "Run the whole pipeline: raw files to tables, checks, samples, split, tensors, first score and report.",

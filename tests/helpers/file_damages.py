@@ -1,4 +1,4 @@
-"""What can become of a file of tensors, and what is said of it."""
+"""What can become of a file of weights, and what is said of it."""
 
 import os
 import pickle
@@ -47,8 +47,7 @@ def write_old_torch_code(path):
 
 def flip_a_bit(path):
     """Change a byte of a weight: the file is as long, and torch reads it as if nothing were wrong."""
-    content = torch.load(path, weights_only=True)
-    weight = content.get("network", content)["first.weight"].numpy().tobytes()
+    weight = torch.load(path, weights_only=True)["first.weight"].numpy().tobytes()
     data = bytearray(path.read_bytes())
     data[bytes(data).index(weight) + 5] ^= 1
     path.write_bytes(bytes(data))
@@ -59,13 +58,13 @@ def write_list(path):
 
 
 DAMAGES = {
-    truncate: "damaged or no file of torch's",
-    cut_short: "damaged or no file of torch's",
-    empty: r"damaged or no file of torch's \(0 bytes",
-    write_noise: r"damaged or no file of torch's \(5,000 bytes",
-    write_code: "damaged or no file of torch's",
-    write_torch_code: "expected tensors and plain values, got objects that could run code, and did not read them",
-    write_old_torch_code: "damaged or no file of torch's",
-    flip_a_bit: "damaged or no file of torch's .*`.*/data/[0-9]+` has another checksum",
-    write_list: "expected values by name, got list",
+    truncate: "damaged",
+    cut_short: "damaged",
+    empty: "damaged",
+    write_noise: "damaged",
+    write_code: "damaged",
+    write_torch_code: "damaged, or .* holds objects that could run code, and was not read",
+    write_old_torch_code: "damaged",
+    flip_a_bit: "damaged, or .*`.*/data/[0-9]+` has another checksum",
+    write_list: "damaged, or not the weights of this model .*list",
 }

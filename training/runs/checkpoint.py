@@ -1,20 +1,20 @@
 """Checkpoints of a training, from which it resumes to the same weights bit for bit, in a hidden folder of its run."""
 
-import fcntl
 import json
 import shutil
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile, ZipFile
 
-from pydantic import TypeAdapter
+from filelock import FileLock, Timeout
 
+from tracklake.schemas.documents import parse_json
 from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import remove_unfinished, write_file
+from tracklake.schemas.hashing import hash_chunks
 from tracklake.training.runs.config import TrainConfig
 from tracklake.training.runs.progress import TrainingState
 
@@ -24,17 +24,9 @@ if TYPE_CHECKING:
     from torch.optim import Optimizer
 
 CHECKPOINT_FILE = "checkpoint.pt"
-CHECKPOINT_VERSION = 3
+CHECKPOINT_VERSION = 4
 """Number of the checkpoint's layout; it grows when older checkpoints cannot be resumed exactly."""
 RESTART = "start over with `--anew`"
-
-_KEYS = {"version", "run", "network", "optimizer", "random", "device_random", "state"}
-_BROKEN = (*UNREADABLE, BadZipFile, EOFError, zlib.error)
-"""Errors of zipfile and torch on files that are damaged or of another kind."""
-
-
-class DamagedFileError(TracklakeError):
-    """A file is absent, damaged, of another version, or does not hold what is expected there."""
 
 
 class UnfinishedError(TracklakeError):
@@ -63,20 +55,18 @@ def claim_folder(run: Path, *, resume: bool | None = False) -> Iterator[Path]:
     if resume and not is_unfinished(run):
         raise UnfinishedError(f"{folder}: no interrupted {of_run} to resume; train without `--resume`")
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UnfinishedError(
-                f"{folder}: another process is training the run `{run.name}`; wait for it to end, or choose another "
-                "name (`--name`)"
-            ) from None
+    try:
+        held = FileLock(folder / "lock", thread_local=False).acquire(blocking=False)
+    except Timeout:
+        other = f"another process is training the run `{run.name}`"
+        raise UnfinishedError(f"{folder}: {other}; wait for it to end, or choose another name (`--name`)") from None
+    with held:
         remove_unfinished(folder)
         try:
             yield folder
         finally:
             if not is_unfinished(run):
-                shutil.rmtree(folder)
+                shutil.rmtree(folder, ignore_errors=True)  # Windows keeps the lock's file while it is held
 
 
 def save_checkpoint(
@@ -87,137 +77,66 @@ def save_checkpoint(
     state: TrainingState,
     device: "torch.device",
 ) -> None:
-    """Write everything that decides how a training goes on, with `run` (see `run_folder.describe_run`)."""
+    """Write everything that decides how a training goes on.
+
+    The file is two lines, the checksum of all that follows and `run` (see `run_folder.describe_run`) as JSON, and then
+    torch's own format.
+    """
     import torch
 
     content = {
-        "version": CHECKPOINT_VERSION,
-        "run": run,
         "network": network.state_dict(),
         "optimizer": optimizer.state_dict(),
         "random": torch.get_rng_state(),
         "device_random": torch.cuda.get_rng_state(device) if device.type == "cuda" else None,
         "state": vars(state) | {"losses": torch.tensor(state.losses, dtype=torch.float64)},
     }
-    write_file(path, lambda stream: torch.save(content, stream))
+    stream = BytesIO()
+    torch.save(content, stream)
+    body = json.dumps({"version": CHECKPOINT_VERSION, "run": run}).encode() + b"\n" + stream.getvalue()
+    write_file(path, hash_chunks([body]).encode() + b"\n" + body)
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], TrainConfig]:
-    """Read a checkpoint, and the settings that its training was started with."""
-    content = read_torch_file(path, RESTART)
-    if type(got := content.get("version")) is not int or got != CHECKPOINT_VERSION:
-        raise DamagedFileError(f"{path}: expected version {CHECKPOINT_VERSION} of checkpoints, got {got}; {RESTART}")
-    state = content.get("state")
-    if content.keys() != _KEYS or not isinstance(state, dict) or state.keys() != vars(TrainingState()).keys():
-        raise DamagedFileError(f"{path}: expected a checkpoint, got a file of {', '.join(sorted(content))}; {RESTART}")
+    """Read a checkpoint, with `run`, and the settings that its training was started with; no code of it is run."""
+    import torch
+
+    checksum, _, body = path.read_bytes().partition(b"\n")
+    if checksum != hash_chunks([body]).encode():
+        raise UnfinishedError(f"{path}: damaged, or no checkpoint of this version; {RESTART}")
+    header, _, content = body.partition(b"\n")
     try:
-        json.dumps(content["run"])  # or there are tensors in it
-        return content, TrainConfig(**content["run"]["training"])
-    except (*UNREADABLE, UsageError) as wrong:
-        raise DamagedFileError(
-            f"{path}: expected settings of a training that this version knows ({wrong}); resume with the version that "
-            f"started it, or {RESTART}"
+        started = parse_json(header.decode())
+        if started["version"] != CHECKPOINT_VERSION:
+            raise ValueError(f"expected version {CHECKPOINT_VERSION}, got {started['version']}")
+        config = TrainConfig(**started["run"]["training"])
+        return torch.load(BytesIO(content), weights_only=True, map_location="cpu") | started, config
+    except (*UNREADABLE, UnpicklingError, UsageError) as wrong:
+        raise UnfinishedError(
+            f"{path}: no checkpoint that this version of tracklake can resume ({describe_damage(wrong)}); resume with "
+            f"the one that started the training, or {RESTART}"
         ) from None
 
 
 def restore(
-    path: Path, content: dict[str, Any], network: "nn.Module", optimizer: "Optimizer", device: "torch.device"
+    path: Path, stored: dict[str, Any], network: "nn.Module", optimizer: "Optimizer", device: "torch.device"
 ) -> TrainingState:
     """Restore weights, moments and random state from a checkpoint's content, and return the progress."""
     import torch
 
     try:
-        losses = content["state"]["losses"].tolist()
-        state = TypeAdapter(TrainingState).validate_python(content["state"] | {"losses": losses})
-        starts = [first for _, first in state.phases]
-        if not len(losses) == state.step > 0 < len(starts) or max(*starts, state.logged[0]) > state.step or min(starts):
-            raise ValueError(f"{state.step} steps with {len(losses)} losses in phases from {starts} on")
-        if state.best_weights is not None:
-            load_weights(network, state.best_weights, path, RESTART)
-        load_weights(network, content["network"], path, RESTART)
-        groups = optimizer.state_dict()["param_groups"]  # all but the last learning rate follows from the settings
-        groups[0]["lr"] = float(content["optimizer"]["param_groups"][0]["lr"])
-        moments, weights = content["optimizer"]["state"], list(network.parameters())
-        for number, held in moments.items():
-            wanted = {"step": torch.tensor(0.0), "exp_avg": weights[number], "exp_avg_sq": weights[number]}
-            if {name: _describe(own) for name, own in held.items()} != {n: _describe(w) for n, w in wanted.items()}:
-                raise ValueError("moments that are not those of the weights")
-        optimizer.load_state_dict({"state": moments, "param_groups": groups})
-        torch.set_rng_state(content["random"])
+        network.load_state_dict(stored["network"])
+        optimizer.load_state_dict(stored["optimizer"])
+        torch.set_rng_state(stored["random"])
         if device.type == "cuda":
-            torch.cuda.set_rng_state(content["device_random"], device)
-        return state
+            torch.cuda.set_rng_state(stored["device_random"], device)
+        return TrainingState(**stored["state"] | {"losses": stored["state"]["losses"].tolist()})
     except UNREADABLE as wrong:
-        raise DamagedFileError(f"{path}: not a checkpoint of this training ({wrong}); {RESTART}") from None
+        raise UnfinishedError(f"{path}: not the weights of this model ({describe_damage(wrong)}); {RESTART}") from None
 
 
-def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
-    """Raise UnfinishedError where settings or data differ from those that the training was started with."""
-    old, new = _flatten(then), _flatten(now)
-    differing = [
-        f"other {name}" if isinstance(old.get(name), list) else f"{name} {old.get(name)} then, {new.get(name)} now"
-        for name in sorted(old.keys() | new.keys())
-        if old.get(name) != new.get(name)
-    ]
-    if differing:
-        raise UnfinishedError(
-            f"{path}: this training was started with other settings or data: {'; '.join(differing)}. Resume with the "
-            f"same (`--resume` alone takes the settings from the checkpoint), or {RESTART}"
-        )
-
-
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
-
-
-def read_torch_file(path: Path, advice: str) -> dict[str, Any]:
-    """Read tensors and plain values by name onto the CPU, without running any code of the file."""
-    import torch
-
-    if not path.is_file():
-        raise DamagedFileError(f"{path}: there is no such file; {advice}")
-    try:
-        with ZipFile(path) as archive:
-            changed = archive.testzip()  # torch itself does not compare the checksums that it writes
-        if changed is not None:
-            raise BadZipFile(f"`{changed}` has another checksum")
-        content = torch.load(path, weights_only=True, map_location="cpu")
-    except UnpicklingError:
-        unsafe = "got objects that could run code, and did not read them"
-        raise DamagedFileError(f"{path}: expected tensors and plain values, {unsafe}; {advice}") from None
-    except _BROKEN as broken:
-        size, reason = path.stat().st_size, str(broken).partition("\n")[0]
-        raise DamagedFileError(f"{path}: damaged or no file of torch's ({size:,} bytes: {reason}); {advice}") from None
-    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise DamagedFileError(f"{path}: expected values by name, got {type(content).__name__}; {advice}")
-    return content
-
-
-def load_weights(network: "nn.Module", weights: object, path: Path, advice: str) -> None:
-    """Load weights by name into a network, all of its own shapes and dtypes."""
-    if not isinstance(weights, dict):
-        raise DamagedFileError(f"{path}: expected weights by name, got {type(weights).__name__}; {advice}")
-    expected = {name: _describe(value) for name, value in network.state_dict().items()}
-    found = {name: _describe(value) for name, value in weights.items()}
-    wrong = [
-        f"`{name}`: expected {expected.get(name, 'nothing')}, got {found.get(name, 'nothing')}"
-        for name in sorted(expected.keys() | found.keys())
-        if expected.get(name) != found.get(name)
-    ]
-    if wrong:
-        some = f"{len(wrong)} differ: {'; '.join(wrong[:3])}"
-        raise DamagedFileError(f"{path}: not the weights of this model, {some}; {advice}")
-    network.load_state_dict(weights)
-
-
-def _describe(value: Any) -> str:  # noqa: ANN401  (whatever a file held)
-    import torch
-
-    if not isinstance(value, torch.Tensor):
-        return f"a {type(value).__name__}"
-    if value.layout != torch.strided or value.is_meta or value.is_nested:
-        return f"a tensor of kind {'meta' if value.is_meta else value.layout}"
-    return f"{tuple(value.shape)} of {value.dtype}"
+def describe_damage(error: Exception) -> str:
+    """Return on one line why torch could not read or load the content of a file."""
+    if isinstance(error, UnpicklingError):
+        return "it holds objects that could run code, and was not read"
+    return " ".join(str(error).split())

@@ -2,12 +2,15 @@
 
 import json
 import shutil
+import zlib
 from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.metadata import distributions, version
 from itertools import chain
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -18,8 +21,8 @@ from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Predictor, Recipe, find_model, require_torch
-from tracklake.training.runs.checkpoint import DamagedFileError, is_unfinished, load_weights, read_torch_file
+from tracklake.training.models import Predictor, Recipe, find_model
+from tracklake.training.runs.checkpoint import RESTART, UnfinishedError, describe_damage, is_unfinished
 
 if TYPE_CHECKING:
     from torch import nn
@@ -43,7 +46,10 @@ class StaleRunError(TracklakeError):
 def describe_run(
     model: str, parameters: dict[str, Any], config: dict[str, Any], folder: TensorFolder, recipe: Recipe | None = None
 ) -> dict[str, Any]:
-    """Return the content of `config.json` without the versions; a model without recipe does not learn."""
+    """Return the content of `config.json` without the versions; a model without recipe does not learn.
+
+    `code` is the digest of the file of a user's own model, so that a training is not resumed with other code.
+    """
     run = {
         "version": RUN_VERSION,
         "model": model,
@@ -57,6 +63,10 @@ def describe_run(
         "blocks": folder.index["blocks"],
         "tensors": digest_tensors(folder),
     }
+    if ":" in model:  # a user's own
+        from tracklake.training.models.own import hash_code
+
+        run["code"] = hash_code(model)
     return dict(json.loads(json.dumps(run, allow_nan=False)))
 
 
@@ -118,16 +128,27 @@ def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]
         model = find_model(config["model"])
         predictor = model.build(protocol, **config["parameters"])
     except (UsageError, *UNREADABLE) as wrong:
-        raise StaleRunError(f"{path}: {wrong}; {AGAIN}") from None
+        advice = "run the command where the module is found" if ":" in config["model"] else AGAIN
+        raise StaleRunError(f"{path}: {wrong}; {advice}") from None
     if model.learns:
-        require_torch(model.name)
-        weights = path / "weights.pt"
-        try:
-            load_weights(predictor, read_torch_file(weights, AGAIN), weights, AGAIN)
-        except DamagedFileError as damaged:
-            raise StaleRunError(str(damaged)) from None
+        _load_weights(predictor, path / "weights.pt")
         predictor.eval()
     return config, predictor
+
+
+def _load_weights(network: "nn.Module", file: Path) -> None:
+    """Load a network's weights without running any code of the file."""
+    import torch
+
+    try:
+        with ZipFile(file) as archive:
+            changed = archive.testzip()  # torch itself does not compare the checksums that it writes
+        if changed is not None:
+            raise BadZipFile(f"`{changed}` has another checksum")
+        network.load_state_dict(torch.load(file, weights_only=True, map_location="cpu"))
+    except (*UNREADABLE, BadZipFile, EOFError, UnpicklingError, zlib.error) as wrong:
+        reason = f"damaged, or not the weights of this model ({describe_damage(wrong)})"
+        raise StaleRunError(f"{file}: {reason}; {AGAIN}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -156,6 +177,28 @@ def refuse_unfinished(path: Path) -> None:
     if not (path / "config.json").is_file() and is_unfinished(path):
         command = f"`tracklake train MODEL --name {path.name} --resume`"
         raise StaleRunError(f"{path}: the training of this run was interrupted; finish it first: {command}")
+
+
+def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raise UnfinishedError where settings or data differ from those that a checkpoint's training was started with."""
+    old, new = _flatten(then), _flatten(now)
+    differing = [
+        f"other {name}" if isinstance(old.get(name), list) else f"{name} {old.get(name)} then, {new.get(name)} now"
+        for name in sorted(old.keys() | new.keys())
+        if old.get(name) != new.get(name)
+    ]
+    if differing:
+        raise UnfinishedError(
+            f"{path}: this training was started with other settings or data: {'; '.join(differing)}. Resume with the "
+            f"same (`--resume` alone takes the settings from the checkpoint), or {RESTART}"
+        )
+
+
+def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
 
 
 def refuse_leak(config: dict[str, Any], folder: TensorFolder, part: str) -> None:

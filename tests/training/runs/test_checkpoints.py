@@ -1,20 +1,22 @@
 """A training that is interrupted anywhere ends as one that is not; checkpoints and runs that do not fit are refused."""
 
 import csv
+import io
 import json
+import pickle
 import signal
 from dataclasses import replace
 
 import pytest
 import torch
-from file_damages import DAMAGES
+from file_damages import Code
 from tensor_tables import TINY
 from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
 
+from tracklake.schemas.hashing import hash_chunks
 from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
-    DamagedFileError,
     UnfinishedError,
     claim_folder,
     is_unfinished,
@@ -304,42 +306,58 @@ def test_a_training_does_not_go_on_with_other_data(made, reported, interrupted, 
 # Files that are not what was written
 
 
-@pytest.mark.parametrize(("damage", "reported"), DAMAGES.items(), ids=lambda own: getattr(own, "__name__", None))
-def test_damaged_checkpoints_are_refused_and_run_nothing(damage, reported, interrupted, tensors):
+def test_damaged_checkpoints_are_refused_and_run_nothing(interrupted, tensors):
     run, checkpoint = interrupted
-    damage(checkpoint)
-    with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {reported}.*start over with `--anew`"):
-        train("forgetful", tensors, run, resume=True)
+    whole = checkpoint.read_bytes()
+    code = pickle.dumps({"network": Code(checkpoint.parent / "was run")})
+    damaged = [b"", b"\n", whole[:-200], whole[: len(whole) // 2], whole + b"x", whole[1:], code]
+    for place in range(3, len(whole), len(whole) // 30):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1
+        damaged.append(bytes(flipped))
+    for content in damaged:
+        checkpoint.write_bytes(content)
+        with pytest.raises(UnfinishedError, match=r"checkpoint.pt: damaged, or no checkpoint .*start over with `--an"):
+            train("forgetful", tensors, run, resume=True)
+        assert checkpoint.read_bytes() == content, "left as it is"
     assert not (checkpoint.parent / "was run").exists()
-    assert checkpoint.is_file(), "left as it is"
+
+
+def seal(header, content):
+    """A checkpoint of any content, with its checksum."""
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    body = json.dumps(header).encode() + b"\n" + stream.getvalue()
+    return hash_chunks([body]).encode() + b"\n" + body
 
 
 @pytest.mark.parametrize(
-    ("change", "reported"),
+    ("header", "content", "reported"),
     [
-        ({"version": 0}, "expected version 3 of checkpoints, got 0"),
-        ({"more": 1}, "expected a checkpoint, got a file of device_random, more, network"),
-        ({"state": {"step": 3}}, "expected a checkpoint, got a file of"),
-        (
-            {"network": {}},
-            r"not the weights of this model, 4 differ: `first.bias`: expected \(8,\) of torch.float32, got",
-        ),
-        ({"optimizer": {}}, "not a checkpoint of this training"),
-        ({"random": torch.zeros(3)}, "not a checkpoint of this training"),
-        ({"run": 3}, "expected settings of a training that this version knows"),
-        ({"run": {"training": [1]}}, "expected settings of a training that this version knows"),
+        ({"version": 3}, {}, "no checkpoint .*expected version 4, got 3"),
+        ({"version": torch.ones(3).tolist()}, {}, "no checkpoint .*expected version 4, got"),
+        ({"run": 3}, {}, "no checkpoint that this version of tracklake can resume"),
+        ({"run": {"training": [1]}}, {}, "no checkpoint that this version of tracklake can resume"),
         (
             {"run": {"training": {"steps": 3, "pace": 2, "gait": 1}}},
-            "expected settings .* that this version knows .*'pace'.*; resume with the version that started it",
+            {},
+            "no checkpoint .*'pace'.*; resume with the one that started the training",
         ),
-        ({"run": {"training": {"seed": "x"}}}, "expected settings .*`seed`, got 'x'"),
-        ({"run": {"training": {"steps": 0}}}, "expected settings .*`steps` above 0"),
+        ({"run": {"training": {"seed": "x"}}}, {}, "no checkpoint .*`seed`, got 'x'"),
+        ({"run": {"training": {"steps": 0}}}, {}, "no checkpoint .*`steps` above 0"),
+        ({}, {"network": {}}, 'not the weights of this model .*Missing key.* "first.weight"'),
+        ({}, {"optimizer": {}}, "not the weights of this model"),
+        ({}, {"random": torch.zeros(3)}, "not the weights of this model"),
+        ({}, {"state": {"losses": torch.zeros(3), "paces": 3}}, "not the weights of this model"),
+        ({}, {"network": Code("was run")}, "no checkpoint that this version .*objects that could run code"),
     ],
 )
-def test_checkpoints_of_other_contents_are_refused(change, reported, interrupted, tensors):
+def test_checkpoints_of_other_contents_are_refused(header, content, reported, interrupted, tensors):
     run, checkpoint = interrupted
-    torch.save(torch.load(checkpoint, weights_only=True) | change, checkpoint)
+    _, started, stored = checkpoint.read_bytes().split(b"\n", maxsplit=2)
+    stored = torch.load(io.BytesIO(stored), weights_only=True)
+    checkpoint.write_bytes(seal(json.loads(started) | header, stored | content))
     for config in (None, CONFIG):
-        with pytest.raises(DamagedFileError, match=f"checkpoint.pt: {reported}.*start over with `--anew`"):
+        with pytest.raises(UnfinishedError, match=f"checkpoint.pt: {reported}.*start over with `--anew`"):
             train("forgetful", tensors, run, config, resume=True)
     assert checkpoint.is_file(), "left as it is"

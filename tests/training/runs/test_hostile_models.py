@@ -1,12 +1,10 @@
 """Stored models with a value changed, or crafted: they work, or are refused with a message that names the file."""
 
 import ast
-import contextlib
 import json
 import random
 import shutil
 
-import numpy as np
 import pytest
 import torch
 from mutations import JUNK, mutate, nest
@@ -18,37 +16,22 @@ from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models import MAX_PARAMETER, MODELS
-from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, DamagedFileError, unfinished_folder
 from tracklake.training.runs.run_folder import StaleRunError, load_run
-from tracklake.training.train import TrainConfig, TrainingInterruptedError, train
+from tracklake.training.train import TrainConfig, train
 
 CONFIG = TrainConfig(epochs=3, patience=5, seed=4)
 META, SPARSE = torch.empty(8, device="meta"), torch.zeros(8).to_sparse()
 TENSORS = (META, SPARSE, torch.zeros(3), torch.ones(()), torch.zeros(8, dtype=torch.complex64))
 
 
-def press(steps):
-    """Ctrl-C after some steps."""
-    left = [steps]
-
-    def progress(_spent, _loss):
-        left[0] -= 1
-        if left[0] == 0:
-            raise KeyboardInterrupt
-
-    return progress
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Tensors, a run of them, and the checkpoint of a training that was interrupted in its second epoch."""
+    """Tensors, and a run of them."""
     folder = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         register(patch)
         tensors = write_tiny(folder / "tensors")
         train("forgetful", tensors, folder / "run", CONFIG)
-        with pytest.raises(TrainingInterruptedError):
-            train("forgetful", tensors, folder / "broken-off", CONFIG, press(6))
     return folder
 
 
@@ -84,20 +67,12 @@ def test_deeply_nested_json_is_refused(copy, name):
             evaluate("run", copy / "tensors", copy)
 
 
-@pytest.mark.parametrize(("weight", "kind"), [(META, "meta"), (SPARSE, "torch.sparse_coo"), ([1.0] * 8, "list")])
+@pytest.mark.parametrize(("weight", "kind"), [(META, "meta"), (SPARSE, "sparse"), ([1.0] * 8, "list")])
 def test_weights_that_hold_no_numbers_are_refused(copy, weight, kind):
     file = copy / "run" / "weights.pt"
     torch.save(torch.load(file, weights_only=True) | {"first.bias": weight}, file)
-    with pytest.raises(StaleRunError, match=rf"weights.pt: .*`first.bias`: expected \(8,\) of .*, got a .*{kind}"):
+    with pytest.raises(StaleRunError, match=rf"weights.pt: .*first.bias.*{kind}"):
         load_run(copy / "run", TINY)
-
-
-@pytest.mark.parametrize("version", [torch.ones(3), torch.tensor(3), META, True, None, [3]])
-def test_versions_of_checkpoints_are_whole_numbers(copy, version):
-    file = unfinished_folder(copy / "broken-off") / CHECKPOINT_FILE
-    torch.save(torch.load(file, weights_only=True) | {"version": version}, file)
-    with pytest.raises(DamagedFileError, match=r"checkpoint.pt: expected version 3 of checkpoints, got "):
-        train("forgetful", copy / "tensors", copy / "broken-off", resume=True)
 
 
 @pytest.mark.filterwarnings("ignore:Initializing zero-element tensors")
@@ -162,23 +137,3 @@ def test_changed_weights_are_refused_or_work(copy):
             outcomes.append(str(file) in str(refused))
     assert len(outcomes) > 50
     assert all(outcomes)
-
-
-def test_a_changed_checkpoint_is_refused_or_resumes(copy):
-    draw, run = random.Random(4), copy / "broken-off"
-    folder = unfinished_folder(run)
-    content = torch.load(folder / CHECKPOINT_FILE, weights_only=True)
-    kept, refusals = copy / "kept", 0
-    shutil.copytree(folder, kept)
-    for _ in range(60):
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(kept, folder)
-        torch.save(mutate(content, draw, (*JUNK, *TENSORS)), folder / CHECKPOINT_FILE)
-        try:
-            with contextlib.suppress(TrainingInterruptedError):
-                train("forgetful", copy / "tensors", run, None, press(2), resume=True)
-        except TracklakeError:
-            refusals += 1
-        shutil.rmtree(run, ignore_errors=True)
-    assert refusals > 30
-    assert np.isfinite(content["state"]["smooth_loss"])

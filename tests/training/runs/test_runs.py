@@ -52,18 +52,13 @@ def test_another_models_weights_are_refused_by_name_and_shape(finished):
     weights = torch.load(file, weights_only=True)
     others = Forgetful(TINY, hidden=5).state_dict()
     torch.save(others, file)
-    with pytest.raises(
-        StaleRunError, match=r"`first.bias`: expected \(8,\) of torch.float32, got \(5,\) of torch.float32; .*train it"
-    ):
+    with pytest.raises(StaleRunError, match=r"mismatch for first.bias: .*\(\[5\]\) from .* is torch.Size\(\[8\]\)"):
         load_run(finished, TINY)
     torch.save({"out.weight": weights["last.weight"], **weights}, file)
-    with pytest.raises(StaleRunError, match=r"`out.weight`: expected nothing, got"):
-        load_run(finished, TINY)
-    torch.save(weights | {"last.bias": weights["last.bias"].double()}, file)
-    with pytest.raises(StaleRunError, match=r"`last.bias`: expected .* of torch.float32, got .* of torch.float64"):
+    with pytest.raises(StaleRunError, match=r'Unexpected key\(s\) in state_dict: "out.weight"'):
         load_run(finished, TINY)
     file.unlink()
-    with pytest.raises(StaleRunError, match=r"weights.pt: there is no such file; train it again"):
+    with pytest.raises(StaleRunError, match=r"weights.pt: .*No such file.*; train it again"):
         load_run(finished, TINY)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 REPEATED = """
 import resource
-from tracklake.training.runs.memory import keep_freed_memory
+from tracklake.pipeline.cli.memory import keep_freed_memory
 
 done = keep_freed_memory()
 
