@@ -48,7 +48,7 @@ def test_a_model_is_added_as_the_recipe_has_it(tmp_path, monkeypatch):
     entry = names["LINEAR_MOTION"]
     module = ModuleType("linear_motion")
     module.LinearMotion = names["LinearMotion"]
-    monkeypatch.setitem(sys.modules, f"tracklake.training.models.{entry.module}", module)
+    monkeypatch.setitem(sys.modules, f"tracklake.training.models{entry.module}", module)
     monkeypatch.setitem(models.MODELS, entry.name, entry)
     folder = write_tiny(tmp_path / "tensors")
     metrics = train(entry.name, folder, tmp_path / "run", TrainConfig(steps=3))

@@ -69,6 +69,14 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 
 def _report_bug(terminal: Terminal, bug: Exception) -> typer.Exit:
+    own = sys.modules.get("tracklake.training.models.own")  # None: no model of the user's own is in use
+    files: set[str] = set() if own is None else own.OWN_FILES
+    frames = reversed(traceback.extract_tb(bug.__traceback__))
+    place = next((f"{frame.filename}, line {frame.lineno}" for frame in frames if frame.filename in files), None)
+    if place is not None:
+        _show_traceback_if_debugging(bug)
+        advice = "This is your own model's code; `tracklake --debug` shows the traceback."
+        return report_failure(terminal, f"{place}: {type(bug).__name__}: {bug}. {advice}")
     terminal.print_bug(describe_bug(bug))
     terminal.print_json({"error": f"{type(bug).__name__}: {bug}", "bug": True})
     return typer.Exit(FAILED)

@@ -46,28 +46,34 @@ class By(StrEnum):
     VEHICLE = "vehicle"
 
 
+ByOption = Annotated[
+    list[By] | None,
+    typer.Option("--by", help="Also show the errors by this; repeatable. `vehicle`: average over vehicles."),
+]
+PublishedOption = Annotated[
+    bool, typer.Option("--published/--no-published", help="Show published figures, too, marked as such.")
+]
+NearestOption = Annotated[
+    int | None, typer.Option("--nearest", min=0, help="Most neighbors that models of scenes are given.")
+]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="Write the table to this .csv, .json or .parquet instead of into the lake.")
+]
+EveryTickOption = Annotated[
+    bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
+]
+
+
 def evaluate(
     runs: Annotated[list[str] | None, typer.Argument(help="Runs or models; none: all runs in the lake.")] = None,
     lake: LakeOption = None,
     part: Annotated[str, typer.Option("--part", help="train, val or eval.")] = "eval",
     protocol: ProtocolOption = None,
-    by: Annotated[
-        list[By] | None,
-        typer.Option("--by", help="Also show the errors by this; repeatable. `vehicle`: average over vehicles."),
-    ] = None,
-    published: Annotated[
-        bool, typer.Option("--published/--no-published", help="Show published figures, too, marked as such.")
-    ] = True,
-    nearest: Annotated[
-        int | None, typer.Option("--nearest", min=0, help="Most neighbors that models of scenes are given.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Write the table to this .csv, .json or .parquet instead of into the lake."),
-    ] = None,
-    every_tick: Annotated[
-        bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
-    ] = False,
+    by: ByOption = None,
+    published: PublishedOption = True,
+    nearest: NearestOption = None,
+    out: OutOption = None,
+    every_tick: EveryTickOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -94,11 +100,10 @@ def evaluate(
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
         )
-        measured = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
-        table = measured
+        table = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
         comparable = print_comparability(terminal, root, TensorFolder.open(tensors), published=published)
         if comparable:
-            table = pl.concat([measured, published_rows(settings.get_protocol().name, comparable)])
+            table = pl.concat([table, published_rows(settings.get_protocol().name, comparable)])
         table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])

@@ -45,44 +45,49 @@ class Pick(StrEnum):
     RANDOM = "random"
 
 
+NamesArgument = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="RUN_OR_MODEL",
+        help="Up to four; constant velocity is drawn beside them where there is room. None: the newest runs.",
+    ),
+]
+VehicleOption = Annotated[
+    str | None, typer.Option("--vehicle", metavar="SUBSET:ID", help="A vehicle, for instance 02-lower:21.")
+]
+TimeOption = Annotated[
+    float | None, typer.Option("--time", metavar="S", help="With --vehicle: seconds since the recording began.")
+]
+PickOption = Annotated[
+    Pick | None,
+    typer.Option("--pick", help="Draw samples of a kind; worst: of the last model, or newest run (default: random)."),
+]
+AllVehiclesOption = Annotated[
+    bool, typer.Option("--all-vehicles", help="Predict every sample of the scene; a model of scenes: every vehicle.")
+]
+AttentionOption = Annotated[
+    bool, typer.Option("--attention", help="Also draw the attention weights of a model, per head.")
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE|FOLDER", help="A .svg or .png, or a folder (default: LAKE/predictions)."),
+]
+
+
 def predict(
-    models: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="RUN_OR_MODEL",
-            help="Up to four; constant velocity is drawn beside them where there is room. None: the newest runs.",
-        ),
-    ] = None,
+    models: NamesArgument = None,
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
     sample: Annotated[int | None, typer.Option("--sample", metavar="N", help="A sample by its number.")] = None,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", metavar="SUBSET:ID", help="A vehicle, for instance 02-lower:21.")
-    ] = None,
-    time: Annotated[
-        float | None, typer.Option("--time", metavar="S", help="With --vehicle: seconds since the recording began.")
-    ] = None,
-    pick: Annotated[
-        Pick | None,
-        typer.Option(
-            "--pick",
-            help="Draw samples of a kind; worst: of the last model, or newest run (default: random).",
-        ),
-    ] = None,
+    vehicle: VehicleOption = None,
+    time: TimeOption = None,
+    pick: PickOption = None,
     part: Annotated[str, typer.Option("--part", help="With --pick: train, val or eval.")] = "eval",
     seed: Annotated[int, typer.Option("--seed", min=0, help="With --pick: seed of the draw.")] = 0,
     count: Annotated[int, typer.Option("--count", min=1, max=100, help="With --pick: how many samples.")] = 1,
-    all_vehicles: Annotated[
-        bool,
-        typer.Option("--all-vehicles", help="Predict every sample of the scene; a model of scenes: every vehicle."),
-    ] = False,
-    attention: Annotated[
-        bool, typer.Option("--attention", help="Also draw the attention weights of a model, per head.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="FILE|FOLDER", help="A .svg or .png, or a folder (default: LAKE/predictions)."),
-    ] = None,
+    all_vehicles: AllVehiclesOption = False,
+    attention: AttentionOption = False,
+    out: OutOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:

@@ -1,6 +1,7 @@
 """`tracklake train`: a model trained on the lake's split, or a training resumed where it was interrupted."""
 
 import re
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,7 +15,6 @@ from tracklake.pipeline.cli.options import (
     ProtocolOption,
     QuietOption,
     read_pairs,
-    require_choice,
 )
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.lake import load
@@ -24,51 +24,59 @@ from tracklake.schemas.errors import explain_file_errors
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.text import quote_shell
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import MODELS, Model
+from tracklake.training.models import MODELS, Model, find_model
 from tracklake.training.runs.config import RECIPE_SETTINGS, TrainConfig
 from tracklake.training.train import TrainingInterruptedError
 from tracklake.training.train import train as train_model
 
+SecondsOption = Annotated[
+    float | None, typer.Option("--seconds", min=0.1, help="How long to train; default: the model's own epochs.")
+]
+EpochsOption = Annotated[int | None, typer.Option("--epochs", min=1, help="Epochs of all its phases together.")]
+StepsOption = Annotated[
+    int | None, typer.Option("--steps", min=1, help="Steps of the optimiser, of all phases together.")
+]
+EpochSamplesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--samples-per-epoch", min=1, help="Most samples of an epoch, drawn again each epoch (default: 200000)."
+    ),
+]
+PatienceOption = Annotated[
+    int | None,
+    typer.Option("--patience", min=1, help="Stop after so many epochs without a better loss on `val`; keep the best."),
+]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option("--seed", min=0, help="Seed of weights, batches and dropout (default: 0).")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="A setting of the model or its recipe; repeatable (batch_size=64)."
+    ),
+]
+ResumeOption = Annotated[
+    bool | None,
+    typer.Option("--resume/--anew", help="Continue an interrupted training with its own settings; or discard it."),
+]
+NoEvaluationOption = Annotated[
+    bool, typer.Option("--no-evaluation", help="Train also where the split has nothing to evaluate on.")
+]
+
 
 def train(
-    model: Annotated[str, typer.Argument(help="A model's name, for instance lstm.")],
+    model: Annotated[str, typer.Argument(help="A model's name, for instance lstm, or your own as mymodule:MyModel.")],
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.1, help="How long to train; default: the model's own epochs.")
-    ] = None,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="Epochs of all its phases together.")] = None,
-    steps: Annotated[
-        int | None, typer.Option("--steps", min=1, help="Steps of the optimiser, of all phases together.")
-    ] = None,
-    samples_per_epoch: Annotated[
-        int | None,
-        typer.Option(
-            "--samples-per-epoch", min=1, help="Most samples of an epoch, drawn again each epoch (default: 200000)."
-        ),
-    ] = None,
-    patience: Annotated[
-        int | None,
-        typer.Option(
-            "--patience", min=1, help="Stop after so many epochs without a better loss on `val`; keep the best."
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Seed of weights, batches and dropout (default: 0).")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="A setting of the model or its recipe; repeatable (batch_size=64)."
-        ),
-    ] = None,
-    resume: Annotated[
-        bool | None,
-        typer.Option("--resume/--anew", help="Continue an interrupted training with its own settings; or discard it."),
-    ] = None,
-    no_evaluation: Annotated[
-        bool, typer.Option("--no-evaluation", help="Train also where the split has nothing to evaluate on.")
-    ] = False,
+    seconds: SecondsOption = None,
+    epochs: EpochsOption = None,
+    steps: StepsOption = None,
+    samples_per_epoch: EpochSamplesOption = None,
+    patience: PatienceOption = None,
+    seed: TrainingSeedOption = None,
+    settings: SetOption = None,
+    resume: ResumeOption = None,
+    no_evaluation: NoEvaluationOption = False,
     device: Annotated[str | None, typer.Option("--device", help="cpu or cuda (default: cpu).")] = None,
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of torch (default: 1).")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the run; default: the model's.")] = None,
@@ -77,28 +85,18 @@ def train(
 ) -> None:
     """Train a model on the split's training part and evaluate it once on the evaluation part."""
     with command(quiet=quiet, json=json) as terminal:
-        require_choice("MODEL", model, tuple(MODELS))
-        run_name = _check_name(model if name is None else name)
-        entry = MODELS[model]
+        entry = find_model(model)
+        run_name = _check_name(model.rpartition(":")[2] if name is None else name)
         if not entry.learns:
             raise typer.BadParameter(f"{model} does not learn; `tracklake evaluate {model}` scores it")
-        given = {
-            "seconds": seconds,
-            "epochs": epochs,
-            "steps": steps,
-            "samples_per_epoch": samples_per_epoch,
-            "patience": patience,
-            "seed": seed,
-            "device": device,
-            "threads": threads,
-            **_read_settings_of_model(entry, settings or []),
-        }
+        given: dict[str, Any] = {"seconds": seconds, "epochs": epochs, "steps": steps, "patience": patience}
+        given |= {"samples_per_epoch": samples_per_epoch, "seed": seed, "device": device, "threads": threads}
+        given |= _read_settings_of_model(entry, settings or [])
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
         terminal.print_origin(describe_synthetic(TensorFolder.open(tensors).origins))
         out = found.lake / RUNS / run_name
-
         try:
             with explain_file_errors(out), terminal.show_training(f"train {model}") as show:
                 metrics = train_model(
@@ -111,19 +109,7 @@ def train(
             again += ["--no-evaluation"] if no_evaluation else []
             command_again = f"{find_command()} {' '.join(map(quote_shell, again))}"
             raise KeyboardInterrupt(f"{stopped}\nTo go on: {command_again}") from None
-        if metrics["evaluation"] is not None:
-            _show_scores(terminal, metrics["evaluation"])
-        else:
-            terminal.print_line(
-                "note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim"
-            )
-        terminal.print_line(
-            f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
-            f"reading them took {metrics['data_share']:.1%} of it"
-        )
-        terminal.print_line(
-            f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report"
-        )
+        _show_training(terminal, metrics, out)
         terminal.print_json(metrics)
 
 
@@ -153,6 +139,19 @@ def _make_config(given: dict[str, Any], *, resume: bool | None) -> TrainConfig |
     if resume and not given:
         return None
     return TrainConfig(**given)
+
+
+def _show_training(terminal: Terminal, metrics: dict[str, Any], out: Path) -> None:
+    """Print what a training took and reached, and what can be done next."""
+    if metrics["evaluation"] is not None:
+        _show_scores(terminal, metrics["evaluation"])
+    else:
+        terminal.print_line("note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim")
+    terminal.print_line(
+        f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
+        f"reading them took {metrics['data_share']:.1%} of it"
+    )
+    terminal.print_line(f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report")
 
 
 def _show_scores(terminal: Terminal, evaluation: dict[str, Any]) -> None:

@@ -73,7 +73,7 @@ class Lake:
         return self.sql("FROM subsets ORDER BY dataset, subset").pl()
 
     def tensors(self) -> "TensorFolder":
-        """Open the training tensors, memory-mapped.
+        """Open the training tensors, memory-mapped; docs/own-models.md shows a training on them.
 
         Raises:
             LakeError: the lake has no tensors.

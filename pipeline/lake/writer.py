@@ -109,8 +109,8 @@ class Writer:
 def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     """Lock a lake (making it where there is none) and yield its writer; its catalog is brought up to date at the end.
 
-    The lock goes with the process, however that ends, and is not inherited by children. With `rebuild` nothing is live at
-    first, whatever schema version the lake is of.
+    The lock goes with the process, however that ends, and is not inherited by children. With `rebuild` nothing is live
+    at first, whatever schema version the lake is of.
 
     Raises:
         LakeLockedError: another process holds the lock.

@@ -55,7 +55,7 @@ def register(monkeypatch, network=Forgetful, recipe=RECIPE):
         return built[-1]
 
     monkeypatch.setitem(sys.modules, "tracklake.training.models.forgetful", SimpleNamespace(Forgetful=build))
-    entry = Model("forgetful", "for tests", "", "forgetful", "Forgetful", parameters={"hidden": 8}, recipe=recipe)
+    entry = Model("forgetful", "for tests", "", ".forgetful", "Forgetful", parameters={"hidden": 8}, recipe=recipe)
     monkeypatch.setitem(MODELS, "forgetful", entry)
     return built
 

@@ -1,14 +1,30 @@
 """Batches of samples and of whole scenes: names, shapes, units and order of their arrays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 Array = Any
 """A NumPy array or a torch tensor; those of one batch or call are all of the same kind."""
 
 
+class Arrays:
+    """Arrays that are found by their names, too: `batch["history"]`, `dict(batch)`."""
+
+    def keys(self) -> list[str]:
+        """Return the names of the arrays; not `absolute`, which is none."""
+        return [own.name for own in fields(self) if own.name != "absolute"]  # type: ignore[arg-type]  # a dataclass
+
+    def __getitem__(self, name: str) -> Array:
+        """Return an array by its name."""
+        return getattr(self, name)
+
+    def __len__(self) -> int:
+        """Return the number of samples or scenes, B."""
+        return len(self[self.keys()[0]])
+
+
 @dataclass(frozen=True)
-class Batch:
+class Batch(Arrays):
     """B samples with K neighbors of all of them together, over H ticks of history and F of future.
 
     Positions are in m, float32: `[..., 0]` along the direction of travel (x_m), `[..., 1]` across it, positive to the
@@ -30,13 +46,9 @@ class Batch:
     origin: Array  # (B, 2) the sample's last position on the carriageway; makes relative positions absolute
     absolute: bool = False
 
-    def __len__(self) -> int:
-        """Return the number of samples, B."""
-        return len(self.sample)
-
 
 @dataclass(frozen=True)
-class SceneBatch:
+class SceneBatch(Arrays):
     """B whole scenes: the V vehicles of all of them, samples or not.
 
     Positions as in `Batch`, each vehicle's relative to its own last position; `origin` says where that is, so that the
@@ -63,7 +75,3 @@ class SceneBatch:
     has_left: Array  # (V,) whether there is a lane to the left
     has_right: Array  # (V,) whether there is one to the right: `lane` is not the index's `last_lane`
     absolute: bool = False
-
-    def __len__(self) -> int:
-        """Return the number of scenes, B."""
-        return len(self.scene)

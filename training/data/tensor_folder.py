@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import PARTS, SEVERITIES
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS, NOMINAL_LANE_M, STEPS_M
 from tracklake.training.data.batches import Batch, SceneBatch
@@ -48,8 +49,9 @@ class TensorFolder:
     arrays: Mapping[str, npt.NDArray[Any]]
 
     @classmethod
-    def open(cls, path: Path) -> Self:
+    def open(cls, path: str | Path) -> Self:
         """Map a folder that the pipeline's tensors stage wrote; TensorError where it is not as declared and written."""
+        path = Path(path)
         index = read_index(path)
         return cls(path, index, read_protocol(path, index), map_arrays(path, index))
 
@@ -131,12 +133,29 @@ class TensorFolder:
         """Name of the split."""
         return str(self.index["split"])
 
-    def samples_of(self, part: str) -> Integers:
-        """Return (S_part,) numbers of the samples of one part, increasing; ValueError for no such part."""
-        return np.flatnonzero(self.sample_part == _find_part(part))
+    def samples_of(self, part: str, *names: str) -> Integers:
+        """Return (S_part,) numbers of the samples of one part, increasing, of all subsets or of those named.
+
+        A name is that of a subset or of a recording: `01` stands for `01-upper` and `01-lower`.
+
+        Raises:
+            UsageError: no such part, or no subset of a name.
+        """
+        chosen = self.sample_part == _find_part(part)
+        if names:
+            subsets = [own["subset"] for own in self.index["subsets"]]
+            meant = np.array([[own == name or own.startswith(f"{name}-") for name in names] for own in subsets])
+            if not meant.any(axis=0).all():
+                raise UsageError(f"{self.path}: expected names among {', '.join(subsets)}, got {', '.join(names)}")
+            chosen &= np.isin(self.run_subset[self.runs_of(self.sample_row)], np.flatnonzero(meant.any(axis=1)))
+        return np.flatnonzero(chosen)
+
+    def read_part(self, part: str, *names: str) -> Batch:
+        """Read all samples of a part as one batch, of all subsets or of those named (see `samples_of`)."""
+        return self.gather(self.samples_of(part, *names))
 
     def scenes_of(self, part: str) -> Integers:
-        """Return (C_part,) numbers of the scenes of one part, increasing; ValueError for no such part."""
+        """Return (C_part,) numbers of the scenes of one part, increasing; UsageError for no such part."""
         return np.flatnonzero(self.scene_part == _find_part(part))
 
     def runs_of(self, row: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
@@ -210,7 +229,7 @@ class DeviceFolder:
 
 def _find_part(part: str) -> int:
     if part not in PARTS:
-        raise ValueError(f"unknown part `{part}`: expected one of {', '.join(PARTS)}")
+        raise UsageError(f"unknown part `{part}`: expected one of {', '.join(PARTS)}")
     return PARTS.index(part)
 
 

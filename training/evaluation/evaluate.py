@@ -84,8 +84,8 @@ class EmptyPartError(TracklakeError):
 
 def evaluate(
     name: str,
-    tensors: Path,
-    models: Path,
+    tensors: str | Path,
+    models: str | Path,
     part: str = "eval",
     *,
     nearest: int = NEAREST,
@@ -102,7 +102,7 @@ def evaluate(
         TracklakeError: see `open_forecaster` and `measure_errors`.
     """
     folder = TensorFolder.open(tensors)
-    own = open_forecaster(name, folder, models, frozenset({part}))
+    own = open_forecaster(name, folder, Path(models), frozenset({part}))
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
     found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)

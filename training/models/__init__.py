@@ -76,7 +76,7 @@ class Model:
         name: name on the command line.
         meaning: one line for the documentation.
         source: publication, by its name in `schemas.references`; empty where the model is ours.
-        module: module of `training.models`, imported only when the model is built.
+        module: its module, relative to `training.models` or absolute; imported only when the model is built.
         builder: class in the module; takes the protocol, and the parameters as keywords.
         parameters: the model's own parameters with their defaults.
         recipe: how a torch network is trained; None where the model needs no training.
@@ -106,7 +106,7 @@ class Model:
             _check_parameter(f"model `{self.name}`: parameter `{name}`", value, type(self.parameters[name]))
         if self.learns:
             require_torch(self.name)
-        make: Callable[..., Any] = getattr(import_module(f"tracklake.training.models.{self.module}"), self.builder)
+        make: Callable[..., Any] = getattr(import_module(self.module, __name__), self.builder)
         return make(protocol, **{**self.parameters, **parameters})
 
 
@@ -131,20 +131,20 @@ _RESIDUAL = {"residual": True}
 _ATTENTION = {"hidden": 128, "dropout": 0.7, "nll_weight": 1.0, "distance_weight": 1.0, **_RESIDUAL}
 
 _MODELS = (
-    Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", "constant_velocity", "ConstantVelocity"),
+    Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", ".constant_velocity", "ConstantVelocity"),
     Model(
         "kalman-cv",
         "Kalman filter over the history with constant velocity and white-noise acceleration",
         BAR_SHALOM,
-        "constant_velocity",
+        ".constant_velocity",
         "KalmanConstantVelocity",
     ),
-    Model("ctrv", "constant turn rate and velocity", SCHUBERT, "ctrv", "ConstantTurnRate"),
+    Model("ctrv", "constant turn rate and velocity", SCHUBERT, ".ctrv", "ConstantTurnRate"),
     Model(
         "lstm",
         "small LSTM encoder-decoder on the deviation from constant velocity",
         "",
-        "lstms",
+        ".lstms",
         "DeviationLstm",
         {"hidden": 48},
         recipe=Recipe(_SQUARED, learning_rate=4e-3, optimizer="adamw", schedule="cosine", max_gradient_norm=5.0),
@@ -153,7 +153,7 @@ _MODELS = (
         "v-lstm",
         "vanilla LSTM: convolutional social pooling's encoder and decoder without the neighbors",
         DEO,
-        "social_pooling",
+        ".social_pooling",
         "VanillaLstm",
         _RESIDUAL,
         recipe=_CONVOLUTIONAL,
@@ -162,7 +162,7 @@ _MODELS = (
         "stacked-lstm",
         "two stacked LSTM layers over the history and a linear layer to all positions ahead",
         CHOI,
-        "lstms",
+        ".lstms",
         "StackedLstm",
         _RESIDUAL,
         recipe=Recipe(_SQUARED),
@@ -171,7 +171,7 @@ _MODELS = (
         "lstm-encoder-decoder",
         "256-unit embedding, two stacked LSTM layers of 256 in encoder and decoder, 256-unit output layer",
         CHOI,
-        "lstms",
+        ".lstms",
         "EncoderDecoder",
         _RESIDUAL,
         recipe=Recipe(_SQUARED, batch_size=100),
@@ -181,7 +181,7 @@ _MODELS = (
             name,
             f"convolutional social pooling{words}",
             DEO,
-            "social_pooling",
+            ".social_pooling",
             "SocialPooling",
             {"maneuvers": bool(words), **_RESIDUAL},
             recipe=_CONVOLUTIONAL,
@@ -193,7 +193,7 @@ _MODELS = (
             f"attention-h{heads}",
             f"vehicle and lane attention with {heads} heads, all vehicles of a scene at once",
             KIM,
-            "attention",
+            ".attention",
             "SceneAttention",
             {"heads": heads, **_ATTENTION},
             reads="scene",
@@ -206,9 +206,14 @@ MODELS = {model.name: model for model in _MODELS}
 
 
 def find_model(name: str) -> Model:
-    """Return the model of a name; raises UsageError where there is none."""
+    """Return the model of a name, or a user's own by `module:Class`; raises UsageError where there is none."""
+    if ":" in name:
+        require_torch(name)
+        from tracklake.training.models.own import find_own_model
+
+        return find_own_model(name)
     if name not in MODELS:
-        raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}")
+        raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}, or your own by `module:Class`")
     return MODELS[name]
 
 

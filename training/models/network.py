@@ -8,6 +8,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
 from tracklake.training.models.constant_velocity import extrapolate, velocity_ticks
@@ -99,5 +100,7 @@ def to_numpy(tensor: Tensor) -> npt.NDArray[Any]:
 
 def mean_squared_distance(predicted: Tensor, future: Tensor, known: Tensor) -> Tensor:
     """Return () the mean squared distance in m2 over known positions: (..., F, 2), (..., F, 2), (..., F)."""
+    if predicted.shape != future.shape:
+        raise UsageError(f"expected predicted positions of shape {tuple(future.shape)}, got {tuple(predicted.shape)}")
     squares = ((predicted - future) ** 2).sum(dim=-1)
     return (squares * known).sum() / known.sum().clamp(min=1)

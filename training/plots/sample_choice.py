@@ -1,6 +1,6 @@
 """The choice of samples: by vehicle and time, at random among those of a kind, or by a model's greatest error."""
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.runs.forecasters import Forecaster
 
 Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
-PICKS: tuple[Pick, ...] = get_args(Pick)
 
 MOST_SEARCHED = 20_000
 """Most samples searched for the worst; of more, so many are drawn at random."""

@@ -2,6 +2,7 @@
 
 import json
 import os
+from typing import get_args
 
 import pytest
 from drawn_moment import FAR, OWN, make_moment
@@ -130,8 +131,7 @@ def test_without_a_lake_there_is_nothing_to_draw(tmp_path, monkeypatch):
 
 def test_kinds_to_pick_are_those_that_samples_are_picked_by():
     from tracklake.pipeline.cli.predict import MOST_MODELS, SUFFIXES, Pick
-    from tracklake.training.plots import charts, picture_drawing
-    from tracklake.training.plots.sample_choice import PICKS
+    from tracklake.training.plots import charts, picture_drawing, sample_choice
 
-    assert {pick.value for pick in Pick} == set(PICKS)
+    assert {pick.value for pick in Pick} == set(get_args(sample_choice.Pick))
     assert (MOST_MODELS, SUFFIXES) == (picture_drawing.MOST_MODELS, charts.SUFFIXES)

@@ -76,7 +76,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (("foo",), "MODEL is one of constant-velocity"),
+        (("foo",), "unknown model `foo`: expected one of constant-velocity"),
         (("constant-velocity",), "constant-velocity does not learn"),
         (("lstm", "--name", "kalman-cv"), "kalman-cv does not learn"),
         (("lstm", "--seconds", "1", "--epochs", "2"), "one of seconds, steps, epochs"),

@@ -7,8 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, F, H, loop_over_samples, random_tables
 from tensor_tables import CLOCK, drive, sample_everything, split_row, write
+from tiny_network import write_tiny
 
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -165,7 +167,7 @@ def test_no_samples_still_open_and_gather_nothing(tmp_path):
 
 def test_unknown_part(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(1), UNDIVIDED))
-    with pytest.raises(ValueError, match="unknown part `test`: expected one of train, val, eval"):
+    with pytest.raises(UsageError, match="unknown part `test`: expected one of train, val, eval"):
         folder.samples_of("test")
 
 
@@ -192,3 +194,19 @@ def test_int16_batches_differ_by_the_rounding_and_no_more(tmp_path_factory, seed
     errors = small.index["max_error_m"]
     assert all(0 <= error <= most for error, most in zip(errors, step / 2 + 1e-4, strict=True))
     assert small.index["rms_error_m"][0] <= errors[0]
+
+
+def test_samples_are_found_by_subset_and_recording(tmp_path):
+    """`01` is both carriageways of the recording, and not the recording 011."""
+    names = ("01-lower", "01-upper", "011")
+    splits = pl.concat([split_row(name, part) for name, part in zip(names, ("train", "eval", "train"), strict=True)])
+    folder = TensorFolder.open(str(write_tiny(tmp_path, splits, subsets=names)))
+    subset = folder.run_subset[folder.runs_of(folder.sample_row)]
+    wanted = {("train", "01"): [0], ("train", "011"): [2], ("train", "01-lower", "011"): [0, 2], ("eval", "01"): [1]}
+    for (part, *chosen), subsets in wanted.items():
+        found = folder.samples_of(part, *chosen)
+        assert found.tolist() == [number for number, own in enumerate(subset) if own in subsets]
+        assert len(folder.read_part(part, *chosen)) == len(found) > 0
+    assert len(folder.samples_of("eval", "011")) == 0
+    with pytest.raises(UsageError, match="expected names among 01-lower, 01-upper, 011, got 01, 02"):
+        folder.samples_of("train", "01", "02")
