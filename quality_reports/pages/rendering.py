@@ -61,7 +61,8 @@ def format_cell(value: object, kind: str = "text") -> str:
 
     Args:
         value: plain value.
-        kind: text, int, percent, bool, duration, speed (in m/s; km/h stands below), or f0 to f4 for that many decimals.
+        kind: text, int, percent, bool, duration, speed or speed_below (m/s with km/h beside or below), or f0 to f4
+            for that many decimals.
     """
     if value is None:
         return DASH
@@ -82,8 +83,9 @@ def _format_number(value: float, kind: str) -> str:
         return _percent(value)
     if kind == "duration":
         return format_duration(value)
-    if kind == "speed":
-        return Markup(f"{_fixed(value, 2)} <small>{_fixed(value * 3.6, 1)}</small>")  # numbers only
+    if kind.startswith("speed"):
+        small = '<small class="below">' if kind == "speed_below" else "<small>"
+        return Markup(f"{_fixed(value, 2)} {small}{_fixed(value * 3.6, 1)}</small>")  # numbers only
     return _fixed(value, int(kind[1:]))
 
 

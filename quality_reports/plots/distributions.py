@@ -64,7 +64,7 @@ def draw_speed_ranges(summary: Sequence[Row]) -> str:
         summary: rows of speeds.sql.
     """
     rows = [row for row in summary if row["subset"] is not None]
-    x = Scale(*find_speed_range([row[name] for row in rows for name in ("min_mps", "max_mps")]), LABELS, WIDTH)
+    x = Scale(*find_speed_range([row[name] for row in rows for name in ("min_mps", "max_mps")]), LABELS, WIDTH - RIGHT)
     lines, (thin, thick, median) = _place_lines(rows), ("", "", "")
     for row in rows:
         y = lines[row["dataset"], row["subset"]]

@@ -126,7 +126,7 @@ def write_data(content: Mapping[str, Any]) -> str:
 
 def draw_scale(top_mps: float) -> str:
     """Draw the legend of speeds: colours between km/h above and m/s below."""
-    left, width, top_kmh = 40, 480, top_mps * 3.6
+    left, width, top_kmh = 36, 290, top_mps * 3.6
     colours = colour_values(np.linspace(0.0, 1.0, COLOURS), 0, 1)
     wide = width / COLOURS
     strip = "".join(
@@ -135,8 +135,8 @@ def draw_scale(top_mps: float) -> str:
     )
     labels = "".join(
         draw_text(f"{left + width * value / top:.1f}", height, f"{value:g}", anchor="middle")
-        for top, height, most in ((top_kmh, 12, 8), (top_mps, 44, 6))
+        for top, height, most in ((top_kmh, 12, 6), (top_mps, 44, 6))
         for value in make_ticks(0.0, top, most)
     )
     units = draw_text(left - 6, 12, "km/h", anchor="end") + draw_text(left - 6, 44, "m/s", anchor="end")
-    return wrap_svg(left + width + 30, 50, "Legend: colours of speeds", strip + labels + units)
+    return wrap_svg(left + width + 12, 50, "Legend: colours of speeds", strip + labels + units)

@@ -137,7 +137,10 @@
       pen.lineWidth = 3;
       pen.strokeStyle = "#f8f9fa";
       pen.fillStyle = "#1f2328";
+      const free = [];  // ids that are far enough from the ones before
       for (const label of labels) {
+        if (free.some(([, across, down]) => Math.abs(across - label[1]) < 34 && Math.abs(down - label[2]) < 13)) continue;
+        free.push(label);
         pen.strokeText(...label);
         pen.fillText(...label);
       }

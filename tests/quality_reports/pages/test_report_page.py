@@ -99,6 +99,7 @@ def test_every_statement_says_what_a_row_is():
         (["a", "b"], "text", "a, b"),
         (61.0, "duration", "61.0 s"),
         (-27.5, "speed", "\N{MINUS SIGN}27.50 <small>\N{MINUS SIGN}99.0</small>"),
+        (10.0, "speed_below", '10.00 <small class="below">36.0</small>'),
         (None, "speed", DASH),
     ],
 )
