@@ -2,7 +2,7 @@
 
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import polars as pl
 
@@ -34,25 +34,31 @@ class Lake:
         load(self.path)
         follow_move(self.path)
 
-    def sql(self, query: str, parameters: Parameters | None = None) -> LakeResult:
-        """Run one SELECT over the tables and macros.
+    def sql(
+        self,
+        query: str,
+        parameters: Parameters | None = None,
+        **frames: Any,  # noqa: ANN401  (of any library)
+    ) -> LakeResult:
+        """Run one SELECT over the tables and macros, and over frames of your own.
 
         Args:
             query: SQL text, for example `"FROM track('02-lower', 21)"`.
             parameters: values of `$name` or `?` placeholders.
+            frames: frames of Polars, pandas or Arrow by the names that they have in the query: `mine=frame`.
 
         Returns:
-            The result; `.pl()` fetches it as a Polars DataFrame, `.fetchall()` as tuples.
+            The result; `.pl()`, `.df()` and `.arrow()` fetch it as a frame, `.fetchall()` as tuples.
 
         Raises:
-            QueryError: the statement is no SELECT, or DuckDB refuses it.
+            QueryError: the statement is no SELECT, DuckDB refuses it, or a frame is none.
         """
         status = (self.path / MANIFEST).stat()
         state = (status.st_mtime_ns, status.st_ino)
         if self._connection is None or state != self._state:
             self.close()
             self._connection, self._state = connect(self.path), state
-        return self._connection.sql(query, parameters)
+        return self._connection.sql(query, parameters, **frames)
 
     def table(self, name: str) -> pl.LazyFrame:
         """Scan a stored table with Polars.

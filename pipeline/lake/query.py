@@ -1,8 +1,10 @@
 """A lake opened for SQL: an in-memory connection with its views and macros, read-only in fact."""
 
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,12 +12,16 @@ import polars as pl
 
 from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
 from tracklake.pipeline.lake.errors import QueryError
+from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import load
 from tracklake.schemas import TABLES
+from tracklake.schemas.errors import MissingExtraError
+from tracklake.schemas.text import make_visible
 
 if TYPE_CHECKING:
     import duckdb
+    import pyarrow
     from duckdb.sqltypes import DuckDBPyType
 
 _EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+", re.IGNORECASE)
@@ -45,17 +51,40 @@ _POLARS_TYPES = {
 }
 """DuckDB's types that Polars holds; others, such as INTERVAL, UNION and BIT, become text in a frame."""
 
+SHOWN_ROWS = 20
+"""Most rows of a result that `show` and notebooks print."""
+
 Parameters = Mapping[str, Any] | Sequence[Any]
 
 
 class LakeResult:
     """The result of a SELECT; DuckDB computes it when it is fetched.
 
-    Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`.
+    Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`. Whatever
+    reads Arrow streams takes it as it is: `pl.DataFrame(result)`, `pyarrow.table(result)`.
+
+    Args:
+        relation: DuckDB's result.
+        owner: connection that the relation needs, where nobody else holds it.
     """
 
-    def __init__(self, relation: "duckdb.DuckDBPyRelation") -> None:
+    def __init__(self, relation: "duckdb.DuckDBPyRelation", owner: "duckdb.DuckDBPyConnection | None" = None) -> None:
         self._relation = relation
+        self._owner = owner
+
+    def __repr__(self) -> str:
+        """Name the columns; nothing is computed."""
+        columns = ", ".join(f"{name} {kind}" for name, kind in zip(self.columns, self.types, strict=True))
+        return f"LakeResult({columns}); rows by .show(), .pl(), .df(), .arrow(), .fetchall()"
+
+    def _repr_html_(self) -> str:
+        """Show the first rows in a notebook."""
+        frame, note = _take_first(self, SHOWN_ROWS)
+        return f"{frame._repr_html_()}<small>{note}</small>"
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Hand the rows to whatever reads Arrow streams, with the types of `pl`."""
+        return self.pl().__arrow_c_stream__(requested_schema)
 
     @property
     def columns(self) -> list[str]:
@@ -97,13 +126,36 @@ class LakeResult:
             narrow for column, narrow in zip(wide, fitting, strict=True) if narrow.null_count() == column.null_count()
         )
 
-    def to_text(self, *, flat: bool = False) -> "LakeResult":
+    def arrow(self) -> "pyarrow.Table":
+        """Return the rows as a PyArrow table, with the types of `pl`."""
+        return self.pl().to_arrow()
+
+    def df(self) -> Any:  # noqa: ANN401  (pandas need not be installed)
+        """Return the rows as a pandas DataFrame, with the types of `pl`.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        if find_spec("pandas") is None:
+            raise MissingExtraError(
+                "a pandas DataFrame needs pandas: `pip install pandas`, or use `.pl()` or `.arrow()`"
+            )
+        return self.pl().to_pandas()
+
+    def show(self, rows: int = SHOWN_ROWS) -> None:
+        """Print the first rows as a table, and how many there are."""
+        frame, note = _take_first(self, rows)
+        with pl.Config(tbl_rows=rows, tbl_hide_dataframe_shape=True):
+            sys.stdout.write(f"{make_visible(str(frame), keep=chr(10))}\n{note}\n")
+
+    def to_text(self, *, flat: bool = False, numbers: bool = False) -> "LakeResult":
         """Return the rows with values that JSON does not know (dates, intervals, bytes, UUIDs ...) as DuckDB's text.
 
         Args:
             flat: whether lists, structs and maps become text as a whole, for CSV.
+            numbers: whether numbers and truth values become text, too.
         """
-        return LakeResult(self._cast(_PLAIN, flat=flat))
+        return LakeResult(self._cast({"varchar"} if numbers else _PLAIN, flat=flat), self._owner)
 
     def _cast(self, kept: Set[str], *, flat: bool = False) -> "duckdb.DuckDBPyRelation":
         """Return the relation with types other than those kept, and other than lists and structs of them, as text."""
@@ -118,7 +170,7 @@ class LakeResult:
 
     def limit(self, n: int, offset: int = 0) -> "LakeResult":
         """Return at most n rows, after the first `offset`."""
-        return LakeResult(self._relation.limit(n, offset))
+        return LakeResult(self._relation.limit(n, offset), self._owner)
 
     def project(self, expressions: str) -> "LakeResult":
         """Return other columns computed from these by a list of SQL expressions.
@@ -128,7 +180,15 @@ class LakeResult:
         """
         _refuse_switches(expressions)
         with query_errors():
-            return LakeResult(self._relation.project(expressions))
+            return LakeResult(self._relation.project(expressions), self._owner)
+
+
+def _take_first(result: LakeResult, rows: int) -> tuple[pl.DataFrame, str]:
+    """Return the first rows of a result, and a text that says how many there are."""
+    frame = result.limit(rows + 1).pl()
+    if frame.height <= rows:
+        return frame, f"{frame.height:,} {'row' if frame.height == 1 else 'rows'}"
+    return frame.head(rows), f"the first {rows:,} of {result.count():,} rows"
 
 
 def _quote_name(name: str) -> str:
@@ -163,17 +223,39 @@ class LakeConnection:
     def __init__(self, raw: "duckdb.DuckDBPyConnection") -> None:
         self._raw = raw
 
-    def sql(self, statement: str, parameters: Parameters | None = None) -> LakeResult:
+    def sql(
+        self,
+        statement: str,
+        parameters: Parameters | None = None,
+        **frames: Any,  # noqa: ANN401  (of any library)
+    ) -> LakeResult:
         """Return the result of a statement.
 
         Args:
             statement: one SELECT.
             parameters: values of its $names, or of its question marks in order.
+            frames: tables of the user's own by name: Polars, pandas, Arrow, or another result.
 
         Raises:
-            QueryError: see `query`.
+            QueryError: see `query`; or a frame has a name of the lake's, or is no table.
         """
-        return _select_only(self._raw, statement, parameters)
+        return _select_only(self._lend(frames) if frames else self._raw, statement, parameters)
+
+    def _lend(self, frames: Mapping[str, Any]) -> "duckdb.DuckDBPyConnection":
+        """Return a connection of its own with the frames, which those of a later query do not replace."""
+        import duckdb
+
+        own = self._raw.cursor()
+        for name, frame in frames.items():
+            if name.lower() in TABLE_BY_NAME:
+                raise QueryError(f"a frame cannot be called {name}, as a table of the lake is. Give it another name.")
+            try:
+                own.register(name, frame.pl() if isinstance(frame, LakeResult) else frame)
+            except (duckdb.Error, TypeError) as refused:
+                raise QueryError(
+                    f"{name}: expected a table of Polars, pandas or Arrow; got {type(frame).__name__}"
+                ) from refused
+        return own
 
     execute = sql
     """Same as `sql`, under the name that DuckDB's connections have."""
@@ -259,7 +341,7 @@ def _select_only(connection: "duckdb.DuckDBPyConnection", sql: str, parameters: 
         if kinds[0] == duckdb.StatementType.EXPLAIN:
             _refuse_explained_writes(connection, statements[0].query)
         _refuse_switches(sql)
-        return LakeResult(connection.sql(statements[0].query, params=parameters or None))
+        return LakeResult(connection.sql(statements[0].query, params=parameters or None), connection)
 
 
 def _refuse_switches(sql: str) -> None:

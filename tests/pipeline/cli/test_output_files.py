@@ -140,8 +140,8 @@ def test_a_file_is_replaced_whole_or_stays(command, lake, tmp_path, monkeypatch)
     assert (into_folder.code, "is a folder; name a file" in into_folder.err) == (1, True)
     absent = command.here(*arguments, tmp_path / "absent" / "out.csv")
     assert (absent.code, absent.err) == (1, f"error: {tmp_path / 'absent' / 'out.csv'}: No such file or directory.\n")
-    for_people = command.here(*arguments[:4], "--out", out)
-    assert (for_people.code, "choose csv, json or parquet" in for_people.err) == (2, True)
+    for_people = command.here(*arguments[:4], "--format", "table", "--out", out)
+    assert (for_people.code, "choose csv, json, jsonl, parquet, arrow" in for_people.err) == (2, True)
 
 
 def test_devices_are_written_to_and_not_replaced(command, lake):

@@ -8,10 +8,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from decimal import Decimal
+from importlib.util import find_spec
 from pathlib import Path
 
 import duckdb
 import polars as pl
+import pyarrow as pa
 import pytest
 from small_lake import SUBSETS, check_lake, make_splits, make_starts, make_status, put, write_round
 
@@ -31,7 +33,7 @@ from tracklake.pipeline.lake.lake import open_lake
 from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
-from tracklake.schemas.errors import FileAccessError
+from tracklake.schemas.errors import FileAccessError, MissingExtraError
 
 SQL_NAMES = {
     pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
@@ -396,7 +398,8 @@ def test_a_result_reads_and_has_no_method_that_writes(lake: Path):
     with connect(lake) as connection:
         found = connection.sql("SELECT vehicle_id, class FROM vehicles ORDER BY 1")
         assert {name for name in dir(found) if not name.startswith("_")} == {
-            "columns", "count", "description", "fetchall", "fetchone", "limit", "pl", "project", "to_text", "types",
+            "arrow", "columns", "count", "description", "df", "fetchall", "fetchone", "limit", "pl", "project", "show",
+            "to_text", "types",
         }  # fmt: skip
         assert {name for name in dir(connection) if not name.startswith("_")} == {"close", "execute", "sql"}
         assert found.columns == [column[0] for column in found.description] == ["vehicle_id", "class"]
@@ -409,6 +412,50 @@ def test_a_result_reads_and_has_no_method_that_writes(lake: Path):
             with pytest.raises(QueryError):
                 found.project(expressions)
         assert (found.fetchone(), found.fetchall()) == ((0, "car"), [(1, "car"), (2, "car")])
+
+
+def test_a_result_is_handed_to_other_libraries(lake: Path, capsys: pytest.CaptureFixture[str]):
+    with connect(lake) as connection:
+        found = connection.sql("SELECT vehicle_id, sum(entries) AS n, length_m FROM vehicles GROUP BY ALL ORDER BY 1")
+        rows = [(0, 9, 4.5), (1, 9, 4.5), (2, 9, 4.5)]
+        assert found.arrow().schema.types == [pa.int32(), pa.int64(), pa.float32()]
+        assert found.arrow().to_pylist() == [dict(zip(found.columns, row, strict=True)) for row in rows]
+        assert pl.DataFrame(found).rows() == pl.DataFrame(pa.table(found)).rows() == rows
+        assert "<td>4.5</td>" in found._repr_html_()
+        assert repr(found).startswith("LakeResult(vehicle_id INTEGER, n HUGEINT, length_m FLOAT)")
+        found.show(2)
+        assert capsys.readouterr().out.endswith("the first 2 of 3 rows\n")
+        if find_spec("pandas") is None:
+            with pytest.raises(MissingExtraError, match="pip install pandas"):
+                found.df()
+        else:
+            assert [tuple(row) for row in found.df().itertuples(index=False)] == rows
+
+
+def test_frames_of_ones_own_are_tables_of_that_query(lake: Path):
+    mine = pl.DataFrame({"vehicle_id": [0, 2], "label": ["a", "b"]})
+    asked = "SELECT label FROM vehicles JOIN mine USING (vehicle_id) ORDER BY 1"
+    with connect(lake) as connection:
+        first = connection.sql(asked, mine=mine)
+        other = connection.sql(asked, mine=mine.with_columns(label=pl.lit("c")).to_arrow())
+        # Computed only now: each with its own frame.
+        assert (first.fetchall(), other.fetchall(), first.pl().rows()) == (
+            [("a",), ("b",)],
+            [("c",)] * 2,
+            [("a",), ("b",)],
+        )
+        assert connection.sql(asked + " LIMIT $n", {"n": 1}, mine=mine.lazy()).fetchall() == [("a",)]
+        assert connection.sql("FROM made WHERE label = 'b'", made=first).fetchall() == [("b",)]
+        with pytest.raises(QueryError, match="mine"):
+            connection.sql("FROM mine").fetchall()
+        with pytest.raises(QueryError, match="a frame cannot be called Tracks"):
+            connection.sql("FROM tracks", Tracks=mine)
+        for wrong in (5, [1], {"a": [1]}, "vehicles"):
+            with pytest.raises(QueryError, match="mine: expected a table of Polars, pandas or Arrow; got "):
+                connection.sql("FROM mine", mine=wrong)
+        for refused in ("COPY mine TO 'x.csv'", "FROM read_text('/etc/passwd'), mine", "SET threads = 1"):
+            with pytest.raises(QueryError), query_errors():
+                connection.sql(refused, mine=mine).fetchall()
 
 
 def test_whole_numbers_come_as_such_where_64_bits_hold_them(lake: Path):
