@@ -103,7 +103,8 @@ def test_folders_are_right_while_files_are_replaced(tmp_path: Path):
     child = nursery.ask("loop 1")
     try:
         newest, began, rounds = 0, time.monotonic(), 0
-        while time.monotonic() - began < 2:
+        while newest < 4 or rounds < 4:
+            assert time.monotonic() - began < 120, f"{newest} replacements and {rounds} rounds in two minutes"
             found = [
                 read_again(root).select("subset", "backward_vehicles").rows(),
                 ds.dataset(root / TABLE, partitioning="hive")
@@ -119,8 +120,6 @@ def test_folders_are_right_while_files_are_replaced(tmp_path: Path):
                 assert min(number for _, number in rows) >= newest - 1  # the subsets follow one another
                 newest = max(newest, *(number for _, number in rows))
             rounds += 1
-        assert newest > 3
-        assert rounds > 3
     finally:
         os.kill(child, signal.SIGKILL)
         nursery.close()
