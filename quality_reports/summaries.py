@@ -1,8 +1,10 @@
 """Numbers of the report: SQL statements over the lake's views, one per file, gathered into plain values."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime
+from functools import cache
 from importlib.resources import files
 from pathlib import PurePath
 from typing import Any, Protocol, SupportsFloat, TypeAlias, TypedDict, TypeVar, cast
@@ -115,6 +117,7 @@ class Connection(Protocol):
         ...
 
 
+@cache
 def read_statement(name: str) -> str:
     """Return the text of `sql/<name>.sql`."""
     return (files("tracklake.quality_reports") / "sql" / f"{name}.sql").read_text(encoding="utf-8")
@@ -123,14 +126,19 @@ def read_statement(name: str) -> str:
 def query(connection: Connection, name: str, parameters: Parameters | None = None) -> list[Row]:
     """Run `sql/<name>.sql` and return its rows as dictionaries of plain values."""
     # Not on a cursor: it would be a connection of its own, without the caller's local settings and registered frames.
-    result = connection.execute(read_statement(name), dict(parameters or {}))
+    result = connection.execute(read_statement(name), _bind(parameters))
     names = [column[0] for column in result.description or ()]
     return [dict(zip(names, map(plain, row), strict=True)) for row in result.fetchall()]
 
 
 def query_frame(connection: Connection, name: str, parameters: Parameters | None = None) -> pl.DataFrame:
     """Run `sql/<name>.sql` and return its rows as a frame, for plots."""
-    return connection.execute(read_statement(name), dict(parameters or {})).pl()
+    return connection.execute(read_statement(name), _bind(parameters)).pl()
+
+
+def _bind(parameters: Parameters | None) -> Row:
+    """Return a statement's values with lists as text, which it casts; DuckDB looks for pandas once per list item."""
+    return {name: json.dumps(value) if isinstance(value, list) else value for name, value in (parameters or {}).items()}
 
 
 def plain_row(row: Mapping[str, Any]) -> Row:

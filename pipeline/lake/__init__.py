@@ -22,6 +22,7 @@ from tracklake.pipeline.lake.manifest import Manifest as Manifest
 from tracklake.pipeline.lake.manifest import load as load
 from tracklake.pipeline.lake.query import LakeResult as LakeResult
 from tracklake.pipeline.lake.query import connect as connect
+from tracklake.pipeline.lake.query import open_recordings as open_recordings
 from tracklake.pipeline.lake.query import query as query
 from tracklake.pipeline.lake.query import query_errors as query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested as list_ingested

@@ -125,9 +125,9 @@ class Manifest:
             (commit for commit in self.commits.values() if commit.stage == stage), key=lambda commit: commit.key
         )
 
-    def of_recording(self, recording: str) -> "Manifest":
-        """Return the manifest without what was made of other recordings than this one (`dataset/recording`)."""
-        commits = {key: commit for key, commit in self.commits.items() if commit.tail in ("", recording)}
+    def of_recordings(self, recordings: Collection[str]) -> "Manifest":
+        """Return the manifest without what was made of other recordings than these (`dataset/recording`)."""
+        commits = {key: commit for key, commit in self.commits.items() if commit.tail in ("", *recordings)}
         return replace(self, commits=commits)
 
     def add_commit(self, commit: Commit, generation: int) -> "Manifest":

@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +14,7 @@ from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
 from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.macros import MACROS
-from tracklake.pipeline.lake.manifest import load
+from tracklake.pipeline.lake.manifest import Manifest, load
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import MissingExtraError
 from tracklake.schemas.text import make_visible
@@ -274,7 +274,7 @@ class LakeConnection:
         self.close()
 
 
-def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection:
+def connect(lake: Path | str) -> LakeConnection:
     """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
 
     Nothing but the lake's live files can be reached, no statement but a SELECT is admitted, no extension loaded, no
@@ -282,7 +282,6 @@ def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection
 
     Args:
         lake: the lake's folder, wherever it stands now.
-        recording: as if the lake held only this one (`dataset/recording`), but for tables over the whole lake.
 
     Raises:
         LakeMissingError: no lake there.
@@ -291,7 +290,7 @@ def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection
     import duckdb
 
     root = Path(lake).resolve()
-    manifest = load(root) if recording is None else load(root).of_recording(recording)
+    manifest = load(root)
     connection = duckdb.connect(
         ":memory:",
         config={
@@ -314,6 +313,22 @@ def connect(lake: Path | str, *, recording: str | None = None) -> LakeConnection
     ):
         connection.execute(f"SET {setting}")
     return LakeConnection(connection)
+
+
+def open_recordings(root: Path, manifest: Manifest, recordings: Collection[str]) -> "duckdb.DuckDBPyConnection":
+    """Open some recordings for statements of our own: views as if the lake held only these (`dataset/recording`).
+
+    One thread, as others work on other recordings. It is DuckDB's own connection: through LakeConnection's relations a
+    large result of a statement with parameters takes ten times as long.
+
+    Raises:
+        LakeError: a live file is missing or unreadable.
+    """
+    import duckdb
+
+    connection = duckdb.connect(":memory:", config={"threads": 1})
+    create_views(connection, root, manifest.of_recordings(recordings))
+    return connection
 
 
 def query(connection: LakeConnection, sql: str) -> LakeResult:

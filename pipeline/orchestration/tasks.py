@@ -40,7 +40,7 @@ from tracklake.pipeline.orchestration.run_plan import (
 )
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile, SourceError
-from tracklake.pipeline.stages.planner import Planner, build_job
+from tracklake.pipeline.stages.planner import Planner, build_jobs, group_jobs
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas import StructureError
@@ -79,12 +79,12 @@ def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict
 
 
 @task(task_run_name="{stage} {title}", **TASK)
-def build(stage: str, title: str, lake: str, job: dict[str, Any], settings: dict[str, Any]) -> Commit:
-    """Do one stage's work on one recording: read, transform, validate, write; returns the commit to make."""
+def build(stage: str, title: str, lake: str, jobs: list[dict[str, Any]], settings: dict[str, Any]) -> list[Commit]:
+    """Do one stage's work on one recording, or some: read, transform, validate, write; returns the commits to make."""
     del title
     if stage == INGEST:
-        return ingest.build(Path(lake), Job(**job))
-    return build_job(STAGE_BY_NAME[stage], Path(lake), Job(**job), Settings(**settings))
+        return [ingest.build(Path(lake), Job(**job)) for job in jobs]
+    return build_jobs(STAGE_BY_NAME[stage], Path(lake), [Job(**job) for job in jobs], Settings(**settings))
 
 
 def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
@@ -108,18 +108,29 @@ def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest,
         return
     show = reporter()
     show.begin(stage, len(jobs))
-    settings = request.get_settings().model_dump(mode="json")
-    futures = {build.submit(stage, job.title, request.lake, asdict(job), settings): job.title for job in jobs}
+    settings = request.get_settings()
+    if stage == INGEST:
+        groups = [[job] for job in jobs]
+    else:
+        groups = group_jobs(STAGE_BY_NAME[stage], writer.manifest, jobs, settings.workers)
+    titles = [", ".join(job.title for job in group) for group in groups]
+    values = settings.model_dump(mode="json")
+    futures = {
+        build.submit(stage, title, request.lake, [asdict(job) for job in group], values): title
+        for title, group in zip(titles, groups, strict=True)
+    }
     for title, made in _await_results(futures):
-        if isinstance(made, Commit):
-            writer.commit(made)
-            result.built[stage] = result.built.get(stage, 0) + 1
-            result.notes += made.info.get("notes", [])
+        if isinstance(made, list):
+            for commit in made:
+                writer.commit(commit)
+                result.notes += commit.info.get("notes", [])
+            result.built[stage] = result.built.get(stage, 0) + len(made)
         else:
             _record_error(title, made, result)
             if isinstance(made, DamagedFileError):
                 writer.mark_damaged({file.key for file in find_damaged_files(writer.root, writer.manifest)})
-        show.advance(stage, title)
+        for name in title.split(", "):
+            show.advance(stage, name)
 
 
 def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult) -> None:

@@ -1,12 +1,13 @@
 """Pages: one of the report per subset, written again only where what it shows has changed."""
 
-from collections.abc import Iterable, Mapping
+from collections import ChainMap
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, connect, is_intact, scan
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, open_recordings, scan
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
@@ -49,16 +50,27 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
     }
 
 
-def build(reader: LakeReader, _settings: Settings) -> StageResult:
-    """Query what the lake holds of one recording and write its subsets' pages into reports/subsets/."""
+def build(readers: Sequence[LakeReader], _settings: Settings) -> list[StageResult]:
+    """Query what the lake holds of some recordings and write their subsets' pages into reports/subsets/."""
     from tracklake.quality_reports.pages.subsets import render_pages
 
+    root, names = readers[0].root, [_name_pages(reader) for reader in readers]
+    with open_recordings(root, readers[0].manifest, [reader.job.tail for reader in readers]) as connection:
+        rendered = render_pages(connection, describe_origin(root), names=dict(ChainMap(*names)))
+        files = {name: write_report_file(root, f"{FOLDER}/{name}", content) for name, content in rendered}
+    return [
+        StageResult(
+            files={REPORTS: [files[name] for name in own.values()]},
+            info={"pages": [(*key, name) for key, name in own.items()]},
+        )
+        for own in names
+    ]
+
+
+def _name_pages(reader: LakeReader) -> dict[tuple[str, str], str]:
+    """Return the names of a recording's pages by (dataset, subset)."""
     dataset, pages = reader.job.inputs["dataset"], reader.job.built_from["pages"]
-    names = {(dataset, subset): name for subset, name in pages.items()}
-    with connect(reader.root, recording=reader.job.tail) as connection:
-        rendered = render_pages(connection, describe_origin(reader.root), names=names)
-        files = [write_report_file(reader.root, f"{FOLDER}/{name}", content) for name, content in rendered]
-    return StageResult(files={REPORTS: files}, info={"pages": [(*key, name) for key, name in names.items()]})
+    return {(dataset, subset): name for subset, name in pages.items()}
 
 
 STAGE = Stage(
@@ -68,7 +80,7 @@ STAGE = Stage(
     after=(),  # a page shows what there is
     version=5,
     build=build,
-    per_subset=False,
+    batch_entries=500_000,
     extra_inputs=_find_inputs,
 )
 

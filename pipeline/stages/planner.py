@@ -10,6 +10,7 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage, StageError, StageResult, make_commit, make_job
+from tracklake.schemas import TRACKS
 
 
 class Planner:
@@ -102,6 +103,42 @@ def _is_done(root: Path, manifest: Manifest, job: Job) -> bool:
     return commit is not None and commit.fingerprint == job.fingerprint and is_intact(root, commit.all_files)
 
 
+def group_jobs(stage: Stage, manifest: Manifest, jobs: Sequence[Job], workers: int) -> list[list[Job]]:
+    """Divide the jobs of a stage into groups that are built together, at least one for every worker."""
+    if not stage.batch_entries:
+        return [[job] for job in jobs]
+    rows = {
+        commit.tail: sum(file.rows or 0 for file in commit.files.get(TRACKS.name, []))
+        for commit in manifest.of_stage(INGEST)
+    }
+    most = min(stage.batch_entries, sum(rows.get(job.tail, 0) for job in jobs) / workers)
+    groups: list[list[Job]] = []
+    size = 0
+    for job in jobs:
+        if not groups or size + rows.get(job.tail, 0) > most:
+            groups.append([])
+            size = 0
+        groups[-1].append(job)
+        size += rows.get(job.tail, 0)
+    return groups
+
+
+def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings) -> list[Commit]:
+    """Build jobs that were grouped, and return their commits in the same order; raises as `build_job` does."""
+    if not stage.batch_entries:
+        return [build_job(stage, root, job, settings) for job in jobs]
+    started = time.perf_counter()
+    manifest = load(root)
+    verify_files(root, {file.path: file for job in jobs for file in _list_inputs(stage, manifest, job)}.values())
+    results = stage.build([LakeReader(root, manifest, stage.after, job) for job in jobs], settings)
+    assert isinstance(results, list)
+    share = (time.perf_counter() - started) * (len(jobs) - 1) / len(jobs)  # each has taken its part of the time
+    return [
+        make_commit(job, {**result.files}, {**result.info, "notes": [*result.notes]}, started + share)
+        for job, result in zip(jobs, results, strict=True)
+    ]
+
+
 def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     """Build what a job asks for, validate and write its tables, and return the commit to make.
 
@@ -110,6 +147,8 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
         StageError: the stage refuses what it made.
         schemas.StructureError: a frame breaks its table's rules.
     """
+    if stage.batch_entries:
+        return build_jobs(stage, root, [job], settings)[0]
     started = time.perf_counter()
     manifest = load(root)
     verify_files(root, _list_inputs(stage, manifest, job))
@@ -118,6 +157,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     notes: list[str] = []
     for reader in _open_readers(stage, root, manifest, job):
         built = stage.build(reader, settings)
+        assert not isinstance(built, list)
         result = built if isinstance(built, StageResult) else StageResult(built)
         for table, frame in result.tables.items():
             written = write_table(root, table, frame, reader.partition, job.fingerprint, where=reader.title)
@@ -139,7 +179,7 @@ def _list_inputs(stage: Stage, manifest: Manifest, job: Job) -> Iterator[LakeFil
 
 def _open_readers(stage: Stage, root: Path, manifest: Manifest, job: Job) -> Iterator[LakeReader]:
     lake = LakeReader(root, manifest, stage.after, job)
-    if stage.scope == "lake" or not stage.per_subset:
+    if stage.scope == "lake":
         yield lake
         return
     for subset in job.inputs["subsets"]:

@@ -78,8 +78,9 @@ class Stage:
         settings: what its result depends on: names of settings, or functions that give values by name.
         version: number to raise when the code makes other results of the same inputs.
         build: (reader, settings) to frames by table, or a StageResult. The reader is a SubsetReader, once for every
-            subset of the recording; a LakeReader for the scope `lake`, and where `per_subset` is False.
-        per_subset: whether a recording's subsets are built one by one.
+            subset of the recording; a LakeReader for the scope `lake`.
+        batch_entries: number of entries up to which small recordings are built together: `build` then takes a list of
+            LakeReaders and returns a list of StageResults. 0: recordings are built one by one.
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
             (by "" for the scope `lake`).
     """
@@ -89,9 +90,9 @@ class Stage:
     scope: Scope
     after: tuple[str, ...]
     version: int
-    build: Callable[[Any, Settings], StageResult | Mapping[Table, pl.DataFrame]]
+    build: Callable[[Any, Settings], StageResult | Mapping[Table, pl.DataFrame] | list[StageResult]]
     settings: tuple[str | Callable[[Settings], Mapping[str, Any]], ...] = ()
-    per_subset: bool = True
+    batch_entries: int = 0
     extra_inputs: Callable[[Path, Manifest, Settings], Mapping[str, Mapping[str, Any]]] | None = None
 
     def describe_settings(self, settings: Settings) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def format_value(value: object) -> str:
     if isinstance(value, int):
         return f"{value:,}".replace("-", MINUS)
     if isinstance(value, float):
-        return f"{value:,.6g}".replace("-", MINUS)
+        return (f"{value:,.6g}" if abs(value) < 1e6 else f"{value:,.0f}").replace("-", MINUS)
     return format_cell(value)
 
 

@@ -1,9 +1,9 @@
 """Worst findings of every rule in a subset: facts, the moment that is shown of each, and their SQL."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from tracklake.quality_reports.rules.rule import Rule
-from tracklake.quality_reports.summaries import Connection, Row, query
+from tracklake.quality_reports.summaries import Row
 
 AROUND_S = 5.0
 """Time shown before and after a finding, and the longest shown part of the finding itself, in seconds."""
@@ -24,27 +24,31 @@ def declare_rule(rule: Rule, unit: str) -> Row:
     return {"name": rule.name, "unit": unit, "extreme": rule.extreme, "partner": partner}
 
 
-def find_examples(connection: Connection, where: Mapping[str, str], rules: Sequence[Row], rate_hz: float) -> list[Row]:
-    """Find the worst findings of each rule: rows of subset_worst.sql with `unit`, `partner`, `moment` and `sql`.
+def ask_for_examples(rules: Sequence[Row]) -> Row:
+    """Return the parameters of subset_worst.sql; `rules` are rows of `declare_rule`, the gravest first."""
+    return {
+        "rules": [rule["name"] for rule in rules],
+        "extremes": [rule["extreme"] for rule in rules],
+        "examples": EXAMPLES,
+    }
+
+
+def describe_examples(worst: Sequence[Row], rules: Sequence[Row], rate_hz: float) -> list[Row]:
+    """Add `unit`, `partner`, `moment` and `sql` to rows of subset_worst.sql.
 
     Args:
-        connection: connection to a lake.
-        where: dataset and subset.
-        rules: rows of `declare_rule`, the gravest first.
+        worst: rows of one subset.
+        rules: rows of `declare_rule`.
         rate_hz: frame rate of the subset.
     """
     about = {rule["name"]: rule for rule in rules}
-    extremes = [rule["extreme"] for rule in rules]
-    worst = query(
-        connection, "subset_worst", {**where, "rules": list(about), "extremes": extremes, "examples": EXAMPLES}
-    )
     return [
         {
             **row,
             "unit": about[row["rule"]]["unit"],
             "partner": about[row["rule"]]["partner"],
             "moment": choose_moment(row, round(AROUND_S * rate_hz)),
-            "sql": write_sql(where, row),
+            "sql": write_sql(row),
         }
         for row in worst
     ]
@@ -61,9 +65,9 @@ def choose_moment(finding: Row, longest: int) -> int:
     return int((first + min(last, first + longest)) // 2 if finding["entries"] == last - first + 1 else first)
 
 
-def write_sql(where: Mapping[str, str], finding: Row) -> str:
+def write_sql(finding: Row) -> str:
     """Return the statement that shows a finding's entries."""
-    dataset, subset = (_quote(where[name]) for name in ("dataset", "subset"))
+    dataset, subset = (_quote(finding[name]) for name in ("dataset", "subset"))
     return (
         f"SELECT * FROM track({subset}, {finding['vehicle_id']})\n"
         f"WHERE dataset = {dataset} AND frame BETWEEN {finding['first_frame']} AND {finding['last_frame']}"

@@ -29,6 +29,7 @@ def render_splits(quality: Quality) -> str | None:
     if not splits["recipes"]:
         return None
     names = [row["split"] for row in splits["recipes"]]
+    leaking = find_leaking(compared)
     shifts = [row for row in splits["shifts"] if (row["part"], row["other_part"]) == (TRAIN, EVAL)]
     return (
         make_environment()
@@ -37,9 +38,9 @@ def render_splits(quality: Quality) -> str | None:
             provenance=quality["provenance"],
             banner=describe_origins(quality),
             compared=compared,
-            shared_plot=Markup(plots.draw_shared(_list_shares(compared), names)) if compared else None,
+            shared_plot=Markup(plots.draw_shared(_list_shares(leaking), names)) if leaking else None,
             shift_plot=Markup(plots.draw_shifts(shifts, names)) if shifts else None,
-            leaking=find_leaking(compared),
+            leaking=leaking,
             splits=[
                 {
                     **recipe,

@@ -1,13 +1,13 @@
 """Pages of single subsets: facts, findings, time-space diagrams, flow, worst examples, scores."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import polars as pl
 from markupsafe import Markup
 
-from tracklake.quality_reports.pages.examples import AROUND_S, declare_rule, find_examples
+from tracklake.quality_reports.pages.examples import AROUND_S, ask_for_examples, declare_rule, describe_examples
 from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.player import find_zero, make_player
 from tracklake.quality_reports.pages.rendering import make_environment
@@ -44,6 +44,14 @@ FEWEST = 15
 """Least number of intervals in a recording."""
 MOST_ROWS = 10
 """Most rows of a table of single vehicles."""
+TABLES = (
+    *("extent", "worst", "flow", "speeds", "speed_histogram", "lane_changes", "windows", "vehicle_scores"),
+    "sample_drops",
+)
+"""Tables that one statement each, subset_<name>.sql, gives for all subsets at once."""
+
+Key: TypeAlias = tuple[str, str]
+"""Dataset and subset."""
 
 
 def render_pages(
@@ -68,8 +76,10 @@ def render_pages(
     declared = [declare_rule(by_name[rule["name"]], rule["unit"]) for rule in rank_rules(figures["rules"])]
     judged = judge(figures["subsets"], figures["subset_scores"], figures["rules"], figures["completeness"])
     verdicts = {(row["dataset"], row["subset"]): row for row in judged}
+    tables = _query_tables(connection, figures["subsets"], declared)
     for subset in figures["subsets"]:
-        content = {**_select_figures(figures, subset), **_query_subset(connection, subset, declared)}
+        own = {name: rows.get(_get_key(subset), []) for name, rows in tables.items()}
+        content = {**_select_figures(figures, subset), **_draw_subset(connection, subset, declared, own)}
         yield (
             names[subset["dataset"], subset["subset"]],
             template.render(
@@ -116,29 +126,44 @@ def _select_figures(figures: SubsetFigures, subset: SubsetFacts) -> Row:
     }
 
 
-def _get_key(row: Mapping[str, Any]) -> tuple[str, str]:
+def _get_key(row: Mapping[str, Any]) -> Key:
     """Return the dataset and the subset of a row."""
     return row["dataset"], row["subset"]
 
 
-def _query_subset(connection: Connection, subset: SubsetFacts, rules: Sequence[Row]) -> Row:
-    """Query the figures that only the subset's page shows, with their plots."""
+def _query_tables(
+    connection: Connection, subsets: Sequence[SubsetFacts], rules: Sequence[Row]
+) -> dict[str, dict[Key, list[Row]]]:
+    """Query tables that only subsets' pages show, of all subsets at once: rows by the table's name and by subset."""
+    asked = {
+        "datasets": [row["dataset"] for row in subsets],
+        "subsets": [row["subset"] for row in subsets],
+        "seconds": [choose_interval(row["seconds"]) for row in subsets],
+    }
+    most = {"most": MOST_ROWS}
+    parameters = {"flow": asked, "worst": ask_for_examples(rules), "windows": most, "vehicle_scores": most}
+    tables: dict[str, dict[Key, list[Row]]] = {}
+    for name in TABLES:
+        by_subset = tables.setdefault(name, {})
+        for row in query(connection, f"subset_{name}", parameters.get(name)):
+            by_subset.setdefault(_get_key(row), []).append(row)
+    return tables
+
+
+def _draw_subset(
+    connection: Connection, subset: SubsetFacts, rules: Sequence[Row], tables: Mapping[str, list[Row]]
+) -> Row:
+    """Describe and draw what only the subset's page shows; `tables` are its rows by TABLES."""
     where = {"dataset": subset["dataset"], "subset": subset["subset"]}
-    extent = query(connection, "subset_extent", where)[0]
-    limited = {**where, "most": MOST_ROWS}
-    seconds = choose_interval(subset["seconds"])
-    examples = find_examples(connection, where, rules, subset["frame_rate_hz"])
+    (extent,) = tables["extent"]
+    examples = describe_examples(tables["worst"], rules, subset["frame_rate_hz"])
     scenes = read_scenes(connection, where, extent, examples, subset["frame_rate_hz"])
     views = _draw_views(scenes, examples, find_top_speed(extent)) if scenes else [None] * len(examples)
     return {
+        **tables,
+        **_draw_plots(tables),
         "extent": extent,
-        **_draw_plots(connection, where, extent, seconds),
-        "seconds": seconds,
-        "speeds": query(connection, "subset_speeds", where),
-        "lane_changes": query(connection, "subset_lane_changes", where),
-        "windows": query(connection, "subset_windows", limited),
-        "vehicle_scores": query(connection, "subset_vehicle_scores", limited),
-        "drops": query(connection, "subset_sample_drops", where),
+        "seconds": choose_interval(subset["seconds"]),
         "examples": [{**example, "view": view} for example, view in zip(examples, views, strict=True)],
         "player": make_player(scenes, extent, examples) if scenes else None,
         "diagrams": _make_diagrams(connection, where, extent, scenes) if scenes else None,
@@ -173,19 +198,19 @@ def choose_interval(seconds: float) -> float:
     return max((length for length in INTERVALS_S if seconds / length >= FEWEST), default=INTERVALS_S[0])
 
 
-def _draw_plots(connection: Connection, where: Mapping[str, str], extent: Row, seconds: float) -> dict[str, Any]:
+def _draw_plots(tables: Mapping[str, list[Row]]) -> dict[str, Any]:
     """Draw the subset's plots as markup; None where it has no entries."""
+    (extent,) = tables["extent"]
     if not extent["entries"]:
         return {"legend": None, "flow": None, "fundamental": None, "speed_histogram": None}
     top_mps = find_top_speed(extent)
-    intervals = query(connection, "subset_flow", {**where, "seconds": seconds})
-    histogram = query(connection, "subset_speed_histogram", where)
+    intervals = tables["flow"]
     return {
         "legend": Markup(draw_scale(top_mps)),
         # Without a section of some length there is neither flow nor density.
         "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
         "fundamental": Markup(draw_fundamental(intervals, top_mps)) if _is_measured(intervals) else None,
-        "speed_histogram": Markup(plots.draw_speed_histogram(histogram, [])),
+        "speed_histogram": Markup(plots.draw_speed_histogram(tables["speed_histogram"], [])),
     }
 
 

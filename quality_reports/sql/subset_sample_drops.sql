@@ -1,5 +1,4 @@
--- Entries of a subset on a protocol's clock that are no samples, by reason.
-SELECT protocol, reason, entries
+-- Entries of every subset on a protocol's clock that are no samples, by reason.
+SELECT dataset, subset, protocol, reason, entries
 FROM sample_drops
-WHERE dataset = $dataset AND subset = $subset
-ORDER BY protocol, entries DESC, reason
+ORDER BY dataset, subset, protocol, entries DESC, reason

@@ -13,8 +13,10 @@ from stage_runs import find_outstanding, plan_stage, run_stage
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.ingest.removal import remove_recordings
-from tracklake.pipeline.lake import Commit, open_for_writing, write_table
+from tracklake.pipeline.lake import Commit, load, open_for_writing, write_table
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.planner import build_jobs, group_jobs
+from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.schemas import SPLITS
 
 pytestmark = pytest.mark.usefixtures("empty_charts")
@@ -106,6 +108,25 @@ def test_only_pages_whose_recording_changed_are_written_again(lake: Path):
     assert {name: written > before[name] for name, written in pages(lake).items()} == dict.fromkeys(NAMES, True)
     (lake / "reports" / "subsets" / "02-upper.html").write_text("spoilt")
     assert make(lake, "pages") == ["pages/highd/02"]
+
+
+def test_pages_drawn_together_are_those_drawn_one_by_one(lake: Path):
+    def read() -> dict[str, str]:
+        created = re.compile(r"\d{4}-\d\d-\d\dT[\d:+]+")
+        return {file.name: created.sub("", file.read_text()) for file in (lake / "reports" / "subsets").glob("*")}
+
+    stage, jobs, manifest = STAGE_BY_NAME["pages"], plan_stage(lake, "pages", Settings()), load(lake)
+    assert group_jobs(stage, manifest, jobs, workers=2) == [[job] for job in jobs], "work for both"
+    assert group_jobs(stage, manifest, jobs, workers=1) == [jobs]
+    commits = []
+    for group in ([jobs[0]], [jobs[1]]):
+        commits += build_jobs(stage, lake, group, Settings())
+    alone = read()
+    together = build_jobs(stage, lake, jobs, Settings())
+    assert read() == alone
+    assert [(commit.key, commit.files.keys(), commit.info["pages"]) for commit in together] == [
+        (commit.key, commit.files.keys(), commit.info["pages"]) for commit in commits
+    ]
 
 
 def test_a_page_is_of_its_own_subset(lake: Path):

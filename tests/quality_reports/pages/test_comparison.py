@@ -259,6 +259,7 @@ def test_no_name_can_inject_markup(against, tables):
         (-3, f"{MINUS}3"),
         (-0.5, f"{MINUS}0.5"),
         (1234.5678, "1,234.57"),
+        (2289800.4, "2,289,800"),
         (["a", "b"], "a, b"),
     ],
 )

@@ -6,6 +6,8 @@ import pytest
 from browser import Browser
 from page_elements import SCRIPT
 
+from tracklake.quality_reports.pages.comparison import render_comparison
+from tracklake.quality_reports.pages.lake_differences import Side, compare
 from tracklake.quality_reports.pages.rendering import DASH
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.pages.subsets import render_pages
@@ -37,9 +39,15 @@ def large(open_lake, small_lake, tmp_path_factory) -> Path:
         {**small_lake["ingest_log"][0], "file": f"{number:02d}_tracks.csv", "rows_dropped": number % 2}
         for number in range(3 * RECORDINGS)
     ]
+    tables["split_recipes"] = [
+        {"split": split, "parameters": "{}", "trains": trains, "claims_no_leakage": trains, "meaning": "an example"}
+        for split, trains in (("flow-balanced", True), ("csp-2018", False))
+    ]
     folder = tmp_path_factory.mktemp("report")
-    report = build_report(open_lake(**tables), {"lake": "large"})
-    for name, page in {"index.html": report.html, **report.others}.items():
+    lake = open_lake(**tables)
+    report = build_report(lake, {"lake": "large"})
+    compared = compare(Side(open_lake(**small_lake), {"lake": "small"}), Side(lake, {"lake": "large"}))
+    for name, page in {"index.html": report.html, "compare.html": render_comparison(compared), **report.others}.items():
         (folder / name).write_text(page, encoding="utf-8")
     return folder
 
@@ -135,6 +143,26 @@ def test_without_a_script_everything_is_shown(browser, large):
     browser.open(large / "index.html", script=False)
     assert browser.run("[...document.querySelectorAll('details')].every(each => each.open)") is True
     assert browser.run("document.querySelectorAll('thead button').length") == 0
+
+
+OVERFLOWING = """
+    [...document.querySelectorAll("body *:not(svg *)")].filter((element) =>
+        element.clientWidth > 0 && element.scrollWidth > element.clientWidth + 1
+        && getComputedStyle(element).overflowX === "visible").map((element) => element.outerHTML.slice(0, 80))
+"""
+"""Elements whose content reaches beyond them and that do not scroll."""
+
+
+@pytest.mark.parametrize("kind", ["index", "splits", "files", "rejects", "compare", "page"])
+def test_every_kind_of_page_loads_and_fits_at_every_width(browser, large, scene, kind):
+    path = scene if kind == "page" else large / f"{kind}.html"
+    for width in (400, 1280, 1920):
+        for dark in (False, True):
+            browser.open(path, width=width, height=SCREEN, dark=dark)
+            at = f"{kind} at {width} px, {'dark' if dark else 'light'}"
+            assert browser.run("document.documentElement.scrollWidth") <= width, at
+            assert browser.run(OVERFLOWING) == [], at
+            assert browser.errors == [], at
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,13 @@ import pytest
 from page_elements import HOSTILE, parse, spoil_texts
 
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
-from tracklake.quality_reports.pages.examples import choose_moment, declare_rule, find_examples, write_sql
+from tracklake.quality_reports.pages.examples import (
+    ask_for_examples,
+    choose_moment,
+    declare_rule,
+    describe_examples,
+    write_sql,
+)
 from tracklake.quality_reports.pages.page_names import name_pages
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.pages.subsets import choose_interval, render_pages
@@ -183,7 +189,8 @@ def test_only_errors_are_marked(open_lake, road):
 
 def test_flow_is_edies(open_lake, road):
     # An interval of 5 s of the 10 s recorded; the section is 0 to 39.2 m. Lane 2: 25 entries at 10 m/s.
-    rows = query(open_lake(**road), "subset_flow", {**WHERE, "seconds": 5.0})
+    asked = {"datasets": [WHERE["dataset"]], "subsets": [WHERE["subset"]], "seconds": [5.0]}
+    rows = query(open_lake(**road), "subset_flow", asked)
     lane_2 = next(row for row in rows if row["lane"] == 2 and row["interval"] == 0)
     assert lane_2["flow_veh_per_h"] == pytest.approx(3600 * (25 * 10 / 25) / (39.2 * 5))
     assert lane_2["density_veh_per_km"] == pytest.approx(1000 * (25 / 25) / (39.2 * 5))
@@ -193,11 +200,11 @@ def test_flow_is_edies(open_lake, road):
 
 def test_speeds_and_lane_changes_of_a_subset(open_lake, road):
     lake = open_lake(**road)
-    whole, lane_1, lane_2 = query(lake, "subset_speeds", WHERE)
+    whole, lane_1, lane_2 = (row for row in query(lake, "subset_speeds") if row["subset"] == "01-lower")
     assert (whole["whole"], whole["entries"], whole["mean_mps"]) == (True, 100, 15.0)
     assert (lane_1["lane"], lane_1["entries"], lane_1["mean_mps"]) == (1, 75, pytest.approx((50 * 20 + 250) / 75))
     assert (lane_2["lane"], lane_2["min_mps"], lane_2["max_mps"]) == (2, 10.0, 10.0)
-    (change,) = query(lake, "subset_lane_changes", WHERE)
+    (change,) = query(lake, "subset_lane_changes")
     assert (change["from_lane"], change["to_lane"], change["direction"]) == (2, 1, "left")
     assert (change["changes"], change["vehicles"]) == (1, 1)
 
@@ -205,7 +212,7 @@ def test_speeds_and_lane_changes_of_a_subset(open_lake, road):
 def test_the_worst_of_each_vehicle_comes_first_and_its_sql_shows_its_entries(open_lake, road):
     lake = open_lake(**road)
     rules = [declare_rule(rule, rule.unit) for rule in RULES if rule.name in ("high_acceleration", "negative_headway")]
-    found = find_examples(lake, WHERE, rules, 25.0)
+    found = describe_examples(query(lake, "subset_worst", ask_for_examples(rules)), rules, 25.0)
     assert [(each["rule"], each["vehicle_id"], each["worst"], each["partner"]) for each in found] == [
         ("high_acceleration", 2, 5.0, None),
         ("negative_headway", 1, -9.0, "leader"),
@@ -239,7 +246,7 @@ def test_the_moment_shown_is_the_middle_of_the_first_seconds():
 def test_sql_quotes_names(open_lake, road):
     spoilt = "it's '01'; --"
     tracks = [{**row, "subset": spoilt} for row in road["tracks"] if row["subset"] == "01-lower"]
-    sql = write_sql({"dataset": "highd", "subset": spoilt}, {"vehicle_id": 2, "first_frame": 25, "last_frame": 27})
+    sql = write_sql({"dataset": "highd", "subset": spoilt, "vehicle_id": 2, "first_frame": 25, "last_frame": 27})
     shown = open_lake(tracks=tracks).execute(sql).pl()
     assert shown["frame"].to_list() == [25, 26, 27]
     assert set(shown["vehicle_id"]) == {2}
