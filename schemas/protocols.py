@@ -78,23 +78,19 @@ class Protocol:
     @property
     def digest(self) -> str:
         """First 12 hex digits of the sha256 of every parameter."""
-        return _digest(self._parameters)
+        return hash_values(self._parameters, 12)
 
     @property
     def sampling_digest(self) -> str:
         """First 12 hex digits of the sha256 of the parameters that samples depend on."""
         others = ("train_share", "scored_s", "headline")
-        return _digest({name: value for name, value in self._parameters.items() if name not in others} | {"split": ""})
+        kept = {name: value for name, value in self._parameters.items() if name not in others}
+        return hash_values(kept | {"split": ""}, 12)
 
     @property
     def _parameters(self) -> dict[str, object]:
         """Parameters that are hashed; lanes that are not folded are no parameter, as before there was one."""
         return {name: value for name, value in asdict(self).items() if name != "fold_lanes" or value}
-
-
-def _digest(values: dict[str, object]) -> str:
-    """Return the first 12 hex digits of the sha256 of some values."""
-    return hash_values(values, 12)
 
 
 CSP = Protocol(name="csp", fold_lanes=True)

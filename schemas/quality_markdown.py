@@ -90,12 +90,8 @@ def _describe(
     else:
         kinds = arguments if origin is types.UnionType else (hint,)
         kind = " or ".join("null" if each is types.NoneType else TYPES[each] for each in kinds)
-        yield f"`{path}`", kind, _find_unit(path) if unit is None else unit, meaning
-
-
-def _find_unit(path: str) -> str:
-    """Return the unit that ends a key's name, or nothing."""
-    return next((unit for end, unit in UNITS.items() if path.endswith(end)), "")
+        by_name = next((each for end, each in UNITS.items() if path.endswith(end)), "")
+        yield f"`{path}`", kind, by_name if unit is None else unit, meaning
 
 
 if __name__ == "__main__":

@@ -116,11 +116,6 @@ def estimate_by_regression(cut: Cut) -> tuple[Floats, Floats]:
     return np.where(enough, cut.lines.predict(cut.speed_mps), cut.by_mean_speed), SIGMAS * cut.sigma
 
 
-def estimate_by_mean_speed(cut: Cut) -> tuple[Floats, Floats]:
-    """Estimate distance / mean speed, with the contract's margin."""
-    return cut.by_mean_speed, SIGMAS * cut.sigma
-
-
 def estimate_without_margin(cut: Cut) -> tuple[Floats, Floats]:
     """Estimate as the contract does, without a margin."""
     estimate, margin = estimate_by_regression(cut)
@@ -154,7 +149,7 @@ def estimate_locally(cut: Cut) -> tuple[Floats, Floats]:
 
 ESTIMATES: Mapping[str, Estimator] = {
     "regression": estimate_by_regression,
-    "mean_speed": estimate_by_mean_speed,
+    "mean_speed": lambda cut: (cut.by_mean_speed, SIGMAS * cut.sigma),
     "no_margin": estimate_without_margin,
     "local_regression": estimate_locally,
 }
