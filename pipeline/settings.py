@@ -165,11 +165,21 @@ class Settings(BaseSettings):
         del settings_cls, env_settings, dotenv_settings, file_secret_settings
         return (init_settings,)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_booleans(cls, value: object, info: ValidationInfo) -> object:
+        """Refuse true and false where a number is expected, for which pydantic takes 1 and 0."""
+        is_switch = "bool" in str(cls.model_fields[str(info.field_name)].annotation)
+        held = value.values() if isinstance(value, Mapping) else [value]
+        if not is_switch and any(isinstance(each, bool) for each in held):
+            raise ValueError("expected a number or a text, not true or false")
+        return value
+
     @field_validator("protocol")
     @classmethod
     def _check_protocol(cls, name: str) -> str:
         if name not in PROTOCOLS:
-            raise ValueError(suggest_name(name, PROTOCOLS))
+            raise ValueError(f"no protocol is called {name}; {suggest_name(name, PROTOCOLS)}")
         return name
 
     @field_validator("min_future_s")
@@ -345,15 +355,15 @@ def _describe_problem(problem: Any) -> str:  # noqa: ANN401  (a TypedDict that p
     """Return what was expected where pydantic found something else."""
     if problem["type"] == "extra_forbidden":
         return f"unknown setting; {suggest_name(str(problem['loc'][0]), Settings.model_fields)}"
-    field = Settings.model_fields.get(str(problem["loc"][0]))
     words = {"ge": "{:g} or more", "gt": "more than {:g}", "le": "{:g} or less"}
-    limits = [(name, getattr(each, name, None)) for each in (field.metadata if field else []) for name in words]
-    bounds = [words[name].format(limit) for name, limit in limits if isinstance(limit, int | float)]
-    if bounds and {*problem.get("ctx", {})} & {*words}:
+    if {*problem.get("ctx", {})} & {*words}:
+        declared = Settings.model_fields[problem["loc"][0]].metadata
+        limits = {name: getattr(each, name) for each in declared for name in words if hasattr(each, name)}
+        bounds = [words[name].format(limit) for name, limit in (limits or problem["ctx"]).items()]
         return f"expected {' and '.join(bounds)}"
-    return re.sub(
-        r"^(Value error, |Input should be )", lambda match: "" if "error" in match[0] else "expected ", problem["msg"]
-    )
+    plain = {"path_type": "expected a path", "string_pattern_mismatch": "expected letters, digits, `.`, `_` and `-`"}
+    message = re.sub("^Input should be ", "expected ", problem["msg"].removeprefix("Value error, "))
+    return plain.get(problem["type"], message)
 
 
 def _make_error(problems: Sequence[tuple[Key, str, object]], sources: Sequence[SettingSource]) -> SettingError:

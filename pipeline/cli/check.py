@@ -65,7 +65,7 @@ def check(
         gates = [parse_gate(text) for text in fail_on or ()]
         if not with_checksums and not gates:
             raise typer.BadParameter("--no-checksums leaves only gates to judge, and no --fail-on gives one")
-        refuse_lake(junit)
+        refuse_lake(junit, "--junit")
         settings = read_settings(lake=lake)
         root = settings.lake
         record: dict[str, Any] = {"lake": root}

@@ -88,8 +88,8 @@ class Terminal:
     @contextmanager
     def show_training(self, title: str) -> Iterator[Callable[[float, float], None]]:
         """Show one bar, updated by the function it yields with the share done (0 to 1) and the loss."""
-        if not self.verbose:
-            yield lambda _share, _loss: None
+        if not self.verbose or chosen.verbose:
+            yield lambda share, loss: LOG.debug("%s: %.1f %% done, loss %.3f", title, 100 * share, loss)
             return
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn())
         with Progress(*columns, TextColumn("[dim]{task.fields[loss]}"), console=self.err) as progress:

@@ -79,7 +79,7 @@ def _open_file(path: Path) -> logging.Handler:
     from tracklake.pipeline.lake import refuse_lake  # imports Polars, which the help page need not
     from tracklake.schemas.errors import explain_file_errors
 
-    refuse_lake(path)
+    refuse_lake(path, "--log-file")
     with explain_file_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         return logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")

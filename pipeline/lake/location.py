@@ -15,12 +15,20 @@ def find_lake(path: Path) -> Path | None:
     return next(filter(_is_lake, folders), None)
 
 
-def refuse_lake(out: Path | None) -> None:
-    """Refuse an --out inside of any lake, whose files it would replace or be deleted with."""
+def refuse_lake(out: Path | None, option: str = "--out") -> None:
+    """Refuse an output inside of any lake, whose files it would replace or be deleted with.
+
+    Args:
+        out: the place; None: there is none.
+        option: option that names it, for the message.
+
+    Raises:
+        LakeError: it lies in a lake.
+    """
     lake = None if out is None else find_lake(out)
     if lake is not None:
         raise LakeError(
-            f"{out}: lies in the lake {lake}, which holds only its own files. Name another place with --out."
+            f"{out}: lies in the lake {lake}, which holds only its own files. Name another place with {option}."
         )
 
 

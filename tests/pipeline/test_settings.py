@@ -40,7 +40,7 @@ def test_what_is_set_takes_its_place(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"protocol": "mine"}, "setting protocol: expected one of csp, csp-2018"),
+        ({"protocol": "mine"}, "setting protocol: no protocol is called mine; expected one of csp, csp-2018"),
         ({"min_future_s": 5.1}, "expected 5 or less, the horizon of the protocol csp"),
         ({"protocol": "grid-2021", "min_future_s": 2.5}, "expected 2 or less, the horizon of the protocol grid-2021"),
         ({"protocol": "csp-2018", "splits": ["flow-balanced"]}, "expected 'csp-2018' among them"),
@@ -138,6 +138,8 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, monkeypatch):
     assert refused() == "TRACKLAKE_THRESHOLDS: expected JSON, got '{'"
     monkeypatch.setenv("TRACKLAKE_THRESHOLDS", "")
     assert refused(workers=0).startswith("setting workers: expected 1 or more, got 0")
+    assert "thresholds: expected a number or a text, not true or false" in refused(thresholds={"overlap_m": True})
+    assert refused(protocol="cps") == "setting protocol: no protocol is called cps; did you mean csp?"
 
 
 def test_variables_that_are_no_settings_are_named_and_harmless(monkeypatch):

@@ -73,6 +73,7 @@ def test_a_log_in_a_lake_and_one_that_cannot_be_written_are_refused(command, lak
     inside = command.here("config", "--log-file", lake.root / "log")
     assert (inside.code, (lake.root / "log").exists()) == (1, False)
     assert "lies in the lake" in inside.err
+    assert "another place with --log-file" in inside.err
     beyond = command.here("config", "--log-file", tmp_path)
     assert beyond.code == 1
     assert f"{tmp_path}: Is a directory" in beyond.err

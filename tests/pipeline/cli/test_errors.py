@@ -87,13 +87,6 @@ def test_settings_that_cannot_be_read_are_a_usage_error(command, tmp_path, conte
     assert "Traceback" not in done.err
 
 
-def test_a_variable_that_is_no_json_is_a_usage_error(command):
-    done = command.here("validate", TRACKLAKE_THRESHOLDS="3 metres")
-    assert done.code == 2
-    assert "TRACKLAKE_THRESHOLDS: expected JSON, got '3 metres'" in done.err
-    assert "Traceback" not in done.err
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_place_without_rights_is_named(command, lake, tmp_path):
     tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)

@@ -72,7 +72,10 @@ def test_what_is_new_changed_damaged_or_gone_is_said(command, tmp_path):
     write_highd(raw, "02")
     assert command.here("ingest", raw, "--lake", root, "--quiet").code == 0
     assert list_stale(tell(command, root))["validate"] == {"highd/01": "not made yet", "highd/02": "not made yet"}
-    assert command.here("validate", "--lake", root, "--quiet").code == 0
+    log = tmp_path / "log"
+    assert command.here("validate", "--lake", root, "--quiet", "--log-file", log).code == 0
+    steps = [line.split(maxsplit=2)[2] for line in log.read_text().splitlines() if "INFO    validate: " in line]
+    assert (steps[0], {*steps[1:]}) == ("validate: 2 to do", {"validate: 01 done", "validate: 02 done"})
     assert "validate" not in list_stale(tell(command, root))
     lost = load(root).commits["validate/highd/02"].files["vehicle_scores"][0]
     (root / lost.path).write_bytes(b"")
