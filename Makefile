@@ -1,5 +1,6 @@
 # make run     environment, generated sample, the whole pipeline to a report
 # make test    every test
+# make test-lowest  the core's tests with the lowest versions that pyproject.toml admits
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
 # make study   every model under every protocol, three seeds: docs/results.md (hours)
@@ -13,7 +14,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 ARGS ?=
 
-.PHONY: install run test lint bench study docs clean
+.PHONY: install run test test-lowest lint bench study docs clean
 
 install: $(INSTALLED)
 
@@ -23,7 +24,7 @@ $(INSTALLED): pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet torch==2.13.0
-	$(BIN)/python -m pip install --quiet --editable ".[training,sample,distributed,dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[all,dev]"
 	touch $@
 
 run: install
@@ -32,6 +33,19 @@ run: install
 # Bytecode is kept, whatever the environment says: tests start many commands.
 test: install
 	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
+
+# The tests in which versions matter most: files, SQL, validation, charts, the whole pipeline (in the fixture `lake`).
+# Without torch, whose lowest version comes with 5 GB of CUDA: it was tried by hand, see pyproject.toml.
+LOWEST := .venv-lowest
+CORE := tests/test_extras.py tests/schemas tests/quality_reports/rules tests/pipeline/transforms/starts \
+	tests/pipeline/sources/csv/test_table_files.py tests/pipeline/lake/test_macros.py tests/pipeline/cli/test_sql_command.py \
+	tests/pipeline/export tests/training/lane_changes/test_lane_forest.py
+
+test-lowest: install
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
+	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct \
+		--editable ".[flows,report,forest,matlab,sample,dev]"
+	$(LOWEST)/bin/pytest -n 2 --dist loadgroup $(CORE)
 
 # mypy and import-linter read folders, not what an import finds: links give the packages their installed names.
 lint: install
@@ -60,4 +74,4 @@ docs: install
 	$(BIN)/python -m tracklake.quality_reports.gates.markdown > docs/check.md
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv .venv-lowest .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -18,6 +18,7 @@ from tracklake.pipeline.lake.files import MODELS as RUNS
 from tracklake.pipeline.stages.score import finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
+from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
@@ -87,6 +88,7 @@ def lane_forest(
     Made for the protocol grid-2021; it works with any.
     """
     with command(quiet=quiet, json=json) as terminal:
+        require_extras("the lane forest", "forest")
         if use and (seed, examples, augment, settings_given) != (None,) * 4:
             raise typer.BadParameter("--use scores a forest as it is: give no --seed, --examples, --augment or --set")
         wanted = None if use else _read_forest_settings(examples, augment, settings_given or [])

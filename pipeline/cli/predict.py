@@ -14,13 +14,11 @@ from tracklake.pipeline.lake.files import MODELS
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
+from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_output
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.attention import export_attention
 from tracklake.training.plots.picture import Picture, forecast_samples, forecast_scene, take_picture
-from tracklake.training.plots.picture_drawing import draw_picture
-from tracklake.training.plots.picture_rows import list_errors
 from tracklake.training.plots.sample_choice import MOST_SEARCHED, find_sample, pick_samples
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
@@ -94,6 +92,9 @@ def predict(
     """Draw samples on the road: history, neighbors, truth, predictions and their uncertainty."""
     with command(quiet=quiet, json=json) as terminal:
         _check_options(models or [], sample, vehicle, time, pick, part, count, out)
+        require_extras("drawing", "report")
+        from tracklake.training.plots.picture_drawing import draw_picture  # imports Altair
+
         refuse_lake(out)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
@@ -241,6 +242,8 @@ def _name_file(out: Path | None, predictions: Path, picture: Picture, *, all_veh
 
 def _show_errors(terminal: Terminal, picture: Picture, file: Path) -> None:
     """Print where the drawing is, and how far each model is from the truth at its end."""
+    from tracklake.training.plots.picture_rows import list_errors  # imports Altair
+
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
     off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
     seconds = max((row["seconds"] for row in last.values()), default=0.0)
@@ -264,6 +267,8 @@ def _draw_attention(
     folder: TensorFolder, forecasters: list[Forecaster], samples: list[int], target: Path
 ) -> list[Path]:
     """Write the attention maps of every model with attention, in a folder of its name."""
+    from tracklake.training.plots.attention import export_attention  # imports Altair
+
     found = []
     for own in forecasters:
         if own.reads == "scene":

@@ -23,6 +23,7 @@ from tracklake.pipeline.cli.options import (
 )
 from tracklake.pipeline.cli.session import report_result, run_steps
 from tracklake.pipeline.orchestration.run_plan import ALL_STEPS
+from tracklake.schemas.extras import require_extras
 
 
 def run(
@@ -48,6 +49,7 @@ def run(
         settings = read_settings(lake=lake, workers=workers, protocol=protocol, columns=columns, recording=recording)
         check = refuse_mixing if source is None else None
         if source is None:
+            require_extras("the pipeline on a generated sample", "sample", "flows", "report")
             if prune or rebuild:
                 raise typer.BadParameter("--prune and --rebuild need SOURCE, the folder with the raw files")
             source = str(provide_sample(settings.lake, minutes, seed, terminal))

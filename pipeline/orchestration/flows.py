@@ -41,7 +41,8 @@ from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.stage import INGEST
 from tracklake.schemas.columns import Dataset
-from tracklake.schemas.errors import MissingExtraError, TracklakeError
+from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.extras import require_extras
 
 REPORT = "report"
 """Name of the stage whose figures a run shows as artifacts."""
@@ -241,12 +242,9 @@ def _choose_runner(settings: Settings) -> TaskRunner[Any]:
     """Return threads (Polars and DuckDB release the interpreter) or Dask workers (which need a shared disk)."""
     if settings.runner == "threads":
         return ThreadPoolTaskRunner(max_workers=settings.workers)
-    try:
-        from prefect_dask.task_runners import DaskTaskRunner
-    except ImportError:
-        raise MissingExtraError(
-            'the setting runner = "dask" needs Dask: `pip install "tracklake[distributed]"`'
-        ) from None
+    require_extras('the setting runner = "dask"', "distributed")
+    from prefect_dask.task_runners import DaskTaskRunner
+
     if settings.dask_address is not None:
         return DaskTaskRunner(address=settings.dask_address)
     cluster = {"n_workers": settings.workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from tracklake.schemas.errors import MORE_FILES, TracklakeError
+from tracklake.schemas.extras import require_extras
 
 TRIAL_BYTES = 1 << 20
 """Bytes that a disk must still take for Prefect to record a run on it."""
@@ -21,8 +22,10 @@ def import_flows() -> ModuleType:
     Prefect reads its variables, and makes its home, when it is imported.
 
     Raises:
+        MissingExtraError: Prefect is not installed.
         TracklakeError: this process may open too few files at once; the embedded server would wait for ever.
     """
+    require_extras("the pipeline", "flows")
     _provide_descriptors()
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")  # it locks the embedded server's database
     os.environ.setdefault("DO_NOT_TRACK", "1")

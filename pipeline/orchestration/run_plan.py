@@ -24,6 +24,7 @@ from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, Stage
 from tracklake.schemas.errors import UsageError
+from tracklake.schemas.extras import require_extras
 
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
 """Every step of `tracklake run`, in order."""
@@ -71,11 +72,13 @@ class RunRequest:
         return Settings(**{**self.settings, "lake": self.lake})
 
     def check(self) -> None:
-        """Refuse paths that would only fail in a later stage.
+        """Refuse paths and missing packages that would only fail in a later stage.
 
         Raises:
+            MissingExtraError: Prefect is not installed, or what draws the requested report is not.
             UsageError: the path of the lake or the source is no UTF-8 text.
         """
+        require_extras("the pipeline", "flows", *(("report",) if "report" in self.steps else ()))
         for name, path in (("lake", self.root), ("SOURCE", self.origin)):
             full = str(path.resolve())
             if any(0xD800 <= ord(character) <= 0xDFFF for character in full):

@@ -9,9 +9,6 @@ from typing import Any, Self
 from zipfile import ZIP_DEFLATED
 
 import numpy as np
-import skops.io
-from sklearn.ensemble import RandomForestClassifier
-from sklearn.exceptions import InconsistentVersionWarning
 
 from tracklake.schemas.arrays import Bytes, Floats, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
@@ -55,7 +52,7 @@ class LaneForest:
     the features `names` in their order. `facts` are plain values that describe the fit.
     """
 
-    classifier: RandomForestClassifier
+    classifier: Any  # scikit-learn's RandomForestClassifier, whose import takes a second
     names: tuple[str, ...]
     rate_hz: int
     horizons_s: tuple[float, ...]
@@ -86,6 +83,8 @@ class LaneForest:
 
     def save(self, file: Path) -> None:
         """Write the forest to a file, whole or not at all."""
+        import skops.io
+
         names = {"version": VERSION, "features": self.names}
         header = names | {"rate_hz": self.rate_hz, "horizons_s": self.horizons_s, "facts": self.facts}
         content = {"header": json.dumps(header, allow_nan=False), "classifier": self.classifier}
@@ -96,14 +95,15 @@ class LaneForest:
         """Read a forest that `save` wrote; nothing in the file is executed.
 
         Raises:
-            ForestError: no such file; it is damaged, of another kind or version, holds types that are not trusted or
-                nodes that do not make trees, or lacks facts.
+            ForestError: no such file; it is damaged, of another version, holds untrusted types, no trees or no facts.
         """
         if not file.is_file():
             raise ForestError(f"{file}: no such file{AGAIN}")
+        import skops.io
+        from sklearn.exceptions import InconsistentVersionWarning
+
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", InconsistentVersionWarning)  # trees of another scikit-learn
+            with warnings.catch_warnings(action="error", category=InconsistentVersionWarning):  # of the trees' library
                 content = skops.io.loads(file.read_bytes(), trusted=list(TRUSTED))
             header, classifier = parse_json(content["header"]), content["classifier"]
         except Exception as broken:
@@ -158,8 +158,7 @@ def fit_examples(
 ) -> LaneForest:
     """Augment examples, choose features, and fit the trees; `facts` are plain values to keep beside the fit's own.
 
-    Each tree is fitted on the maneuver and on the lanes at all horizons together, so that a leaf knows both the
-    maneuver under way and how far it will have come at each horizon.
+    Each tree is fitted on the maneuver and on the lanes at all horizons together, so that its leaves know both.
 
     Raises:
         TracklakeError: no feature correlates enough with the maneuver.
@@ -173,6 +172,8 @@ def fit_examples(
             f"no feature correlates with the maneuver by {least:g} or more (the best, {table[0].feature}, by "
             f"{table[0].strength:.3f}): set `least_correlation` lower"
         )
+    from sklearn.ensemble import RandomForestClassifier
+
     trees, leaf = settings.trees, settings.leaf
     classifier = RandomForestClassifier(n_estimators=trees, min_samples_leaf=leaf, random_state=seed, n_jobs=1)
     given = augmented.feature[:, [FEATURE_NUMBER[name] for name in names]]
@@ -213,6 +214,8 @@ def _check_header(header: Any) -> None:  # noqa: ANN401  (whatever JSON a file h
 
 def _check_classifier(forest: LaneForest) -> None:
     """Raise a ValueError where nodes do not make trees: a prediction would leave the arrays, or never end."""
+    from sklearn.ensemble import RandomForestClassifier
+
     classifier, features, outputs = forest.classifier, len(forest.names), 1 + len(forest.horizons_s)
     if type(classifier) is not RandomForestClassifier:
         raise ValueError(f"expected a RandomForestClassifier, got {type(classifier).__name__}")

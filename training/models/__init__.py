@@ -3,13 +3,13 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import accumulate
 from typing import Any, Literal
 from typing import Protocol as Interface
 
 from tracklake.schemas import references
-from tracklake.schemas.errors import MissingExtraError, UsageError
+from tracklake.schemas.errors import UsageError
+from tracklake.schemas.extras import require_extras
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.models.prediction import Prediction
 
@@ -219,7 +219,4 @@ def find_model(name: str) -> Model:
 
 def require_torch(model: str) -> None:
     """Raise MissingExtraError, with the command that installs torch, where torch is missing."""
-    if find_spec("torch") is None:
-        raise MissingExtraError(
-            f'the model `{model}` needs torch, which is not installed: pip install "tracklake[training]"'
-        )
+    require_extras(f"the model `{model}`", "training")

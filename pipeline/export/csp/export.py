@@ -32,6 +32,7 @@ from tracklake.pipeline.transforms.csp.subset import (
 )
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.extras import require_extras
 from tracklake.schemas.protocols import LAST_LANES
 
 FILES = ("TrainSet.mat", "ValSet.mat", "TestSet.mat")
@@ -49,10 +50,12 @@ def export_csp(settings: Settings, out: Path, options: CspOptions, *, force: boo
     """Write the three .mat files of a lake's freeway subsets and a card that describes them.
 
     Raises:
+        MissingExtraError: SciPy is not installed.
         LakeMissingError: the lake does not exist.
         ExportError: nothing can be exported, or not to this folder, or it is too large for the format.
         StageError: --clean needs a stage that has not run.
     """
+    require_extras("the export of .mat files", "matlab")
     root = settings.lake
     manifest = load(root)
     refuse_taken(out, (*FILES, CARD), force=force)

@@ -10,6 +10,8 @@ import polars as pl
 import pyarrow as pa
 
 from tracklake.pipeline.sources.source import SourceError
+from tracklake.schemas.errors import MissingExtraError
+from tracklake.schemas.extras import require_extras
 
 BLOCK_ROWS = 1 << 16
 """Rows converted at once."""
@@ -35,6 +37,7 @@ def read_as_csv(handle: BinaryIO, head: bytes, name: str) -> Iterator[bytes]:
 
     Raises:
         NoTableError: the file is damaged or holds no such table.
+        SourceError: SciPy, which reads MATLAB files, is not installed.
     """
     try:
         if head.startswith(MATLAB):
@@ -66,6 +69,10 @@ def _read_batches(handle: BinaryIO, head: bytes) -> Iterator[pl.DataFrame]:
 
 
 def _read_matrix(handle: BinaryIO, name: str) -> Iterator[bytes]:
+    try:
+        require_extras(name, "matlab")
+    except MissingExtraError as missing:
+        raise SourceError(str(missing)) from None
     from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError
 

@@ -196,14 +196,14 @@ def fit_frames(speed_mps: Floats, frames: Floats) -> dict[str, Any]:
             "slope_frames_per_mps": 0.0,
             "r2": 0.0 if frames_vary else None,
         }
-    from sklearn.linear_model import LinearRegression  # slow to import
-
-    speeds = speed_mps[:, np.newaxis]
-    line = LinearRegression().fit(speeds, frames)
+    centred = frames - frames.mean()
+    slope = np.linalg.lstsq((speed_mps - speed_mps.mean())[:, np.newaxis], centred)[0][0]
+    intercept = frames.mean() - slope * speed_mps.mean()
+    residuals = frames - (intercept + slope * speed_mps)
     return {
-        "intercept_frames": float(line.intercept_),
-        "slope_frames_per_mps": float(line.coef_[0]),
-        "r2": float(line.score(speeds, frames)),
+        "intercept_frames": float(intercept),
+        "slope_frames_per_mps": float(slope),
+        "r2": float(1 - np.sum(residuals**2) / np.sum(centred**2)),
     }
 
 

@@ -317,4 +317,6 @@ def test_constant_velocity_needs_no_torch_and_lstm_says_what_to_install(tmp_path
     )
     samples, message = done.stdout.splitlines()
     assert int(samples) == tables[1][2].height
-    assert message == 'the model `lstm` needs torch, which is not installed: pip install "tracklake[training]"'
+    assert message == (
+        'the model `lstm` needs the extra [training] (not installed: torch): pip install "tracklake[training]"'
+    )

@@ -12,6 +12,7 @@ from scipy.io import savemat
 
 from tracklake.pipeline.ingest.discovery import discover
 from tracklake.pipeline.sources.csv import NoTableError
+from tracklake.schemas import extras
 
 ROWS = [ngsim_row(7, f, Preceding=3, v_Acc="1.5", Local_X="27.126", Space_Headway="50.25") for f in range(1, 6)]
 PLAIN = as_csv(ROWS, TEXT_NAMES)
@@ -87,3 +88,16 @@ def test_tables_in_a_folder_and_in_an_archive(tmp_path):
     assert (found.skipped, found.refusals) == (("TrainSet.mat", "other.parquet"), ())
     alone = discover(folder / "TrainSet.mat", digest=lambda file: file.name)
     assert "got traj 5 x 47" in alone.refusals[0]
+
+
+def test_without_scipy_a_matlab_file_is_refused_and_the_others_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    write(tmp_path / "raw" / "good.parquet", TABLES["parquet"])
+    write(tmp_path / "raw" / "trajectories.mat", TABLES["matlab"])
+    found = discover(tmp_path / "raw", digest=lambda file: file.name)
+    assert [file.name for file in found.recognised] == ["good.parquet"]
+    assert found.skipped == ()
+    (refusal,) = found.refusals
+    assert (
+        refusal == 'trajectories.mat needs the extra [matlab] (not installed: scipy): pip install "tracklake[matlab]"'
+    )

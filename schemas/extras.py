@@ -1,0 +1,36 @@
+"""Extras of the distribution: packages that only some commands need, and the message where they are missing."""
+
+from importlib.util import find_spec
+
+from tracklake.schemas.errors import MissingExtraError
+
+EXTRAS = {
+    "flows": ("prefect",),
+    "report": ("altair", "vl_convert"),
+    "training": ("torch",),
+    "forest": ("sklearn", "skops"),
+    "matlab": ("scipy",),
+    "sample": ("sumo",),
+    "distributed": ("prefect_dask",),
+}
+"""Modules that each extra installs, by the extra's name in pyproject.toml."""
+
+
+def require_extras(what: str, *extras: str) -> None:
+    """Refuse work whose packages are not installed.
+
+    Args:
+        what: subject of the message, for instance a command.
+        extras: names of EXTRAS.
+
+    Raises:
+        MissingExtraError: naming what is missing and the command that installs it.
+    """
+    missing = {extra: [name for name in EXTRAS[extra] if find_spec(name) is None] for extra in extras}
+    missing = {extra: names for extra, names in missing.items() if names}
+    if missing:
+        packages = ", ".join(name for names in missing.values() for name in names)
+        raise MissingExtraError(
+            f"{what} needs the extra{'s' * (len(missing) > 1)} {' and '.join(f'[{extra}]' for extra in missing)} "
+            f'(not installed: {packages}): pip install "tracklake[{",".join(missing)}]"'
+        )
