@@ -121,7 +121,7 @@ def save(folder: Path, number: int, entries: int) -> None:
     each = round(ROAD_M / SPEED_MPS * RATE_HZ)
     vehicles = max(LANES, round(entries / each))
     ids = np.arange(vehicles)
-    # Vehicles of a lane enter one after the other, 19 m apart in the mean, and keep 6 m and more where nobody changes.
+    # Vehicles of a lane enter one after the other, 19 m apart in the mean, and keep 6 m and more without lane changes.
     headway = each * LANES / VEHICLES_A_FRAME
     entered = (ids // LANES + random.uniform(-0.34, 0.34, vehicles)) * headway + headway
     first_frame = 1 + entered.astype(np.int64)

@@ -47,7 +47,7 @@ class Reference:
         return track[np.where(track[:, 0] == tick)[0][0], 1:]
 
     def history(self, run: int, tick: int, origin: np.ndarray) -> np.ndarray:
-        """Positions up to a tick, as many as there are; none where nobody is."""
+        """Positions up to a tick, as many as there are; none where there is no vehicle."""
         if run < 0:
             return np.empty((0, 2))
         track = self.tracks[run]

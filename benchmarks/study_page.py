@@ -174,7 +174,7 @@ def describe_source(arm: Arm) -> str:
         split = arm.environment.get("TRACKLAKE_SPLIT", PROTOCOLS[arm.protocol].split)
         return f"Generated traffic, split `{split}`."
     return (
-        "The public excerpt of US-101: 290 of its 2,169 vehicles, so that nobody's neighbors are known, split by "
+        "The public excerpt of US-101: 290 of its 2,169 vehicles, so that no vehicle's neighbors are known, split by "
         "blocks of time. It has no lanes; samples need some, and were given lanes of 12 ft from `Local_X`. Lateral "
         "maneuvers are only as good as these."
     )

@@ -30,7 +30,7 @@ LOOP, MODULE = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 def workplace(tmp_path, monkeypatch):
     """A folder to run tracklake in, with the page's module; what is imported from there is forgotten afterwards."""
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that is changed within a second is read anew
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that is changed within a second is read again
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mymodule.py").write_text(MODULE)
     known = set(sys.modules)

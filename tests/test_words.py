@@ -1,4 +1,4 @@
-"""Docstrings say what they are about: no fragments, no first lines of fewer than four words."""
+"""Words: docstrings stand by themselves, riddles have no place, and each silenced check has its reason beside it."""
 
 import ast
 import re
@@ -9,6 +9,10 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("src", "schemas", "pipeline", "quality_reports", "training")
 FRAGMENT = re.compile(r"(Of|As|And|By|To|With|Which|What it|Nothing|That|From|Because|But|Or|So)\b")
 """First words of a fragment, which goes on with a sentence that stands elsewhere."""
+TEXTS = {".py", ".md", ".j2", ".sql", ".js", ".toml"}
+UNWANTED = re.compile(r"\b(nobody|told|odds|(?<!--)anew|whoever|in vain|passed over)\b", re.IGNORECASE)
+"""Words for which the field has plainer ones; `--anew` is an option."""
+SILENCED = re.compile(r"# (?:noqa(?:: [A-Z0-9, ]+)?|type: ignore(?:\[[\w-]+\])?) *(.*)")
 
 
 def list_docstrings(source: str) -> Iterator[tuple[int, str]]:
@@ -74,3 +78,35 @@ def test_every_docstring_stands_by_itself():
     assert len(files) > 200
     faults = [f"{file.relative_to(ROOT)}:{fault}" for file in files for fault in find_faults(file.read_text())]
     assert faults == []
+
+
+def list_texts() -> Iterator[Path]:
+    """Code, pages and queries but this file; the changelog quotes former names."""
+    for folder in (*FOLDERS, "tests", "benchmarks", "docs"):
+        files = sorted((ROOT / folder).rglob("*"))
+        yield from (file for file in files if file.suffix in TEXTS and file != Path(__file__))
+    yield from (ROOT / name for name in ("README.md", "CONTRIBUTING.md", "pyproject.toml"))
+
+
+def test_no_unwanted_word_is_used():
+    assert UNWANTED.search("Nobody drives there.")
+    assert not UNWANTED.search("start over with `--anew`")
+    found = [
+        f"{file.relative_to(ROOT)}:{number}: {hit.group()}"
+        for file in list_texts()
+        for number, line in enumerate(file.read_text().splitlines(), start=1)
+        for hit in UNWANTED.finditer(line)
+    ]
+    assert found == []
+
+
+def test_every_silenced_check_has_its_reason_beside_it():
+    silenced = [
+        (f"{file.relative_to(ROOT)}:{number}", match.group(1))
+        for file in list_texts()
+        if file.suffix == ".py"
+        for number, line in enumerate(file.read_text().splitlines(), start=1)
+        if (match := SILENCED.search(line))
+    ]
+    assert len(silenced) > 20
+    assert [where for where, reason in silenced if len(reason.split()) < 2] == []

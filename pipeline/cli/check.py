@@ -115,7 +115,7 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
 
 
 def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), copies: Sequence[str] = ()) -> bool:
-    """Record what is damaged, and end the session anew without some copies; returns whether it came to its end."""
+    """Record what is damaged, and repeat the end of the session without some copies; returns whether it succeeded."""
     is_marked = False
     try:
         with open_for_writing(root) as writer:
@@ -124,7 +124,7 @@ def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), c
             writer.mark_damaged({file.key for file in damaged})
             is_marked = bool(damaged)
     except LakeError as error:
-        if not is_marked:  # else the catalog cannot be made of damaged files, which is told anyway
+        if not is_marked:  # else the catalog cannot be made of damaged files, which is reported anyway
             terminal.print_problem(str(error), label="note")
         return False
     return True

@@ -48,7 +48,7 @@ def show_manifest(root: Path, manifest: Manifest) -> None:
     remove_files(root, (root / name for name in list_files(root, _list_folders(root)) - names.keys()))
     for folder, _, files in (found for top in _list_folders(root) for found in os.walk(root / top, topdown=False)):
         if not files and not os.listdir(folder):  # noqa: PTH208  (for thousands of folders, a path each is slow)
-            os.rmdir(folder)  # noqa: PTH106
+            os.rmdir(folder)  # noqa: PTH106  (as above)
 
 
 def is_shown(root: Path, manifest: Manifest) -> bool:

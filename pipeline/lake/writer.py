@@ -126,7 +126,7 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
 
 
 def follow_move(root: Path) -> None:
-    """Make the catalog of a lake that was moved or copied again, where it can be written and nobody does."""
+    """Make the catalog of a lake that was moved or copied again, unless another process writes to it."""
     if os.access(root, os.W_OK) and session_end.has_moved(root):
         with suppress(TracklakeError, OSError):
             refuse_if_busy(root)

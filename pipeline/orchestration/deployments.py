@@ -23,8 +23,7 @@ ONE_AT_A_TIME = ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLi
 def serve_deployments(lake: Path, source: Path | None, cron: str | None, interval_s: float | None) -> None:
     """Serve the flows as deployments until interrupted; runs are started from Prefect's UI, CLI or a schedule.
 
-    Runs work on this lake and source unless told otherwise; by cron, or at an interval in seconds, the whole pipeline
-    runs.
+    Lake and source are defaults of the runs; by cron, or at an interval in seconds, the whole pipeline runs.
 
     Raises:
         UsageError: the cron expression cannot be read.

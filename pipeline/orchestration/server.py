@@ -150,7 +150,7 @@ def _embed_server() -> str:
     app: Any = create_app(ephemeral=True)
 
     async def record_failure(scope: Any, receive: Any, send: Any) -> None:  # noqa: ANN401  (ASGI's own dicts)
-        async def watch(message: Any) -> None:  # noqa: ANN401
+        async def watch(message: Any) -> None:  # noqa: ANN401  (a dict of ASGI)
             if message["type"].endswith(".failed"):
                 failures.append(message.get("message", ""))
             await send(message)

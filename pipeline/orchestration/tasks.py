@@ -224,14 +224,14 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
 def _await_writer(stack: ExitStack, request: RunRequest, timeout_s: float) -> Writer:
     """Open the lake for writing, as soon as no other process writes to it."""
     limit = time.monotonic() + timeout_s
-    told = False
+    is_reported = False
     while True:
         try:
             return stack.enter_context(open_for_writing(request.root, rebuild=request.rebuild))
         except LakeLockedError as busy:
             if time.monotonic() >= limit:
                 raise
-            if not told:
+            if not is_reported:
                 get_run_logger().info("%s This run waits up to %g s for it.", busy, timeout_s)
-                told = True
+                is_reported = True
             time.sleep(LOCK_POLL_S)

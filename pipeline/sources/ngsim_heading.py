@@ -1,4 +1,4 @@
-"""The fields of an NGSIM file, told by its first lines or by the user's mapping."""
+"""Fields of an NGSIM file, found in its first lines or in the user's mapping."""
 
 import csv
 import re

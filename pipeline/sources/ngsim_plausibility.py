@@ -87,7 +87,7 @@ def measure(rows: pl.DataFrame, rate_hz: float) -> Figures:
         step=(pl.col("Global_Time") - pl.col("time_before")) / (pl.col("Frame_ID") - pl.col("frame_before"))
     )["step"].cast(pl.Float64)
     usual = step.median() if step.len() >= FEWEST else None
-    # Recordings of one file share ids, and are told apart by their times.
+    # Recordings of one file share ids, and differ in their times.
     key = [*(["key"] if usual == FRAME_MS else []), "Vehicle_ID"]
     keyed = rows.with_columns(key=pl.col("Global_Time").cast(pl.Int64) - FRAME_MS * pl.col("Frame_ID").cast(pl.Int64))
     pairs = _pair_frames(keyed, key)

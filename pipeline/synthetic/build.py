@@ -34,7 +34,7 @@ TRUTH_FILE = "truth.parquet"
 README_FILE = "README.md"
 README = """# A generated sample
 
-These files have the raw formats of highD and NGSIM, but nobody drove there: SUMO simulated the traffic, and tracking
+These files have the raw formats of highD and NGSIM, but were not recorded: SUMO simulated the traffic, and tracking
 noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes).
 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from tracklake.schemas.arrays import Bytes, Floats
 
 VIRIDIS = ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b")
-"""Ten equal steps of matplotlib's viridis less the last: perceptually uniform, told apart by colour-blind readers, and
+"""Ten equal steps of matplotlib's viridis less the last: perceptually uniform, distinct for colour-blind readers, and
 in order of lightness on any printer. The last yellow is left out because it is hardly visible on white."""
 EMPTY = 0
 """Palette entry of cells without a value, which is transparent."""

@@ -57,9 +57,9 @@ def draw_verdicts(verdicts: Sequence[Mapping[str, Any]], pages: Mapping[tuple[st
 def _draw_mark(row: Mapping[str, Any], x: float, y: float, page: str | None) -> str:
     """Return the mark of a subset with its name as a tooltip, and a link where it has a page."""
     colour, share = COLOURS[row["verdict"]], row["error_share"]
-    told = "not checked" if share is None else f"{share:.2%} of the entries with an error"
+    errors = "not checked" if share is None else f"{share:.2%} of the entries with an error"
     path = f'd="M{x:.1f} {y:.1f}{SHAPES.get(row["verdict"], SHAPES[GOOD])}"'
     filled = f'fill="{colour}"' if row["verdict"] in SHAPES else f'fill="none" stroke="{colour}"'
-    title = html.escape(f"{row['subset']}: {row['verdict']}, {told}")
+    title = html.escape(f"{row['subset']}: {row['verdict']}, {errors}")
     mark = f"<path {path} {filled}><title>{title}</title></path>"
     return f'<a href="{html.escape(page)}" aria-label="{title}">{mark}</a>' if page else mark

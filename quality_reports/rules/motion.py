@@ -136,7 +136,7 @@ JERK_FLICKER = Rule(
     unit="changes",
     thresholds=(Threshold("jerk_flicker_changes", 1.0, "changes"),),
     meaning="of the ten jerks, 0.1 s apart, of the second that ends at the entry, the sign changes more often than the "
-    "threshold. A jerk of zero has no sign and is passed over: +, 0, - is one change, +, 0, + none. Behind a track's "
+    "threshold. A jerk of zero has no sign and is skipped: +, 0, - is one change, +, 0, + none. Behind a track's "
     "beginning or a frame gap the second is as long as there are entries",
     source=f"{DESIGN}; drivers reverse jerk at most once in a second: {PUNZO}",
     breaks=lambda limits: pl.col("jerk_reversals") > limits["jerk_flicker_changes"],

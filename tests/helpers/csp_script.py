@@ -25,7 +25,7 @@ def run_script(recordings, folded=()):
 
     Returns:
         {part: (traj rows of 47 singles each, {(data set id, vehicle): (3, T) singles})}, and how many vehicles of under
-        31 frames were passed over, on which the script itself stops.
+        31 frames were skipped, on which the script itself stops.
     """
     parts = {part: ([], {}) for part in PARTS}
     stopped_on = 0

@@ -78,8 +78,8 @@ def decode(weights, given, steps):
 
 def recognise(weights, encoding, head):
     """Probabilities of the maneuvers of one kind."""
-    odds = np.exp(weights[f"{head}.weight"] @ encoding + weights[f"{head}.bias"])
-    return odds / odds.sum()
+    powers = np.exp(weights[f"{head}.weight"] @ encoding + weights[f"{head}.bias"])
+    return powers / powers.sum()
 
 
 def with_maneuver(encoding, lateral, longitudinal):

@@ -17,23 +17,23 @@ def perceptron(weights, name, row):
 
 def attend(weights, name, heads, width, queries, keys):
     """Rows after attention, residual and normalisation, and the weights [head][query][key]."""
-    out, looks = [], [[] for _ in range(heads)]
+    out, maps = [], [[] for _ in range(heads)]
     for row in queries:
         joined = []
         for head in range(heads):
             cut = slice(head * width, (head + 1) * width)
             query = linear(weights, f"{name}.query", row)[cut]
             scores = [query @ linear(weights, f"{name}.key", key)[cut] / math.sqrt(width) for key in keys]
-            odds = [math.exp(score - max(scores)) for score in scores]
-            odds = [each / sum(odds) for each in odds]
-            looks[head].append(odds)
+            powers = [math.exp(score - max(scores)) for score in scores]
+            attention = [each / sum(powers) for each in powers]
+            maps[head].append(attention)
             values = [linear(weights, f"{name}.value", key)[cut] for key in keys]
-            joined.extend(sum((share * value for share, value in zip(odds, values, strict=True)), np.zeros(width)))
+            joined.extend(sum((share * value for share, value in zip(attention, values, strict=True)), np.zeros(width)))
         found = linear(weights, f"{name}.back", np.array(joined)) if keys else 0
         summed = row + found
         scaled = (summed - summed.mean()) / math.sqrt(summed.var() + 1e-6)
         out.append(scaled * weights[f"{name}.norm.weight"] + weights[f"{name}.norm.bias"])
-    return out, looks
+    return out, maps
 
 
 def find_velocity(history, known, ticks):

@@ -94,7 +94,7 @@ def test_the_first_screen_answers_and_every_figure_leads_on(report):
     assert "2 of 2 subsets are not usable" in first
     # A mark for every subset leads to its page.
     marks = re.findall(r'<a href="subsets/([^"]+)" aria-label="([^"]+)">', first)
-    assert [(page, told.split(",")[0]) for page, told in marks] == [
+    assert [(page, title.split(",")[0]) for page, title in marks] == [
         ("01-lower.html", "01-lower: not usable"),
         ("01-upper.html", "01-upper: not usable"),
         ("peachtree-north.html", "peachtree-north: not usable"),

@@ -4,7 +4,7 @@
 -- frame: the source's frame number
 -- x: of the point in metres, along the direction of travel, as x_m
 -- y: of the point in metres, to the driver's right, as y_m
--- radius: in metres; a vehicle exactly that far away is within it; nobody is within a negative one
+-- radius: in metres; a vehicle exactly that far away is within it; a negative one finds none
 --
 -- dataset, subset, frame, time_s, vehicle_id
 -- distance_m: from the point to the vehicle's front centre

@@ -157,9 +157,9 @@ def test_what_the_options_change_is_not_written_into_the_lake(command, lake, opt
 
 
 def test_what_is_not_there_is_named_with_what_is(command, lake):
-    nobody = command.here("evaluate", "nobody", "--lake", lake.root)
-    assert nobody.code == 1
-    assert "no run or model `nobody`: expected one of the runs constant-velocity" in nobody.err
+    unknown = command.here("evaluate", "unknown", "--lake", lake.root)
+    assert unknown.code == 1
+    assert "no run or model `unknown`: expected one of the runs constant-velocity" in unknown.err
     other = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--protocol", "grid-2021")
     assert other.code == 1
     reported = r"another protocol than grid-2021 \(\w{12}\) as it is set now: by csp \(\w{12}\)\. Run `tracklake run`"

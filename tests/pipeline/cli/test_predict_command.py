@@ -109,7 +109,7 @@ def test_without_names_the_newest_runs_that_fit_are_drawn(predict, tensors, tmp_
         (["--sample", 0, "--count", 2], 2, "--count goes with --pick"),
         (["--count", 2, "--out", "one.png"], 2, "--out is a folder where --count is more than 1"),
         (["--out", "one.pdf"], 2, "--out ends in .svg or .png, or is a folder; got one.pdf"),
-        (["nobody"], 1, "no run or model `nobody`: expected one of the runs (none yet)"),
+        (["unknown"], 1, "no run or model `unknown`: expected one of the runs (none yet)"),
         (["lstm"], 1, "no trained run; run `tracklake train lstm` first"),
         (["a", "b", "c", "d", "e"], 2, "a drawing holds 4 models at most"),
         (["--sample", 0, "--attention"], 2, "--attention needs a run of a model with attention"),

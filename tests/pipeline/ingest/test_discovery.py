@@ -182,7 +182,7 @@ def test_a_damaged_memory_of_digests_is_forgotten(tmp_path, remembered):
 
 @pytest.fixture
 def closed(tmp_path, monkeypatch):
-    """A folder that nobody, not even root, may list, and in which nothing can be looked at."""
+    """A folder that no user, not even root, may list, and in which nothing can be looked at."""
     write(tmp_path / "closed" / "b.csv", as_csv(ROWS[:2]))
     real_scan, real_lstat = os.scandir, os.lstat
 

@@ -258,7 +258,7 @@ def test_directions_of_an_arterial(tmp_path):
 def test_an_id_that_stands_for_two_vehicles_is_split(tmp_path):
     """Vehicle 5 is a car that announces 100 frames and a truck that announces 40; both are there in frame 2.
 
-    The truck's row of frame 4 is missing, and nobody of that id is left in frame 6.
+    The truck's row of frame 4 is missing, and no vehicle of that id is left in frame 6.
     """
     truck = {"Total_Frames": 40, "v_length": 40, "v_Class": 3, "Lane_ID": 3}
     rows = [

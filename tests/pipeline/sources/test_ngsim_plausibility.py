@@ -1,4 +1,4 @@
-"""Units and times that a file does not state are told by its rows, or the file is refused."""
+"""Units and times that a file does not state are found in its rows, or the file is refused."""
 
 import pytest
 from polars.testing import assert_frame_equal

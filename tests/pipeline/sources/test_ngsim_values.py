@@ -10,7 +10,7 @@ from tracklake.quality_reports.rules.registry import RULES
     ("key", "origin"),
     [
         (1118853000042 - 100, "synthetic"),
-        (1118853000042 - 100 + 100 * 77, "synthetic"),  # frames numbered anew
+        (1118853000042 - 100 + 100 * 77, "synthetic"),  # frames numbered again
         (1118853000000 - 100, "recorded"),
         (1118853000043 - 100, "recorded"),
         (1118846978900, "recorded"),

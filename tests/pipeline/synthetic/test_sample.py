@@ -134,7 +134,7 @@ def test_rules_find_exactly_the_injected_defects(truth):
         assert rule not in names or entries == counts.get((subset, names[rule]), 0), (subset, rule)
     misread = {"wrong_leader", "wrong_headway", "lane_flicker", "position_jump"}
     assert {name for _, name in counts} == {*names.values(), *misread, "late_start", "frame_gap", "overlap_unseen"}
-    # Whoever leads a vehicle that is recorded in a lane not its own has, by the files, lost its follower; a headway is
+    # The leader of a vehicle that is recorded in another lane has, by the files, lost its follower; a headway is
     # also wrong where somebody has jumped. Nothing less than what was injected is found.
     rules = {"wrong_headway": "headway_mismatch", "lane_flicker": "lane_flicker"}
     for (subset, name), entries in counts.items():

@@ -268,11 +268,11 @@ def test_numbers_that_are_none_are_refused(tmp_path):
 
 def test_a_folder_whose_scenes_lack_samples_is_refused(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
-    nobody = replace(folder, arrays={**folder.arrays, "scene_sample": np.full_like(folder.scene_sample, -1)})
+    empty = replace(folder, arrays={**folder.arrays, "scene_sample": np.full_like(folder.scene_sample, -1)})
     with pytest.raises(
         TensorError, match=r"`scene_sample`: expected each of [0-9]+ samples in one scene, got 0 vehicles"
     ):
-        gather_nearest(nobody, [0], nearest=2)
+        gather_nearest(empty, [0], nearest=2)
 
 
 def test_a_protocol_of_another_clock_gives_its_own_shapes(tmp_path):

@@ -85,8 +85,8 @@ class HoldsTheTruth(Still):
 class LooksUpTheManeuver(Still):
     def predict(self, observed):
         _, numbers = self.recognise(observed)
-        odds = np.eye(3)[self.folder.sample_lateral[numbers]]
-        return replace(super().predict(observed), lateral=odds)
+        probability = np.eye(3)[self.folder.sample_lateral[numbers]]
+        return replace(super().predict(observed), lateral=probability)
 
 
 class IsSureWhereItBrakes(Still):

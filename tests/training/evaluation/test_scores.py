@@ -226,8 +226,8 @@ def test_the_mean_on_the_way_and_at_the_end_by_hand():
 def test_always_saying_the_commonest_maneuver():
     case = plain([[0.0]] * 4)
     case.lateral = np.array([0, 1, 1, 2])
-    odds = np.array([[0.6, 0.4, 0.0], [0.6, 0.4, 0.0], [0.1, 0.8, 0.1], [0.0, 0.0, 1.0]])
-    case.said = Prediction(case.said.position_m, lateral=odds)
+    probability = np.array([[0.6, 0.4, 0.0], [0.6, 0.4, 0.0], [0.1, 0.8, 0.1], [0.0, 0.0, 1.0]])
+    case.said = Prediction(case.said.position_m, lateral=probability)
     found = tally(case)
     everything, left = found["all", "all", "samples", 2.0], found["all", "lateral=left", "samples", 2.0]
     assert (everything.lateral_accuracy, everything.majority_lateral_share) == (0.75, 0.5)

@@ -79,8 +79,8 @@ def test_the_target_alone():
         "left_lane": 0,
         "right_lane": 1,
     }
-    nobody = dict.fromkeys(FEATURE_NAMES[FEATURE_NUMBER["ego"] :], 0)
-    assert found == pytest.approx(expected | nobody, abs=2e-3, rel=1e-3)
+    others = dict.fromkeys(FEATURE_NAMES[FEATURE_NUMBER["ego"] :], 0)
+    assert found == pytest.approx(expected | others, abs=2e-3, rel=1e-3)
 
 
 def test_target_and_the_vehicle_behind():
@@ -233,7 +233,7 @@ def test_a_shift_moves_the_ego_alone_and_leaves_it_behind():
     features[:, ego] = [1, 1, 1, 0]
     features[:, gap] = [30, 30, 4, 0]
     shifted = shift_targets(features, np.array([5.0, -5.0, -5.0, 5.0], np.float32))
-    assert shifted[:, gap].tolist() == [35, 25, 2, 0], "no nearer than half of 4 m; and nobody is not moved"
+    assert shifted[:, gap].tolist() == [35, 25, 2, 0], "no nearer than half of 4 m; and a missing one is not moved"
     others = [number for number in range(len(FEATURES)) if number != gap]
     np.testing.assert_array_equal(shifted[:, others], features[:, others])
 

@@ -104,7 +104,7 @@ def test_scores_by_hand(one_change):
     The forest says own, right, right: of the leader 4, 2 and 3 are so, of the follower 5, 0 and 0.
 
     Along the road everybody keeps his speed, so that the true row is the middle one. The leader is at 10, 20 and 40 m,
-    in rows of 2 m (20 less 18 m/s); the follower at 9, 18 and 36 m, in rows of 1 m, for nobody is behind him.
+    in rows of 2 m (20 less 18 m/s); the follower at 9, 18 and 36 m, in rows of 1 m, for it has no follower.
     """
     predictors = {"straight": ConstantVelocity(SHORT), "short": Says([9.2, 17.2, 27, 36], 0.0)}
     scores = evaluate_grid(one_change, predictors, constant_forest("r", "k", "r", "r"))
@@ -132,8 +132,8 @@ def test_scores_by_hand(one_change):
     assert everyone.recall == {"keep": 0.0, "left": None, "right": 1.0}
     counts = dict(zip(("all", *STRATA), (10, 5, 5, 0, 0), strict=True))
     assert {row.stratum: row.n for row in scores.maneuvers} == counts
-    nobody = by_key(scores, model="straight", column="place", seconds=2.0, stratum="decelerating, changing")
-    assert (nobody.n, nobody.cell, nobody.majority) == (0, None, None)
+    empty = by_key(scores, model="straight", column="place", seconds=2.0, stratum="decelerating, changing")
+    assert (empty.n, empty.cell, empty.majority) == (0, None, None)
     json.dumps(asdict(scores), allow_nan=False)
 
 

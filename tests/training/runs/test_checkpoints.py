@@ -50,7 +50,7 @@ def _ctrl_c():
 
 
 def stop_after(steps, error=KeyboardInterrupt):
-    """Told of every step, raises at the end of one."""
+    """Progress that raises at the end of a step."""
     reported = []
 
     def progress(_spent, _loss):

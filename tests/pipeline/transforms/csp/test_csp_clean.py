@@ -76,7 +76,7 @@ def test_whole_tracks_keep_the_originals_rows_and_labels(rows, last_lane, full_f
     expected = np.concatenate([assemble(original, part) for part in (TRAIN, VAL, TEST)])
     assert np.array_equal(assemble(found, TRAIN)[:, :8], expected[:, :8])
     assert found.left_out == {}
-    # Nobody is overwritten: who stands in an original grid stands in this one.
+    # No neighbor is overwritten: what stands in an original grid stands in this one.
     for mine, theirs in zip(assemble(found, TRAIN)[:, 8:], expected[:, 8:], strict=True):
         assert set(theirs.tolist()) <= set(mine.tolist()) or len(set(mine.tolist())) >= 13
 

@@ -225,8 +225,8 @@ def test_properties(seed, vehicles, cutoff_m, shift):
 
 def test_nothing_to_assess():
     tracks = make_tracks(drive(1, 20, 60))
-    nobody = all_whole(tracks).with_columns(fully_tracked=pl.lit(value=False))
-    for starts, cutoff_m in ((nobody, 0.0), (all_whole(tracks), None)):
+    none = all_whole(tracks).with_columns(fully_tracked=pl.lit(value=False))
+    for starts, cutoff_m in ((none, 0.0), (all_whole(tracks), None)):
         table = assess_starts(tracks, starts, **NAMES, cutoff_m=cutoff_m, first_frame=0, frame_rate_hz=RATE_HZ)
         assert START_ASSESSMENTS.validate(table, where="test").is_empty()
     short = make_tracks([*drive(1, 20, 20), (2, 30, 0.0, 0, 8.0)])

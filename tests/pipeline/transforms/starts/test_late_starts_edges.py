@@ -122,7 +122,7 @@ def test_one_vehicle_in_one_frame(vehicle, frame, x_m, lane, speed_mps):
     assert missing.is_empty()
     assert cutoffs["late"] == 0
     assert cutoffs["eligible"] == cutoffs["fully_tracked"] == (frame >= 10)
-    assert starts["early"].to_list() == [False], "nobody came before it"
+    assert starts["early"].to_list() == [False], "no vehicle came before it"
 
 
 @settings(max_examples=20, deadline=None)

@@ -122,6 +122,6 @@ def test_sizes_are_those_of_their_vehicles_in_any_order(sizes, draw):
 
 
 def test_a_vehicle_without_a_row_is_refused():
-    nobody = pl.DataFrame(schema={"vehicle_id": pl.Int32, "length_m": pl.Float32, "width_m": pl.Float32})
+    none = pl.DataFrame(schema={"vehicle_id": pl.Int32, "length_m": pl.Float32, "width_m": pl.Float32})
     with pytest.raises(ValueError, match=r"ngsim/x: expected every vehicle .*, got 2 runs of others, .* vehicle 8"):
-        find_sizes(nobody, np.array([8, 9]), where="ngsim/x")
+        find_sizes(none, np.array([8, 9]), where="ngsim/x")

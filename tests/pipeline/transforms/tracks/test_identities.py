@@ -76,7 +76,7 @@ def test_a_leader_is_the_vehicle_of_that_id_in_the_frame_and_lane():
     seven = [entry(7, 1, 0.0, lane=1, leader=5), entry(7, 2, 1.0, lane=2, leader=5, follower=5),
              entry(7, 3, 2.0, lane=2, leader=5, follower=6)]  # fmt: skip
     found = identify([*two, *seven])
-    # The vehicle that announces 8 (lane 2) sorts first and keeps the id; the other is 8, beyond 7. Nobody of id 5 is
+    # The vehicle that announces 8 (lane 2) sorts first and keeps the id; the other is 8, beyond 7. No vehicle 5 is
     # behind in frame 2, so that the follower is the one in the lane; no vehicle 5 lasts until frame 3.
     follower = found.entries.filter(pl.col("vehicle_id") == 7).select("leader_id", "follower_id").rows()
     assert follower == [(8, None), (5, 5), (None, 6)]
