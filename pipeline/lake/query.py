@@ -65,7 +65,7 @@ class LakeResult:
 
     Args:
         relation: DuckDB's result.
-        owner: connection that the relation needs, where nobody else holds it.
+        owner: connection that the relation needs, where no other object holds it.
     """
 
     def __init__(self, relation: "duckdb.DuckDBPyRelation", owner: "duckdb.DuckDBPyConnection | None" = None) -> None:
