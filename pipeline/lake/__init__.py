@@ -1,5 +1,6 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
+from tracklake.pipeline.lake.admission import query_errors as query_errors
 from tracklake.pipeline.lake.checksums import DamagedFile as DamagedFile
 from tracklake.pipeline.lake.checksums import find_damaged_files as find_damaged_files
 from tracklake.pipeline.lake.checksums import verify_files as verify_files
@@ -20,12 +21,11 @@ from tracklake.pipeline.lake.manifest import Commit as Commit
 from tracklake.pipeline.lake.manifest import LakeFile as LakeFile
 from tracklake.pipeline.lake.manifest import Manifest as Manifest
 from tracklake.pipeline.lake.manifest import load as load
-from tracklake.pipeline.lake.query import LakeResult as LakeResult
 from tracklake.pipeline.lake.query import connect as connect
 from tracklake.pipeline.lake.query import open_recordings as open_recordings
 from tracklake.pipeline.lake.query import query as query
-from tracklake.pipeline.lake.query import query_errors as query_errors
 from tracklake.pipeline.lake.rebuild import list_ingested as list_ingested
+from tracklake.pipeline.lake.results import LakeResult as LakeResult
 from tracklake.pipeline.lake.session_end import is_settled as is_settled
 from tracklake.pipeline.lake.writer import Writer as Writer
 from tracklake.pipeline.lake.writer import follow_move as follow_move

@@ -9,7 +9,8 @@ import polars as pl
 from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME, TENSORS, scan
 from tracklake.pipeline.lake.manifest import MANIFEST, load
-from tracklake.pipeline.lake.query import LakeConnection, LakeResult, Parameters, connect
+from tracklake.pipeline.lake.query import LakeConnection, Parameters, connect
+from tracklake.pipeline.lake.results import LakeResult
 from tracklake.pipeline.lake.writer import follow_move
 
 if TYPE_CHECKING:

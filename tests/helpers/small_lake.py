@@ -13,9 +13,11 @@ from pathlib import Path
 import polars as pl
 
 from tracklake.pipeline.lake import Commit, LakeFile, Writer, connect, load, open_for_writing, write_folder, write_table
-from tracklake.schemas import SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, Table
+from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES, Table
+from tracklake.schemas import SUBSETS as SUBSETS_TABLE
 
 SUBSETS = ("01-upper", "01-lower")
+UPPER = {"dataset": "highd", "subset": "01-upper"}
 
 
 def make_status(subset: str, number: int, dataset: str = "highd") -> pl.DataFrame:
@@ -136,6 +138,41 @@ def check_folder(root: Path, *, linked: bool = False) -> None:
 def make_splits(rows: int) -> pl.DataFrame:
     fixed = {"split": "s", "dataset": "highd", "subset": "01-upper", "first_frame": 1, "last_frame": 2, "part": "train"}
     return pl.DataFrame([{**fixed, "block": i} for i in range(rows)], schema=SPLITS.dtypes)
+
+
+def make_vehicles(rows: int, subset: str = "01-upper") -> pl.DataFrame:
+    facts = {
+        "dataset": "highd", "subset": subset, "class": "car", "length_m": 4.5, "width_m": 2.0, "first_frame": 1,
+        "last_frame": 9, "entries": 9, "entries_announced": None, "start_x_m": 0.0, "end_x_m": 9.0, "start_lane": 1,
+        "mean_speed_mps": 3.0, "lane_changes": 0,
+    }  # fmt: skip
+    found = [{**facts, "vehicle_id": i, "source_vehicle_id": i} for i in range(rows)]
+    return pl.DataFrame(found, schema=VEHICLES.dtypes)
+
+
+def make_subset(subset: str = "01-upper") -> pl.DataFrame:
+    facts = {
+        "dataset": "highd", "subset": subset, "recording": "01", "site": "1", "origin": "recorded",
+        "direction": "upper", "freeway": True, "frame_rate_hz": 25.0, "lanes": 2, "seconds": 9.0, "first_frame": 1,
+        "last_frame": 9, "vehicles": 3, "entries": 27, "flow_vphpl": None, "vehicles_per_lane_s": None, "ids_split": 0,
+        "on_ramp_lanes": [], "lane_markings_m": [0.0, 3.75],
+        "columns_missing": ["lane"], "source_files": [{"file": "a.csv", "sha256": "00"}],
+    }  # fmt: skip
+    return pl.DataFrame([facts], schema=SUBSETS_TABLE.dtypes)
+
+
+def make_rejects(text: str) -> pl.DataFrame:
+    row = {"dataset": "highd", "recording": None, "file": "a", "line": 1, "reason": "short", "text": text}
+    return pl.DataFrame([row], schema=REJECTS.dtypes)
+
+
+def write_every_kind(root: Path) -> None:
+    """Every kind of partition, list and struct columns, two stages beside what they judge."""
+    with open_for_writing(root) as writer:
+        writer.commit(put(root, "a", 1, make_vehicles(3), VEHICLES, **UPPER))
+        writer.commit(put(root, "b", 1, make_subset(), SUBSETS_TABLE, **UPPER))
+        writer.commit(put(root, "c", 1, make_rejects("it's"), REJECTS, dataset="highd"))
+        writer.commit(put(root, "d", 1, make_splits(2), SPLITS))
 
 
 class Nursery:
