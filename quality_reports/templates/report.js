@@ -43,6 +43,10 @@
   }
 
   // Tables.
+  const fit = new ResizeObserver((entries) => entries.forEach(({ target }) => {
+    target.classList.toggle("fits", target.scrollWidth <= target.clientWidth);
+  }));
+  find(".box").forEach((box) => fit.observe(box));
   const listHeads = (table) => {
     const grid = [];
     [...table.tHead.rows].forEach((row, y) => {
