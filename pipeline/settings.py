@@ -1,21 +1,15 @@
 """Settings: files `tracklake.toml`, then the environment (`TRACKLAKE_*`), then options; and where each came from."""
 
+import json
 import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_origin
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    SettingsError,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.files import SETTINGS_FILE
@@ -62,17 +56,10 @@ class SettingSource:
         return f"{self.name}:{self.lines[key]}" if key in self.lines else self.name
 
 
-class Settings(BaseSettings):
+class Settings(BaseModel):
     """All settings of the pipeline; each is part of the fingerprints of the tables that it influences."""
 
-    model_config = SettingsConfigDict(
-        env_prefix=PREFIX,
-        env_nested_delimiter="__",
-        env_ignore_empty=True,
-        extra="forbid",
-        frozen=True,
-        allow_inf_nan=False,
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
     lake: Path = Field(Path("lake"), description="folder of the lake")
     columns: Path | None = Field(None, description="mapping of the columns of raw files in a format of their own")
@@ -151,19 +138,6 @@ class Settings(BaseSettings):
             if faults:
                 found = [(("thresholds", name), fault, self.thresholds[name]) for name, fault in faults]
                 raise _make_error(found, sources)
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Leave pydantic only what `read_sources` has found."""
-        del settings_cls, env_settings, dotenv_settings, file_secret_settings
-        return (init_settings,)
 
     @field_validator("*", mode="before")
     @classmethod
@@ -249,16 +223,9 @@ def read_sources(options: Mapping[str, Any]) -> list[SettingSource]:
     Raises:
         SettingError: a file or variable cannot be read, or the lake's own file names a lake.
     """
-    try:
-        variables = EnvSettingsSource(Settings)()
-    except SettingsError as error:
-        field = next(iter(re.findall(r'field "(\w+)"', str(error))), "*")
-        raise SettingError(
-            f"{PREFIX}{field.upper()}: expected JSON, got {os.environ.get(PREFIX + field.upper())!r}"
-        ) from error
     found = find_file()
     sources = [] if found is None else [_read_file(found)]
-    sources += [SettingSource(ENVIRONMENT, variables, {}), SettingSource(OPTION, options, {})]
+    sources += [SettingSource(ENVIRONMENT, _read_environment(), {}), SettingSource(OPTION, options, {})]
     lake = merge_sources(sources).get("lake", Settings.model_fields["lake"].default)
     own = Path(lake) / SETTINGS_FILE if isinstance(lake, str | Path) else Path(SETTINGS_FILE)
     if _is_file(own) and not (found is not None and own.samefile(found)):
@@ -267,6 +234,38 @@ def read_sources(options: Mapping[str, Any]) -> list[SettingSource]:
             raise SettingError(f"{of_lake.locate(('lake',))}: a lake's own file names no lake; remove the line")
         sources.insert(-2, of_lake)
     return sources
+
+
+def _read_environment() -> dict[str, Any]:
+    """Return the settings of the variables TRACKLAKE_NAME, and TRACKLAKE_NAME__KEY of tables; empty ones are not set.
+
+    Lists and tables are written as JSON.
+    """
+    variables = {name.upper(): text for name, text in os.environ.items() if text}
+    found: dict[str, Any] = {}
+    for field, declared in Settings.model_fields.items():
+        name = f"{PREFIX}{field.upper()}"
+        is_json = get_origin(declared.annotation) in (dict, list)
+        if name in variables:
+            found[field] = _read_json(name, variables[name]) if is_json else variables[name]
+        if get_origin(declared.annotation) is dict:
+            table = {
+                each.removeprefix(f"{name}__").lower(): _read_json(each, text) if text.startswith("[") else text
+                for each, text in sorted(variables.items())
+                if each.startswith(f"{name}__")
+            }
+            whole = found.get(field, {})
+            if table and isinstance(whole, Mapping):
+                found[field] = {**whole, **table}
+    return found
+
+
+def _read_json(name: str, text: str) -> Any:  # noqa: ANN401  (JSON)
+    """Return the value of a variable written as JSON."""
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise SettingError(f"{name}: expected JSON, got {text!r}") from error
 
 
 def list_files(lake: Path) -> list[str]:
