@@ -16,7 +16,7 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import LakeOption, require_choice
 from tracklake.pipeline.cli.tables import GAP, cut_text, print_table
-from tracklake.pipeline.lake import LakeResult, connect, load, query_errors, refuse_lake
+from tracklake.pipeline.lake import LakeResult, connect, load, refuse_lake
 from tracklake.pipeline.lake import query as run_query
 from tracklake.pipeline.lake.catalog import build_catalog, list_columns, sql_type
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
@@ -95,8 +95,7 @@ def sql(
         form = choose_format(format, out, json=json)
         with connect(read_settings(lake=lake).lake) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
-            with query_errors():  # DuckDB computes while the result is fetched
-                write_result(relation, form, out, terminal)
+            write_result(relation, form, out, terminal)
 
 
 def choose_format(asked: str | None, out: Path | None, *, json: bool) -> str:

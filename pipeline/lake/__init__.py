@@ -1,6 +1,5 @@
 """The lake: Parquet files, the manifest that says which are live, one writer, and the DuckDB catalog."""
 
-from tracklake.pipeline.lake.admission import query_errors as query_errors
 from tracklake.pipeline.lake.checksums import DamagedFile as DamagedFile
 from tracklake.pipeline.lake.checksums import find_damaged_files as find_damaged_files
 from tracklake.pipeline.lake.checksums import verify_files as verify_files

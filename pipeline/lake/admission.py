@@ -101,6 +101,10 @@ def query_errors() -> Iterator[None]:
 
     try:
         yield
+    except duckdb.ConnectionException as closed:
+        raise QueryError(
+            "the lake was closed before this result was fetched; fetch it first, or open it again"
+        ) from closed
     except duckdb.Error as failed:
         tables = ", ".join(table.name for table in TABLES)
         macros = ", ".join(macro.signature for macro in MACROS)

@@ -57,7 +57,7 @@ class Lake:
         status = (self.path / MANIFEST).stat()
         state = (status.st_mtime_ns, status.st_ino)
         if self._connection is None or state != self._state:
-            self.close()
+            # Not closed: results of the connection before may not be fetched yet.
             self._connection, self._state = connect(self.path), state
         return self._connection.sql(query, parameters, **frames)
 

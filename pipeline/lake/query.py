@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 from tracklake.pipeline.lake.admission import admit_select, query_errors
 from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
@@ -21,16 +22,19 @@ Parameters = Mapping[str, Any] | Sequence[Any]
 class LakeConnection:
     """A lake opened for SQL; made by `connect`. One SELECT at a time, and nothing else, as in `query`.
 
-    What it returns is a `LakeResult`: `.pl()`, `.fetchall()`, `.columns` and the rest of what reads.
+    What it returns is a `LakeResult`: `.pl()`, `.fetchall()`, `.columns` and the rest of what reads. Each has its own
+    cursor: on a shared one another query ends a result that is being fetched, and threads disturb each other.
     """
 
     def __init__(self, raw: "duckdb.DuckDBPyConnection") -> None:
         self._raw = raw
+        self._cursors: WeakSet[duckdb.DuckDBPyConnection] = WeakSet()
 
     def sql(
         self,
         statement: str,
-        parameters: Parameters | None = None,
+        parameters: object = None,
+        /,
         **frames: Any,  # noqa: ANN401  (of any library)
     ) -> LakeResult:
         """Return the result of a statement.
@@ -43,33 +47,24 @@ class LakeConnection:
         Raises:
             QueryError: see `query`; or a frame has a name of the lake's, or is no table.
         """
-        connection = self._lend(frames) if frames else self._raw
-        admitted = admit_select(connection, statement)
+        if not isinstance(parameters, Mapping | Sequence | None):
+            kind = type(parameters).__name__
+            raise QueryError(f"parameters: expected values by name or in order; got {kind}. Give a frame another name.")
         with query_errors():
-            return LakeResult(connection.sql(admitted, params=parameters or None), connection)
-
-    def _lend(self, frames: Mapping[str, Any]) -> "duckdb.DuckDBPyConnection":
-        """Return a connection of its own with the frames, which those of a later query do not replace."""
-        import duckdb
-
-        own = self._raw.cursor()
-        for name, frame in frames.items():
-            if name.lower() in TABLE_BY_NAME:
-                raise QueryError(f"a frame cannot be called {name}, as a table of the lake is. Give it another name.")
-            try:
-                own.register(name, frame.pl() if isinstance(frame, LakeResult) else frame)
-            except (duckdb.Error, TypeError) as refused:
-                raise QueryError(
-                    f"{name}: expected a table of Polars, pandas or Arrow; got {type(frame).__name__}"
-                ) from refused
-        return own
+            cursor = self._raw.cursor()
+        self._cursors.add(cursor)
+        _lend_frames(cursor, frames)
+        admitted = admit_select(cursor, statement)
+        with query_errors():
+            return LakeResult(cursor.sql(admitted, params=parameters or None), cursor)
 
     execute = sql
     """Same as `sql`, under the name that DuckDB's connections have."""
 
     def close(self) -> None:
-        """Close the connection and the lake's files; a query that still runs, as after Ctrl-C, is broken off."""
-        self._raw.interrupt()  # or closing waits for its end
+        """Close the connection; a query that still runs, as after Ctrl-C, is broken off."""
+        for cursor in list(self._cursors):
+            cursor.interrupt()
         self._raw.close()
 
     def __enter__(self) -> "LakeConnection":
@@ -79,6 +74,21 @@ class LakeConnection:
     def __exit__(self, *_raised: object) -> None:
         """Close the connection after a `with` block."""
         self.close()
+
+
+def _lend_frames(cursor: "duckdb.DuckDBPyConnection", frames: Mapping[str, Any]) -> None:
+    """Make frames tables of a cursor, which other cursors do not see."""
+    import duckdb
+
+    for name, frame in frames.items():
+        if name.lower() in TABLE_BY_NAME:
+            raise QueryError(f"a frame cannot be called {name}, as a table of the lake is. Give it another name.")
+        try:
+            cursor.register(name, frame.pl() if isinstance(frame, LakeResult) else frame)
+        except (duckdb.Error, TypeError) as refused:
+            raise QueryError(
+                f"{name}: expected a table of Polars, pandas or Arrow; got {type(frame).__name__}"
+            ) from refused
 
 
 def connect(lake: Path | str) -> LakeConnection:
@@ -141,7 +151,7 @@ def open_recordings(root: Path, manifest: Manifest, recordings: Collection[str])
 def query(connection: LakeConnection, sql: str) -> LakeResult:
     """Run one SELECT and return its result; EXPLAIN of one, DESCRIBE, SUMMARIZE and SHOW are selects, too.
 
-    DuckDB computes a result when it is fetched: what fails only then fails there, see `query_errors`.
+    DuckDB computes a result when it is fetched, and what fails only then raises a QueryError there.
 
     Raises:
         QueryError: not exactly one SELECT, or DuckDB's own message with the lists of tables and macros.

@@ -34,19 +34,20 @@ SHOWN_ROWS = 20
 
 
 class LakeResult:
-    """The result of a SELECT; DuckDB computes it when it is fetched.
+    """The result of a SELECT; DuckDB computes it when it is fetched, and a QueryError says what fails then.
 
     Not DuckDB's own relation: that writes files and creates tables, and runs any statement by its `query`. Whatever
     reads Arrow streams takes it as it is: `pl.DataFrame(result)`, `pyarrow.table(result)`.
 
     Args:
         relation: DuckDB's result.
-        owner: connection that the relation needs, where no other object holds it.
+        cursor: connection of its own, which it keeps open.
     """
 
-    def __init__(self, relation: "duckdb.DuckDBPyRelation", owner: "duckdb.DuckDBPyConnection | None" = None) -> None:
+    def __init__(self, relation: "duckdb.DuckDBPyRelation", cursor: "duckdb.DuckDBPyConnection") -> None:
         self._relation = relation
-        self._owner = owner
+        self._cursor = cursor
+        self._is_executed = False
 
     def __repr__(self) -> str:
         """Name the columns; nothing is computed."""
@@ -79,15 +80,21 @@ class LakeResult:
 
     def fetchall(self) -> list[tuple[Any, ...]]:
         """Return all rows that were not fetched yet."""
-        return self._relation.fetchall()
+        with query_errors():
+            return self._relation.fetchall()
 
     def fetchone(self) -> tuple[Any, ...] | None:
         """Return the next row, or None after the last one."""
-        return self._relation.fetchone()
+        with query_errors():
+            if not self._is_executed:
+                self._relation.execute()  # as a whole; of a stream the next query, such as `count`, would drop the rest
+                self._is_executed = True
+            return self._relation.fetchone()
 
     def count(self) -> int:
         """Return the number of rows, by a query of its own."""
-        ((rows,),) = self._relation.count("*").fetchall()
+        with query_errors():
+            ((rows,),) = self._relation.count("*").fetchall()
         return int(rows)
 
     def pl(self) -> pl.DataFrame:
@@ -95,7 +102,8 @@ class LakeResult:
 
         Where they do not, they are Decimal, which JSON writes as text. Types that Polars lacks become text.
         """
-        frame = self._cast(_POLARS_TYPES).pl()
+        with query_errors():
+            frame = self._cast(_POLARS_TYPES).pl()
         wide = [column for column, kind in zip(frame, self.types, strict=True) if str(kind) in ("HUGEINT", "UHUGEINT")]
         fitting = [column.cast(pl.Int64, strict=False) for column in wide]
         return frame.with_columns(
@@ -131,13 +139,13 @@ class LakeResult:
             flat: whether lists, structs and maps become text as a whole, for CSV.
             numbers: whether numbers and truth values become text, too.
         """
-        return LakeResult(self._cast({"varchar"} if numbers else _PLAIN, flat=flat), self._owner)
+        return LakeResult(self._cast({"varchar"} if numbers else _PLAIN, flat=flat), self._cursor)
 
     def _cast(self, kept: Set[str], *, flat: bool = False) -> "duckdb.DuckDBPyRelation":
         """Return the relation with types other than those kept, and other than lists and structs of them, as text."""
         wanted = [_name_cast(kind, kept, flat=flat) for kind in self.types]
         if all(name is None for name in wanted):
-            return self._relation
+            return self._relation.project("*")  # all rows, also of a result of which some were fetched
         columns = []
         for place, (column, name) in enumerate(zip(self.columns, wanted, strict=True), start=1):
             value = f"#{place}" if name is None else f"CAST(#{place} AS {name})"
@@ -146,7 +154,7 @@ class LakeResult:
 
     def limit(self, n: int, offset: int = 0) -> "LakeResult":
         """Return at most n rows, after the first `offset`."""
-        return LakeResult(self._relation.limit(n, offset), self._owner)
+        return LakeResult(self._relation.limit(n, offset), self._cursor)
 
     def project(self, expressions: str) -> "LakeResult":
         """Return other columns computed from these by a list of SQL expressions.
@@ -156,7 +164,7 @@ class LakeResult:
         """
         refuse_switches(expressions)
         with query_errors():
-            return LakeResult(self._relation.project(expressions), self._owner)
+            return LakeResult(self._relation.project(expressions), self._cursor)
 
 
 def _take_first(result: LakeResult, rows: int) -> tuple[pl.DataFrame, str]:

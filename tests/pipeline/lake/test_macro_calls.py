@@ -50,7 +50,7 @@ def test_a_macro_reads_its_subset_and_no_other(opened: LakeConnection, unreadabl
         # Of four, or of one where the others were left out even earlier; for every reading there is.
         counts = re.findall(r'"Scanning Files": "(\d+)/[14]"', plan)
         assert counts == ["1"] * plan.count('"Function": "READ_PARQUET"')
-    with pytest.raises(duckdb.Error):
+    with pytest.raises(QueryError):
         unreadable.sql("SELECT sum(x_m) FROM tracks").fetchall()
 
 

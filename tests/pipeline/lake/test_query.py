@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,9 +12,10 @@ from pathlib import Path
 import polars as pl
 import pyarrow as pa
 import pytest
-from small_lake import write_every_kind
+from small_lake import write_every_kind, write_round
 
-from tracklake.pipeline.lake import QueryError, connect, query, query_errors
+from tracklake.pipeline.lake import QueryError, connect, query
+from tracklake.pipeline.lake.lake import open_lake
 from tracklake.pipeline.lake.query import LakeConnection
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import MissingExtraError
@@ -113,7 +115,7 @@ def test_what_writes_or_looks_elsewhere_is_refused(opened: LakeConnection, lake:
     filled = sql.format(lake=lake, out=folder / "out", secret=folder / "secret.csv")
     before = snapshot(folder)
     # Some are refused on asking, the others when DuckDB first touches the file.
-    with pytest.raises(QueryError), query_errors():
+    with pytest.raises(QueryError):
         query(opened, filled).fetchall()
     assert opened.execute("SELECT count(*) FROM vehicles").fetchall() == [(3,)]
     assert opened.execute("SELECT count(*) FROM duckdb_tables()").fetchall() == [(0,)]
@@ -211,14 +213,39 @@ def test_frames_of_ones_own_are_tables_of_that_query(lake: Path):
         assert connection.sql("FROM made WHERE label = 'b'", made=first).fetchall() == [("b",)]
         with pytest.raises(QueryError, match="mine"):
             connection.sql("FROM mine").fetchall()
+        with pytest.raises(QueryError, match=r"parameters: expected values .* got DataFrame\. Give a frame another"):
+            connection.sql("FROM parameters", mine)
+        assert connection.sql("FROM statement LIMIT 1", statement=mine).fetchall() == [(0, "a")]
         with pytest.raises(QueryError, match="a frame cannot be called Tracks"):
             connection.sql("FROM tracks", Tracks=mine)
         for wrong in (5, [1], {"a": [1]}, "vehicles"):
             with pytest.raises(QueryError, match="mine: expected a table of Polars, pandas or Arrow; got "):
                 connection.sql("FROM mine", mine=wrong)
         for refused in ("COPY mine TO 'x.csv'", "FROM read_text('/etc/passwd'), mine", "SET threads = 1"):
-            with pytest.raises(QueryError), query_errors():
+            with pytest.raises(QueryError):
                 connection.sql(refused, mine=mine).fetchall()
+
+
+def test_results_do_not_disturb_each_other(lake: Path):
+    """DuckDB reads 2,048 rows at once; more of them show whether the rest is still there."""
+    numbers = "SELECT n FROM range(9000) AS t(n) ORDER BY 1"
+    with connect(lake) as connection:
+        one, other = connection.sql(numbers), connection.sql(numbers)
+        assert (one.fetchone(), other.fetchone(), one.fetchone()) == ((0,), (0,), (1,))
+        assert (one.count(), one.pl().height, one.limit(5).pl().height) == (9000, 9000, 5)
+        assert (len(one.fetchall()), len(other.fetchall())) == (8998, 8999)
+        with ThreadPoolExecutor(4) as pool:
+            found = pool.map(lambda _: len(connection.sql(numbers).fetchall()), range(20))
+        assert list(found) == [9000] * 20
+
+
+def test_a_result_outlives_the_next_commit(tmp_path: Path):
+    write_round(tmp_path, 1)
+    opened = open_lake(tmp_path)
+    before = opened.sql("SELECT backward_vehicles FROM subset_status")
+    write_round(tmp_path, 2)
+    assert opened.sql("SELECT backward_vehicles FROM subset_status").fetchall() == [(2,), (2,)]
+    assert before.fetchall() == [(1,), (1,)]
 
 
 def test_whole_numbers_come_as_such_where_64_bits_hold_them(lake: Path):
@@ -254,7 +281,7 @@ def test_python_variables_are_no_tables(lake: Path):
     ],
 )
 def test_a_wrong_query_gets_duckdbs_message_and_the_tables(lake: Path, sql: str, says: str):
-    with connect(lake) as connection, pytest.raises(QueryError, match=re.escape(says)) as caught, query_errors():
+    with connect(lake) as connection, pytest.raises(QueryError, match=re.escape(says)) as caught:
         query(connection, sql).fetchall()
     *_, tables, macros = str(caught.value).splitlines()
     assert tables == f"Tables: {', '.join(table.name for table in TABLES)}."
