@@ -300,9 +300,11 @@ def merge_sources(sources: Sequence[SettingSource]) -> dict[str, Any]:
 
 
 def list_keys(values: Mapping[str, Any]) -> Iterator[Key]:
-    """Yield the keys of settings, and instead of that of a table those in it."""
+    """Yield the keys of settings, and instead of that of a table of settings those in it."""
+    tables = {name for name, field in Settings.model_fields.items() if field.default_factory is dict}
     for name, value in values.items():
-        yield from ((name, inner) for inner in value) if isinstance(value, Mapping) else [(name,)]
+        is_table = name in tables and isinstance(value, Mapping)
+        yield from ((name, inner) for inner in value) if is_table else [(name,)]
 
 
 def find_unknown_variables() -> list[str]:
@@ -316,7 +318,7 @@ def find_unknown_variables() -> list[str]:
     for name in sorted(os.environ):
         upper = name.upper()
         if upper.startswith(PREFIX) and upper not in (*known, DEBUG) and not upper.startswith(tables):
-            hint = suggest_name(upper, known)
+            hint = suggest_name(upper, (*known, DEBUG))
             hint = hint if hint.endswith("?") else "`tracklake config` lists the settings"
             messages.append(f"{name}: no setting has this name, so it has no effect; {hint}")
     return messages
@@ -360,7 +362,8 @@ def _describe_problem(problem: Any) -> str:  # noqa: ANN401  (a TypedDict that p
         limits = {name: getattr(each, name) for each in declared for name in words if hasattr(each, name)}
         bounds = [words[name].format(limit) for name, limit in (limits or problem["ctx"]).items()]
         return f"expected {' and '.join(bounds)}"
-    plain = {"path_type": "expected a path", "string_pattern_mismatch": "expected letters, digits, `.`, `_` and `-`"}
+    plain = {"path_type": "expected a path", "dict_type": "expected a table"}
+    plain |= {"string_pattern_mismatch": "expected letters, digits, `.`, `_` and `-`"}
     message = re.sub("^Input should be ", "expected ", problem["msg"].removeprefix("Value error, "))
     return plain.get(problem["type"], message)
 

@@ -73,7 +73,9 @@ def check(
         results = [] if damaged else judge_gates(root, gates) if gates else []
         if gates:
             outdated = find_outdated(settings, load(root))
-            for stage in outdated:
+            if damaged:
+                terminal.print_problem("gates are not judged where files are damaged", label="note")
+            for stage in () if damaged else outdated:
                 terminal.print_problem(
                     f"{stage} is not up to date: gates are judged on what it made last", label="note"
                 )

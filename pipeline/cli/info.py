@@ -13,6 +13,7 @@ from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOptio
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.ingest.staleness import StageState, describe_stages
 from tracklake.pipeline.lake import Manifest, connect, load
+from tracklake.pipeline.lake.catalog import CATALOG
 from tracklake.pipeline.lake.files import MODELS, REPORTS, STORE, TABLE_BY_NAME, TENSORS
 from tracklake.quality_reports.gates.metrics import collect_metrics
 from tracklake.schemas.origin import describe_synthetic
@@ -76,7 +77,7 @@ def measure_sizes(root: Path, manifest: Manifest) -> dict[str, int]:
     """
     parts = {STORE: "tables", TENSORS: "tensors", REPORTS: "reports", MODELS: "models"}
     parts |= dict.fromkeys(TABLE_BY_NAME, "copies")
-    sizes = dict.fromkeys((*parts.values(), "replaced", "others"), 0)
+    sizes = dict.fromkeys((*parts.values(), "catalog", "replaced", "others"), 0)
     live, seen = manifest.live_paths(), set()
     for top in (*parts, "."):  # the content of tables before the folders with links to it
         for folder, _, names in os.walk(root / top):
@@ -86,7 +87,8 @@ def measure_sizes(root: Path, manifest: Manifest) -> dict[str, int]:
                     continue
                 seen.add((status.st_dev, status.st_ino))
                 is_replaced = top in (STORE, TENSORS) and path.relative_to(root).as_posix() not in live
-                sizes["replaced" if is_replaced else parts.get(top, "others")] += status.st_size
+                part = "catalog" if path == root / CATALOG else parts.get(top, "others")
+                sizes["replaced" if is_replaced else part] += status.st_size
     return sizes | {"total": sum(sizes.values())}
 
 

@@ -39,12 +39,17 @@ class StageState:
 
 
 def describe_stages(root: Path, manifest: Manifest, settings: Settings) -> list[StageState]:
-    """Return the state of every stage, in the order of a run; a stage after a stale one is stale as well."""
+    """Return the state of every stage, in the order of a run; a stage after a stale one is stale as well.
+
+    Ingestion alone is no reason: raw files with another time of change may hold what they held.
+    """
     planner = Planner(root, manifest, settings)
     states = [_describe_ingestion(root, manifest)]
-    waiting: set[str] = set()
+    waiting: list[str] = []
     for stage in STAGES:
-        before = [name for name in stage.after if name in waiting]
+        # Pages and the report come after no stage, but show what all have made.
+        shown = [name for name in waiting if manifest.of_stage(name)]
+        before = [name for name in stage.after or shown if name in waiting]
         commits = {commit.key: commit for commit in manifest.of_stage(stage.name)}
         try:
             if before:
@@ -55,14 +60,14 @@ def describe_stages(root: Path, manifest: Manifest, settings: Settings) -> list[
             states.append(
                 StageState(stage.name, 0, len(commits), stale or {stage.name: f"waits for {', '.join(before)}"})
             )
-            waiting.add(stage.name)
+            waiting.append(stage.name)
             continue
         stale = {job.tail or stage.name: _explain_job(job, commits.get(job.key)) for job in pending}
         stale |= {commits[key].tail or stage.name: "no longer made: what it is made of is gone" for key in left_over}
         possible = len(planner.plan(stage.name))
         states.append(StageState(stage.name, possible - len(pending), possible, stale))
         if stale:
-            waiting.add(stage.name)
+            waiting.append(stage.name)
     return states
 
 
@@ -108,8 +113,10 @@ def _explain_job(job: Job, commit: Commit | None) -> str:
         return "its files are missing or were changed"
     if {"stage_version", "schema_version"} & {*names}:
         return OTHERWISE
-    made_again = [name for name in names if name in (INGEST, *STAGE_BY_NAME)]
-    settings = [name for name in names if name not in made_again]
+    had, has = before.get("commits", {}), now.get("commits", {})  # pages and the report show what these made
+    others = {key.partition("/")[0] for key in {**had, **has} if had.get(key) != has.get(key)}
+    made_again = [name for name in (INGEST, *STAGE_BY_NAME) if name in (*names, *others)]
+    settings = [name for name in names if name not in (*made_again, "commits")]
     parts = [f"{', '.join(made_again)} was made again"] if made_again else []
     changes = [text for name in settings for text in _list_changes(name, before.get(name), now.get(name))]
     if changes:

@@ -104,7 +104,11 @@ def cut_runs(values: NDArray[np.int32], rows: int) -> list[tuple[int, int]]:
 
 
 def find_blocks(frame: NDArray[np.floating], vehicle_id: Integers, blocks: pl.DataFrame, where: str) -> Integers:
-    """Find the row of `blocks` that holds each entry, (N,); -1 = none."""
+    """Find the row of `blocks` (SPLITS) that holds each entry, (N,); -1 = none; `where` names the subset.
+
+    Raises:
+        ValueError: two blocks hold one entry.
+    """
     found = np.full(len(frame), -1, dtype=np.int64)
     for position, block in enumerate(blocks.iter_rows(named=True)):
         # Positions between frames are floating-point, so a millionth of a frame is tolerated.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from tracklake.quality_reports.gates.metrics import LABEL, METRIC_BY_NAME, SCOPES, Metric, Row
+from tracklake.quality_reports.gates.metrics import LABEL, METRIC_BY_NAME, SCOPES, SHARE, Metric, Row
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.text import suggest_name
 
@@ -46,7 +46,9 @@ class Condition:
     def holds(self, row: Row) -> bool | None:
         """Return whether it holds in a row of metrics; None: the metric's value is not known there."""
         found = row.get(self.metric.name)
-        return None if found is None else COMPARISONS[self.sign](found, self.value)
+        if found is None:  # a rule that no entry breaks has no worst value
+            return False if row.get(f"{self.metric.name.removesuffix('.worst')}.entries") == 0 else None
+        return COMPARISONS[self.sign](found, self.value)
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,13 @@ def _read_condition(text: str, name: str, sign: str, value: str) -> Condition:
             raise GateError(f"--fail-on {text!r}: {name} is one of {choices}; got {plain!r}")
         return Condition(metric, sign, plain)
     try:
-        number = float(plain.rstrip("% ")) / (100 if plain.endswith("%") else 1)
+        number = float(plain.removesuffix("%")) / (100 if plain.endswith("%") else 1)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
         raise GateError(f"--fail-on {text!r}: {name} is compared with a number (0.05 or 5%), got {plain!r}")
+    if metric.unit == SHARE and not 0 <= number <= 1:
+        raise GateError(f"--fail-on {text!r}: {name} is a share; expected 0 to 1 (0.05 or 5%), got {plain}")
     return Condition(metric, sign, number)
 
 

@@ -42,8 +42,8 @@ to date. Where files are damaged, no gate is judged.
 
 ## Metrics
 
-`tracklake check --list-metrics` prints this list. Shares of a recording, a dataset or the lake are weighted by
-entries or vehicles; they are not known unless those of all its subsets are.
+`tracklake check --list-metrics` prints this list. What a recording, a dataset or the lake has is not known unless it is
+known of all its subsets (late starts and samples: of all on freeways); shares are weighted by entries or vehicles.
 """
 
 

@@ -6,14 +6,14 @@ from typing import Any
 
 from tracklake.quality_reports.rules.registry import RULES
 from tracklake.quality_reports.summaries import Connection, collect_rules, query
-from tracklake.quality_reports.verdicts import VERDICTS, judge
+from tracklake.quality_reports.verdicts import BAD, CARE, GOOD, judge
 
 SCOPES = ("subset", "recording", "dataset", "lake")
 """Scopes of metrics: what one value is of, the smallest first."""
 OF_RECORDINGS = SCOPES[1:]
 OF_RULES = ("subset", "dataset", "lake")
-LABEL = "text"
-"""Unit of metrics that are text."""
+LABEL, SHARE = "text", "0 to 1"
+"""Units of metrics that are text, and of shares."""
 
 
 @dataclass(frozen=True)
@@ -41,47 +41,45 @@ class Metric:
 
 RULE_FIGURES = {
     "entries": ("entries that break the rule", "1"),
-    "entry_share": ("share of the entries that break it", "0 to 1"),
+    "entry_share": ("share of the entries that break it", SHARE),
     "vehicles": ("vehicles with an entry that breaks it", "1"),
-    "vehicle_share": ("share of the vehicles with one", "0 to 1"),
+    "vehicle_share": ("share of the vehicles with one", SHARE),
     "runs": ("findings: runs of consecutive entries", "1"),
-    "worst": ("most extreme value", "the rule's"),
+    "worst": ("most extreme value; no comparison holds where no entry breaks the rule", "the rule's"),
 }
 """Meanings and units of the metrics of each rule, `RULE.NAME`."""
 
 METRICS: tuple[Metric, ...] = (
-    Metric("error_share", "share of the entries that break a rule of severity error", "0 to 1"),
-    Metric("warning_share", "share of the entries that break a rule of severity error or warning", "0 to 1"),
-    Metric("vehicle_error_share", "share of the vehicles with an error in any entry", "0 to 1"),
-    Metric("vehicle_warning_share", "share of the vehicles with an error or a warning in any entry", "0 to 1"),
+    Metric("error_share", "share of the entries that break a rule of severity error", SHARE),
+    Metric("warning_share", "share of the entries that break a rule of severity error or warning", SHARE),
+    Metric("vehicle_error_share", "share of the vehicles with an error in any entry", SHARE),
+    Metric("vehicle_warning_share", "share of the vehicles with an error or a warning in any entry", SHARE),
     Metric("excluded_subsets", "subsets kept out of samples and splits; of one subset 0 or 1"),
     Metric(
         "verdict",
-        "verdict of the report: 'usable', 'usable with care', 'not usable' or 'not checked'",
+        "verdict of the report: 'usable', 'usable with care' or 'not usable'",
         LABEL,
         ("subset", "dataset"),
-        choices=VERDICTS,
+        choices=(BAD, CARE, GOOD),
     ),
     Metric("unchecked_rules", "rules that read a column which the source lacks", scopes=("subset",)),
     Metric("speed_rms_mps", "root mean square of recorded - recomputed speed", "m/s", ("subset",)),
     Metric("accel_rms_mps2", "root mean square of recorded - recomputed acceleration", "m/s2", ("subset",)),
     Metric("spacing_rms_m", "root mean square of recorded headway - headway from positions", "m", ("subset",)),
     Metric("worst_jerk_mps3", "greatest magnitude of the jerk", "m/s3"),
-    Metric("late_share", "late starts / starts that were judged", "0 to 1", needs="`tracklake repair` of a freeway"),
+    Metric("late_share", "late starts / starts that were judged", SHARE, needs="`tracklake repair` of a freeway"),
     Metric("samples", "prediction origins", needs="`tracklake samples` of a freeway"),
-    Metric("kept_share", "samples / (samples + dropped)", "0 to 1", needs="`tracklake samples` of a freeway"),
-    Metric("subsets", "subsets in the lake", scopes=OF_RECORDINGS),
-    Metric("recordings", "recordings in the lake", scopes=("dataset", "lake")),
+    Metric("kept_share", "samples / (samples + dropped)", SHARE, needs="`tracklake samples` of a freeway"),
+    Metric("subsets", "subsets in the lake", scopes=OF_RECORDINGS, needs="a recording"),
+    Metric("recordings", "recordings in the lake", scopes=("dataset", "lake"), needs="a recording"),
     Metric("vehicles", "tracks", needs="a recording"),
     Metric("entries", "rows of `tracks`", needs="a recording"),
     Metric("flow_vphpl", "flow in vehicles per hour and lane", "veh/h/lane", ("subset",), "known lanes"),
     Metric("rows_read", "data rows of the source files", scopes=OF_RECORDINGS, needs="`tracklake ingest`"),
     Metric("rows_dropped", "data rows that were rejected", scopes=OF_RECORDINGS, needs="`tracklake ingest`"),
-    Metric("dropped_share", "rows_dropped / rows_read", "0 to 1", OF_RECORDINGS, "`tracklake ingest`"),
-    Metric("missing_entry_share", "announced entries that are missing", "0 to 1", OF_RECORDINGS, "an announced number"),
-    Metric(
-        "missing_vehicle_share", "announced vehicles that are missing", "0 to 1", OF_RECORDINGS, "an announced number"
-    ),
+    Metric("dropped_share", "rows_dropped / rows_read", SHARE, OF_RECORDINGS, "`tracklake ingest`"),
+    Metric("missing_entry_share", "announced entries that are missing", SHARE, OF_RECORDINGS, "an announced number"),
+    Metric("missing_vehicle_share", "announced vehicles that are missing", SHARE, OF_RECORDINGS, "an announced number"),
     Metric("dataset", "highd, ngsim or custom", LABEL, SCOPES[:3], selects=True),
     Metric("recording", "name of the recording", LABEL, SCOPES[:2], selects=True),
     Metric("subset", "name of the subset", LABEL, SCOPES[:1], selects=True),
@@ -118,11 +116,13 @@ def collect_metrics(connection: Connection, names: Collection[str]) -> list[Row]
         found = [("lake", rule["total"]), *(("dataset", row) for row in rule["datasets"])]
         for scope, own in (*found, *(("subset", row) for row in rule["subsets"])):
             row = by_key[scope, own.get("dataset"), own.get("subset")]
-            row |= {f"{rule['name']}.{figure}": own[figure] for figure in RULE_FIGURES}
+            if own["subsets_checked"] == own["subsets_all"]:  # else what was not checked would pass
+                row |= {f"{rule['name']}.{figure}": own[figure] for figure in RULE_FIGURES}
     if has_verdict:
         for verdict in _judge(connection, rules):
             scope = "dataset" if verdict["subset"] is None else "subset"
-            by_key[scope, verdict["dataset"], verdict["subset"]]["verdict"] = verdict["verdict"]
+            row = by_key[scope, verdict["dataset"], verdict["subset"]]
+            row["verdict"] = None if row["error_share"] is None else verdict["verdict"]
     return rows
 
 

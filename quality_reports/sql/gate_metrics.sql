@@ -1,10 +1,9 @@
 -- Metrics of quality gates: a row per subset, per recording, per dataset, and one of the lake (`scope`); what does not
--- apply is null. Shares over several subsets are weighted by entries or vehicles, and null unless all of them are known.
-WITH kept AS (
-    SELECT dataset, subset, count(*) AS samples FROM samples GROUP BY dataset, subset
-),
-dropped AS (
-    SELECT dataset, subset, sum(entries)::BIGINT AS dropped FROM sample_drops GROUP BY dataset, subset
+-- apply is null. What several subsets have together is null unless it is known of all of them (of all on freeways, for
+-- late starts and samples); shares are weighted by entries or vehicles.
+WITH drawn AS (
+    SELECT dataset, subset, sum(samples)::BIGINT AS samples, sum(entries_on_clock)::BIGINT AS on_clock
+    FROM sample_counts GROUP BY dataset, subset
 ),
 facts AS (
     SELECT
@@ -12,13 +11,11 @@ facts AS (
         1 - share_without_error AS error_share, 1 - share_without_warning AS warning_share,
         1 - vehicles_without_error AS vehicle_error_share, 1 - vehicles_without_warning AS vehicle_warning_share,
         speed_rms_mps, accel_rms_mps2, spacing_rms_m, worst_jerk_mps3, len(rules_unchecked) AS unchecked_rules,
-        eligible, late, CASE WHEN samples IS NOT NULL OR dropped IS NOT NULL THEN coalesce(samples, 0) END AS samples,
-        coalesce(dropped, 0) AS dropped
+        freeway, eligible, late, samples, on_clock
     FROM subsets
     LEFT JOIN subset_scores USING (dataset, subset)
     LEFT JOIN start_cutoffs USING (dataset, subset)
-    LEFT JOIN kept USING (dataset, subset)
-    LEFT JOIN dropped USING (dataset, subset)
+    LEFT JOIN drawn USING (dataset, subset)
 ),
 of_subsets AS (
     SELECT
@@ -37,10 +34,12 @@ of_subsets AS (
         CASE WHEN count(excluded) = count(*) THEN count(*) FILTER (excluded) END AS excluded_subsets,
         max(unchecked_rules) AS unchecked_rules, max(speed_rms_mps) AS speed_rms_mps,
         max(accel_rms_mps2) AS accel_rms_mps2, max(spacing_rms_m) AS spacing_rms_m,
-        max(worst_jerk_mps3) AS worst_jerk_mps3,
-        round(sum(late) / nullif(sum(eligible), 0), 9) AS late_share,
-        sum(samples)::BIGINT AS samples,
-        round(sum(samples) / nullif(sum(samples + dropped), 0), 9) AS kept_share
+        CASE WHEN count(error_share) = count(*) THEN max(worst_jerk_mps3) END AS worst_jerk_mps3,
+        CASE WHEN count(eligible) = count(*) FILTER (freeway)
+            THEN round(sum(late) / nullif(sum(eligible), 0), 9) END AS late_share,
+        CASE WHEN count(samples) = count(*) FILTER (freeway) THEN sum(samples)::BIGINT END AS samples,
+        CASE WHEN count(samples) = count(*) FILTER (freeway)
+            THEN round(sum(samples) / nullif(sum(on_clock), 0), 9) END AS kept_share
     FROM facts
     GROUP BY GROUPING SETS ((), (dataset), (dataset, recording), (dataset, recording, subset))
 ),

@@ -30,7 +30,7 @@ def judge(text: str, **shares):
         ("  error_share  >=  5%  ", 0.05, "subset"),
         ("error_share > 5 % per lake", 0.05, "lake"),
         ("error_share > 1e-3 per dataset", 0.001, "dataset"),
-        ("dropped_share != -1", -1.0, "recording"),
+        ("dropped_share != 100%", 1.0, "recording"),
         ("overlap.entries == 3", 3.0, "subset"),
         ("recordings < 2", 2.0, "dataset"),
         ("verdict == 'not usable'", "not usable", "subset"),
@@ -63,6 +63,9 @@ def test_conditions_are_joined():
         ("eror_share > 1", r"no metric is called eror_share; did you mean error_share\?"),
         ("overlap.entris > 1", r"did you mean overlap\.entries\?"),
         ("qqqq > 1", "no metric is called qqqq; `tracklake check --list-metrics` lists all"),
+        ("error_share > 5", r"error_share is a share; expected 0 to 1 \(0.05 or 5%\), got 5"),
+        ("overlap.entry_share < -1%", "is a share"),
+        ("error_share > 5%%", "compared with a number"),
         ("error_share > nan", "compared with a number"),
         ("error_share > inf", "compared with a number"),
         ("error_share > many", r"compared with a number \(0.05 or 5%\), got 'many'"),
@@ -82,7 +85,7 @@ def test_what_is_no_gate_is_refused(text, message):
 
 
 @given(
-    name=st.sampled_from([metric.name for metric in METRICS if metric.unit != "text"]),
+    name=st.sampled_from([metric.name for metric in METRICS if metric.unit not in ("text", "0 to 1")]),
     sign=st.sampled_from(list(COMPARISONS)),
     value=st.floats(allow_nan=False, allow_infinity=False),
     blanks=st.tuples(*[st.sampled_from(["", " ", "  "])] * 3),
@@ -117,6 +120,13 @@ def test_what_is_not_known_does_not_pass():
     assert judge("error_share > 5% and entries > 10", a=None).state == "passed", "one condition fails for sure"
     assert judge("error_share > 5%", a=None, b=0.2).state == "failed"
     assert judge("samples < 1", a=0.0).state == "unknown", "a column that there is not"
+    place = {"scope": "subset", "dataset": "highd", "recording": "a", "subset": "a", "entries": 10}
+    worst = {"overlap.worst": None}
+    states = [
+        judge_gate(parse_gate("overlap.worst > 1"), [{**place, **worst, **own}]).state
+        for own in ({"overlap.entries": 0}, {})
+    ]
+    assert states == ["passed", "unknown"], "no overlap, and none looked for"
 
 
 def test_a_gate_over_nothing_does_not_pass():

@@ -52,6 +52,7 @@ def test_sizes_count_every_file_once(command, lake):
     live = [file for commit in manifest.commits.values() for file in commit.all_files]
     assert sizes["tables"] == sum(file.bytes for file in live if file.path.startswith(".files/"))
     assert sizes["tensors"] == sum(file.bytes for file in live if file.path.startswith("tensors/"))
+    assert sizes["catalog"] == (lake.root / "catalog.duckdb").stat().st_size
     assert (sizes["copies"], sizes["replaced"]) == (0, 0)
 
 
@@ -61,6 +62,8 @@ def test_a_changed_setting_names_itself_and_what_waits_for_it(command, lake):
     assert set(stale["validate"].values()) == {reason}
     assert set(stale["samples"].values()) == {"waits for validate"}
     assert stale["tensors"] == {"tensors": "waits for validate, samples, split"}
+    waits = "waits for validate, samples, split, tensors, score"
+    assert {*stale["pages"].values(), *stale["report"].values()} <= {waits, f"{waits}, pages"}, "they show all stages"
     assert {"ingest", "repair", "assess"} & {*stale} == set()
 
 
@@ -77,6 +80,13 @@ def test_what_is_new_changed_damaged_or_gone_is_said(command, tmp_path):
     steps = [line.split(maxsplit=2)[2] for line in log.read_text().splitlines() if "INFO    validate: " in line]
     assert (steps[0], {*steps[1:]}) == ("validate: 2 to do", {"validate: 01 done", "validate: 02 done"})
     assert "validate" not in list_stale(tell(command, root))
+    assert command.here("report", "--lake", root, "--quiet").code == 0
+    assert {"pages", "report"} & {*list_stale(tell(command, root))} == set(), "they show all that was made"
+    strict = {"TRACKLAKE_THRESHOLDS": '{"high_jerk_mps3": 3}'}
+    assert command.here("validate", "--lake", root, "--quiet", **strict).code == 0
+    again = list_stale(tell(command, root, **strict))
+    assert {*again["pages"].values(), *again["report"].values()} == {"validate was made again", "waits for pages"}
+    assert command.here("validate", "--lake", root, "--quiet").code == 0
     lost = load(root).commits["validate/highd/02"].files["vehicle_scores"][0]
     (root / lost.path).write_bytes(b"")
     tracks = raw / "01_tracks.csv"
