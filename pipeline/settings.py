@@ -260,7 +260,7 @@ def _read_environment() -> dict[str, Any]:
     return found
 
 
-def _read_json(name: str, text: str) -> Any:  # noqa: ANN401  (JSON)
+def _read_json(name: str, text: str) -> Any:  # noqa: ANN401  (JSON holds values of any type)
     """Return the value of a variable written as JSON."""
     try:
         return json.loads(text)
