@@ -53,7 +53,9 @@ def render_comparison(compared: Row, report: str | None = None) -> str:
 
 def summarise(compared: Row) -> list[Row]:
     """Return what differs, part by part: name, anchor, differences, those for the better and those for the worse."""
-    rows = []
+    none = {"better": 0, "worse": 0, "only": 0}
+    made_with = len(compared["made_with"])
+    rows = [{"name": "settings and versions", "anchor": "made-with", "changed": made_with} | none] if made_with else []
     for part, name in PARTS.items():
         changed = compared[part]["changed"]
         judged = [judge_change(row, row["figure"]) for row in changed if "figure" in row]
@@ -81,8 +83,11 @@ def judge_change(change: Row, figure: str) -> str:
 
 def describe_sides(compared: Row) -> str | None:
     """Describe what is synthetic in each of two compared lakes; None where nothing is."""
-    texts = [f"{side}: {compared[side]['synthetic']}" for side in ("now", "then") if compared[side].get("synthetic")]
-    return " ".join(texts).capitalize() if texts else None
+    now: str | None = compared["now"].get("synthetic")
+    then: str | None = compared["then"].get("synthetic")
+    if now == then:
+        return now
+    return " ".join(f"{side}: {text}" for side, text in (("Now", now), ("Then", then)) if text)
 
 
 def format_value(value: object) -> str:

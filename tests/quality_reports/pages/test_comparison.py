@@ -8,6 +8,7 @@ from page_elements import HOSTILE, drop_script, parse
 
 from tracklake.quality_reports.pages.comparison import (
     MINUS,
+    describe_sides,
     format_difference,
     format_value,
     judge_change,
@@ -299,3 +300,24 @@ def test_the_summary_counts_the_differences_of_every_part(against, tables):
         "name": "findings", "anchor": "rules", "changed": 1, "only": 0, "better": 0, "worse": 1,
     }  # fmt: skip
     assert (rows["samples"]["changed"], rows["samples"]["worse"], rows["samples"]["better"]) == (5, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("now", "then", "banner"),
+    [
+        (None, None, None),
+        ("No figures of highD.", "No figures of highD.", "No figures of highD."),
+        ("Synthetic data: A.", None, "Now: Synthetic data: A."),
+        ("Synthetic data: A.", "Synthetic data: B.", "Now: Synthetic data: A. Then: Synthetic data: B."),
+    ],
+)
+def test_what_is_synthetic_on_both_sides_is_said_once_in_the_same_letters(now, then, banner):
+    sides = {"now": {"synthetic": now}, "then": {"synthetic": then}}
+    assert describe_sides(sides) == banner
+
+
+def test_the_summary_names_other_settings_although_no_figure_differs(against, tables):
+    compared = against(tables)
+    compared["made_with"] = [{"name": "validate.thresholds.high_jerk_mps3", "then": 15.0, "now": 14.0}]
+    assert summarise(compared)[0]["name"] == "settings and versions"
+    assert summarise(compared)[0]["changed"] == 1
