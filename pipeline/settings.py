@@ -26,6 +26,10 @@ ENVIRONMENT, OPTION = "environment", "option"
 PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split")
 """Names of the settings that replace a protocol's own values."""
 
+KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "string": "a text"}
+KINDS |= {"path": "a path", "list": "a list", "dict": "a table"}
+"""Words for kinds of values, by pydantic's names."""
+
 Key = tuple[str, ...]
 """Name of a setting, and with a table of settings such as `thresholds` the name in it."""
 
@@ -265,7 +269,7 @@ def _read_json(name: str, text: str) -> Any:  # noqa: ANN401  (JSON holds values
     try:
         return json.loads(text)
     except ValueError as error:
-        raise SettingError(f"{name}: expected JSON, got {text!r}") from error
+        raise SettingError(f'{name}: expected JSON such as ["a"] or {{"a": 1}}, got {text!r}') from error
 
 
 def list_files(lake: Path) -> list[str]:
@@ -362,10 +366,12 @@ def _describe_problem(problem: Any) -> str:  # noqa: ANN401  (a TypedDict that p
         limits = {name: getattr(each, name) for each in declared for name in words if hasattr(each, name)}
         bounds = [words[name].format(limit) for name, limit in (limits or problem["ctx"]).items()]
         return f"expected {' and '.join(bounds)}"
-    plain = {"path_type": "expected a path", "dict_type": "expected a table"}
-    plain |= {"string_pattern_mismatch": "expected letters, digits, `.`, `_` and `-`"}
-    message = re.sub("^Input should be ", "expected ", problem["msg"].removeprefix("Value error, "))
-    return plain.get(problem["type"], message)
+    kind = problem["type"]
+    if kind == "string_pattern_mismatch":
+        return "expected letters, digits, `.`, `_` and `-`"
+    if kind in ("int_from_float", *(f"{name}_{what}" for name in KINDS for what in ("type", "parsing"))):
+        return f"expected {KINDS[kind.partition('_')[0]]}"
+    return re.sub("^Input should be ", "expected ", problem["msg"].removeprefix("Value error, "))
 
 
 def _make_error(problems: Sequence[tuple[Key, str, object]], sources: Sequence[SettingSource]) -> SettingError:

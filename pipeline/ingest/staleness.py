@@ -96,7 +96,7 @@ def _explain_recording(commit: Commit, digests: Digests) -> str:
     if versions != (VERSION, SOURCE_BY_NAME[commit.info["dataset"]].version):
         return OTHERWISE
     changed = [path for path in _list_sources(commit) if path.exists() and digests.has_changed(path)]
-    return f"{changed[0]} has changed" if changed else ""
+    return f"{changed[0]} has another size or time than when it was read" if changed else ""
 
 
 def _explain_job(job: Job, commit: Commit | None) -> str:

@@ -129,12 +129,16 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, monkeypatch):
     assert "tracklake.toml:7: setting max_backward_share: expected 0 or more and 1 or less, got 1.5" in said
     assert "tracklake.toml:8: setting split_block_s: expected a finite number, got nan" in said
     assert any(line.startswith("tracklake.toml:2: setting splits.1: expected 'flow-balanced'") for line in said)
-    (tmp_path / "tracklake.toml").write_text("thresholds = 3\n[lake]\nx = 1\n[on_ramp_lane]\nx = [1]\n[threshold]\n")
+    (tmp_path / "tracklake.toml").write_text(
+        "thresholds = 3\nnearest = 2.5\nsplit_seed = 'x'\n[lake]\nx = 1\n[on_ramp_lane]\nx = [1]\n[threshold]\n"
+    )
     assert refused().splitlines() == [
-        "tracklake.toml:2: setting lake: expected a path, got {'x': 1}",
+        "tracklake.toml:4: setting lake: expected a path, got {'x': 1}",
         "tracklake.toml:1: setting thresholds: expected a table, got 3",
-        "tracklake.toml:4: setting on_ramp_lane: unknown setting; did you mean on_ramp_lanes?",
-        "tracklake.toml:6: setting threshold: unknown setting; did you mean thresholds?",
+        "tracklake.toml:2: setting nearest: expected a whole number, got 2.5",
+        "tracklake.toml:3: setting split_seed: expected a whole number, got 'x'",
+        "tracklake.toml:6: setting on_ramp_lane: unknown setting; did you mean on_ramp_lanes?",
+        "tracklake.toml:8: setting threshold: unknown setting; did you mean thresholds?",
     ], "tables have a line, too"
     (tmp_path / "tracklake.toml").write_text("[thresholds]\nhigh_jerk_mps3 = 9\nhigh_acceleration_mps2 = -3\n")
     message = "tracklake.toml:3: setting thresholds.high_acceleration_mps2: expected 0 or more (m/s2), got -3.0"
@@ -142,7 +146,7 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, monkeypatch):
     monkeypatch.setenv("TRACKLAKE_THRESHOLDS__HIGH_JERK_MPS3", "-1")
     assert "TRACKLAKE_THRESHOLDS__HIGH_JERK_MPS3: setting thresholds.high_jerk_mps3: expected 0 or more" in refused()
     monkeypatch.setenv("TRACKLAKE_THRESHOLDS", "{")
-    assert refused() == "TRACKLAKE_THRESHOLDS: expected JSON, got '{'"
+    assert refused() == 'TRACKLAKE_THRESHOLDS: expected JSON such as ["a"] or {"a": 1}, got \'{\''
     monkeypatch.setenv("TRACKLAKE_THRESHOLDS", "")
     assert refused(workers=0).startswith("setting workers: expected 1 or more, got 0")
     assert "thresholds: expected a number or a text, not true or false" in refused(thresholds={"overlap_m": True})

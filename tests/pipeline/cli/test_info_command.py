@@ -92,7 +92,7 @@ def test_what_is_new_changed_damaged_or_gone_is_said(command, tmp_path):
     tracks = raw / "01_tracks.csv"
     tracks.write_text(tracks.read_text() + "\n")
     said = list_stale(tell(command, root))
-    assert said["ingest"] == {"highd/01": f"{tracks} has changed"}
+    assert said["ingest"] == {"highd/01": f"{tracks} has another size or time than when it was read"}
     assert said["validate"] == {"highd/02": "its files are missing or were changed"}
     shutil.rmtree(raw)
     assert "ingest" not in list_stale(tell(command, root)), "nothing to compare with"
