@@ -58,12 +58,10 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     }
     scores = [score for score in quality["model_scores"] if score["rows"]]
     for score in scores:
-        rmse = "  ".join(
-            f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in score["rows"] if row["rmse_m"] is not None
-        )
-        lines[f"RMSE, m ({score['model']})"] = (
-            f"{rmse}  (n = {score['rows'][0]['n']:,} at {score['rows'][0]['seconds']:g} s)"
-        )
+        known = [row for row in score["rows"] if row["rmse_m"] is not None]
+        rmse = "  ".join(f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in known)
+        counts = ", ".join(f"{row['n']:,}" for row in known)  # each has its own: errors over fewer samples may be less
+        lines[f"RMSE, m ({score['model']})"] = f"{rmse}  (n = {counts})" if known else "none"
     width = max(map(len, lines)) + 2
     for name, value in lines.items():
         terminal.print_line(f"{name:<{width}}{value}")

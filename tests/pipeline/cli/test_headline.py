@@ -24,3 +24,11 @@ def test_training_is_not_proposed_where_nothing_was_scored(lake, quality, capsys
     printed = capsys.readouterr().out
     assert "train lstm" not in printed
     assert f'sql "FROM subsets" --lake {lake.root}' in printed
+
+
+def test_every_error_stands_with_its_number_of_samples(lake, quality, capsys):
+    """Few samples look 3 s ahead in short recordings: their error may be less than at 2 s."""
+    rows = [{"seconds": s, "rmse_m": rmse, "n": n} for s, rmse, n in ((1, 1.371, 1427), (3, 1.82, 29), (5, None, 0))]
+    scored = quality | {"model_scores": [{"model": "mine", "part": "eval", "rows": rows}]}
+    show_headline(Terminal(), scored, lake.root / "reports", lake.root)
+    assert "1 s 1.37  3 s 1.82  (n = 1,427, 29)" in capsys.readouterr().out
