@@ -129,9 +129,10 @@ def follow_move(root: Path) -> None:
     """Make the catalog of a lake that was moved or copied again, unless another process writes to it."""
     if os.access(root, os.W_OK) and session_end.has_moved(root):
         with suppress(TracklakeError, OSError):
-            refuse_if_busy(root)
-            catalog.rebuild_catalog(root, load(root))
-            session_end.record_end(root)
+            refuse_foreign(root)
+            with _hold_lock(root):  # or the end recorded would be that of a session that began meanwhile
+                catalog.rebuild_catalog(root, load(root))
+                session_end.record_end(root)
 
 
 def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:

@@ -11,12 +11,15 @@ import pytest
 from small_lake import SUBSETS, UPPER, check_lake, make_starts, make_status, put, write_every_kind, write_round
 
 from tracklake.pipeline.lake import (
+    LakeLockedError,
+    Manifest,
     catalog,
     connect,
     is_settled,
     load,
     open_for_writing,
     query,
+    refuse_if_busy,
     scan,
 )
 from tracklake.pipeline.lake.errors import DamagedFileError
@@ -205,3 +208,21 @@ def test_the_catalog_of_a_moved_or_copied_lake_is_made_again_by_whoever_opens_it
         made = (root / "catalog.duckdb").stat().st_mtime_ns
         open_lake(root)
         assert (root / "catalog.duckdb").stat().st_mtime_ns == made
+
+
+def test_no_session_begins_while_a_moved_lake_gets_its_catalog(tmp_path: Path, monkeypatch):
+    """Its end would be recorded for a manifest whose catalog is not made yet."""
+    write_round(tmp_path / "before", 2)
+    moved = (tmp_path / "before").rename(tmp_path / "moved")
+    rebuild, seen = catalog.rebuild_catalog, []
+
+    def try_to_write(root: Path, manifest: Manifest) -> None:
+        with pytest.raises(LakeLockedError):
+            refuse_if_busy(root)
+        seen.append(root)
+        rebuild(root, manifest)
+
+    monkeypatch.setattr(catalog, "rebuild_catalog", try_to_write)
+    open_lake(moved)
+    assert seen == [moved]
+    assert is_settled(moved, load(moved))
