@@ -247,12 +247,12 @@ def _format_cell(value: object, longest: int) -> str:
 
 def show_names(terminal: Terminal) -> None:
     """Print every table and macro with its meaning; they are the same in all lakes."""
+    tables = {table.name: _take_first_sentence(table.meaning) for table in TABLES}
+    macros = {macro.signature: macro.meaning for macro in MACROS}
+    terminal.print_json({"tables": tables, "macros": macros})
     for title, meanings in (
-        (
-            "Tables (columns: tracklake sql --list tracks)",
-            {table.name: _take_first_sentence(table.meaning) for table in TABLES},
-        ),
-        ("Macros (call: FROM track('01-upper', 5))", {macro.signature: macro.meaning for macro in MACROS}),
+        ("Tables (columns: tracklake sql --list tracks)", tables),
+        ("Macros (call: FROM track('01-upper', 5))", macros),
     ):
         terminal.print_line(title, style="bold")
         width = max(map(len, meanings)) + 2
@@ -271,9 +271,12 @@ def show_name(terminal: Terminal, name: str) -> None:
         columns = list_columns(table).items()
         rows = [(column, sql_type(each.dtype), each.unit or "", each.description) for column, each in columns]
         print_table(terminal, LISTED, rows, title=table.meaning, right=[False] * len(LISTED))
+        listed = [dict(zip(LISTED, row, strict=True)) for row in rows]
+        terminal.print_json({"table": name, "meaning": table.meaning, "columns": listed})
     elif macro is not None:
         terminal.print_line(macro.signature, style="bold")
         terminal.print_line(macro.explanation)
+        terminal.print_json({"macro": macro.signature, "meaning": macro.explanation})
     else:
         known = [*TABLE_BY_NAME, *(each.name for each in MACROS)]
         near = get_close_matches(name, known, n=1)

@@ -158,6 +158,12 @@ def test_the_listing_of_a_name_says_what_its_columns_are(command):
     assert re.search(r"^length_m +FLOAT +m +along the direction of travel$", listed, flags=re.MULTILINE)
     assert re.search(r"^starts_late +BOOLEAN +eligible and first seen", listed, flags=re.MULTILINE)
     assert "\ndistance_m: from the point to the vehicle's front centre\n" in command.here("sql", "near", "--list").out
+    said = json.loads(command.here("sql", "--list", "vehicles", "--json").out)
+    assert {"column": "length_m", "type": "FLOAT", "unit": "m", "meaning": "along the direction of travel"} in said[
+        "columns"
+    ]
+    assert json.loads(command.here("sql", "near", "--list", "--json").out)["macro"].startswith("near(subset, ")
+    assert {"tables", "macros"} == json.loads(command.here("sql", "--list", "--json").out).keys()
     wrong = command.here("sql", "--list", "trakcs")
     assert wrong.code == 2
     assert "no table or macro 'trakcs'; did you mean tracks?" in wrong.err
