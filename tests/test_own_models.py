@@ -112,6 +112,8 @@ def test_its_training_is_resumed_exactly_and_with_the_same_file_only(workplace):
     (workplace / "mymodule.py").write_text(MODULE + "\n# changed\n")
     with pytest.raises(UnfinishedError, match=r"code \w{12} then, \w{12} now"):
         train("mymodule:MyModel", tensors, "run", resume=True)
+    (workplace / "mymodule.py").write_text(MODULE.replace("hidden: int = 32", "hidden: int = 16"))
+    assert find_model("mymodule:MyModel").parameters == {"hidden": 16}, "an edited file is read again"
     (workplace / "mymodule.py").write_text(MODULE)
     train("mymodule:MyModel", tensors, "run", resume=True)
     one, other = (torch.load(f"{run}/weights.pt", weights_only=True) for run in ("whole", "run"))
@@ -133,6 +135,8 @@ def test_its_training_is_resumed_exactly_and_with_the_same_file_only(workplace):
         ("nowhere:MyModel", "", "module `nowhere` cannot be imported .ModuleNotFoundError: No module named 'nowhere'"),
         (":MyModel", "", "the module `` cannot be imported"),
         ("broken:MyModel", "def", "module `broken` cannot be imported .SyntaxError"),
+        ("sys:path", "", "module `sys` cannot be imported .AttributeError"),
+        ("broken:MyModel", "raise SystemExit(0)", "module `broken` cannot be imported .SystemExit: 0"),
         ("broken:MyModel", "1 / 0", "module `broken` cannot be imported .ZeroDivisionError: division by zero"),
         ("broken:MyModel", "x = 1", "derived from PlaceNetwork or Network in .*broken.py, got no such name"),
         ("broken:os", "import os", "derived from PlaceNetwork or Network in .*broken.py, got <module 'os'"),

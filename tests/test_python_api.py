@@ -87,6 +87,8 @@ def test_a_lake_gives_subsets_tables_and_answers(opened, lake):
 def test_tensors_are_those_of_the_lake(opened):
     tensors = opened.tensors()
     assert len(tensors.samples_of("train")) + len(tensors.samples_of("eval")) > 0
+    assert repr(tensors).startswith("TensorFolder(path=")
+    assert "array" not in repr(tensors)
 
 
 def test_an_unknown_table_is_answered_with_the_nearest(opened):

@@ -70,7 +70,7 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 def _report_bug(terminal: Terminal, bug: Exception) -> typer.Exit:
     own = sys.modules.get("tracklake.training.models.own")  # None: no model of the user's own is in use
-    files: set[str] = set() if own is None else own.OWN_FILES
+    files: set[str] = set() if own is None else {file for file, _ in own.OWN_FILES.values()}
     frames = reversed(traceback.extract_tb(bug.__traceback__))
     place = next((f"{frame.filename}, line {frame.lineno}" for frame in frames if frame.filename in files), None)
     if place is not None:

@@ -1,7 +1,7 @@
 """Tensor folders: opened memory-mapped, checked against their declaration, gathered in batches by indexing."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -44,9 +44,9 @@ class TensorFolder:
     """
 
     path: Path
-    index: dict[str, Any]
+    index: dict[str, Any] = field(repr=False)
     protocol: Protocol
-    arrays: Mapping[str, npt.NDArray[Any]]
+    arrays: Mapping[str, npt.NDArray[Any]] = field(repr=False)
 
     @classmethod
     def open(cls, path: str | Path) -> Self:

@@ -2,7 +2,7 @@
 
 import inspect
 import sys
-from importlib import import_module
+from importlib import import_module, reload
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,8 +10,8 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.training.models import Model, Phase, Reads, Recipe
 
-OWN_FILES: set[str] = set()
-"""Files of the modules that were imported for models: an error raised in them is not ours."""
+OWN_FILES: dict[str, tuple[str, str]] = {}
+"""File and digest of each module that was imported for a model: an error raised in the file is not ours."""
 
 
 def find_own_model(name: str) -> Model:
@@ -30,13 +30,17 @@ def find_own_model(name: str) -> Model:
         sys.path.append(here)
     try:
         found = import_module(module)
-    except Exception as error:  # whatever the user's own code raises
+        file = str(found.__file__)
+        code = file, hash_chunks([Path(file).read_bytes()], 12)
+        if OWN_FILES.get(module, code) != code:
+            found = reload(found)  # edited while this process runs, as from a notebook
+    except (Exception, SystemExit) as error:  # whatever the user's own code raises
         raise UsageError(
             f"model `{name}`: the module `{module}` cannot be imported ({type(error).__name__}: {error}). It is looked "
             f"for in the working folder, {here}, and among installed modules"
         ) from error
-    file, own = str(found.__file__), getattr(found, builder, "no such name")
-    OWN_FILES.add(file)
+    own = getattr(found, builder, "no such name")
+    OWN_FILES[module] = code
     if not (isinstance(own, type) and issubclass(own, Network)):
         raise UsageError(f"model `{name}`: expected a class derived from PlaceNetwork or Network in {file}, got {own}")
     arguments = [each for each in inspect.signature(own).parameters.values() if not each.kind.name.startswith("VAR")]
@@ -52,8 +56,3 @@ def find_own_model(name: str) -> Model:
         raise UsageError(f"model `{name}`: the class in {file} lacks {', '.join(lacking)}; see docs/own-models.md")
     parameters = {each.name: each.default for each in arguments[1:] if isinstance(each.default, int | float | str)}
     return Model(name, "a model of the user's own", "", module, builder, parameters, reads, recipe)
-
-
-def hash_code(model: str) -> str:
-    """Return the digest of the file that a user's own model was imported from."""
-    return hash_chunks([Path(str(sys.modules[model.partition(":")[0]].__file__)).read_bytes()], 12)

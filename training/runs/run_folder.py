@@ -64,9 +64,9 @@ def describe_run(
         "tensors": digest_tensors(folder),
     }
     if ":" in model:  # a user's own
-        from tracklake.training.models.own import hash_code
+        from tracklake.training.models.own import OWN_FILES
 
-        run["code"] = hash_code(model)
+        run["code"] = OWN_FILES[model.partition(":")[0]][1]
     return dict(json.loads(json.dumps(run, allow_nan=False)))
 
 
