@@ -27,6 +27,8 @@ SERVER_START_S = 120.0
 
 # Two workers on two cores: more threads than one would only spin and wait for each other. Commands inherit it.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Polars alike, in the workers only: on small tables a second thread costs a seventh more. Commands use all cores.
+os.environ.setdefault("POLARS_MAX_THREADS", "1")
 
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
 settings.register_profile("tracklake", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -109,7 +111,8 @@ class Command:
 @pytest.fixture(scope="session")
 def clean_environment() -> dict[str, str]:
     """The environment without this user's settings of Prefect and of tracklake."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("TRACKLAKE_", "PREFECT_"))}
+    others = ("TRACKLAKE_", "PREFECT_", "POLARS_MAX_THREADS")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
     return {**kept, "COLUMNS": "200", "PYTHONWARNINGS": "default"}
 
 

@@ -1,6 +1,7 @@
 """The Python interface as docs/python.md and the notebook show it, also beside folders of the user's own."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -13,6 +14,8 @@ import tracklake
 from tracklake.schemas import TABLES
 
 ROOT = Path(__file__).parents[1]
+FOLDERS = ("training", "schemas", "pipeline", "quality_reports")
+"""Folders of our packages, whose names a user's folders may have."""
 PAGE = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), flags=re.DOTALL))
 NOTEBOOK = json.loads((ROOT / "examples" / "quickstart.ipynb").read_text())
 CELLS = "\n".join("".join(cell["source"]) for cell in NOTEBOOK["cells"] if cell["cell_type"] == "code")
@@ -24,32 +27,48 @@ def opened(lake):
         yield opened
 
 
-def make_workplace(folder: Path, lake: Path, sample: Path) -> Path:
-    """A user's folder with a lake, the sample, and packages of the user's own with the names of our folders."""
-    shutil.copytree(lake, folder / "lake")
-    (folder / "sample").symlink_to(sample)
-    for name in ("training", "schemas", "pipeline", "quality_reports"):
-        (folder / name).mkdir()
-        (folder / name / "__init__.py").write_text("raise ImportError('a folder of the user')\n")
-    return folder
+@pytest.fixture
+def workplace(lake, sample, tmp_path) -> Path:
+    """A user's folder with a lake and the sample."""
+    shutil.copytree(lake.root, tmp_path / "lake")
+    (tmp_path / "sample").symlink_to(sample)
+    return tmp_path
 
 
-def test_the_examples_run_beside_folders_of_the_same_names(lake, sample, tmp_path, command):
-    """Those of docs/python.md, then those of the notebook, each in a folder of its own."""
-    code = "import os\n"
-    for name, examples in (("page", PAGE), ("notebook", CELLS)):
-        folder = make_workplace(tmp_path / name, lake.root, sample)
-        code += f"os.chdir({str(folder)!r})\nexec({examples!r}, {{}})\nprint('finished')\n"
+@pytest.mark.parametrize("examples", [PAGE, CELLS], ids=["page", "notebook"])
+def test_the_examples_run(workplace, command, examples, monkeypatch):
+    monkeypatch.chdir(workplace)
+    monkeypatch.setattr(os, "environ", command.environment)
+    exec(examples, {})
+
+
+def test_a_user_may_have_folders_of_the_same_names(workplace, command):
+    """Everything that the examples import and open works beside packages with the names of our folders."""
+    for name in FOLDERS:
+        (workplace / name).mkdir()
+        (workplace / name / "__init__.py").write_text("raise ImportError('a folder of the user')\n")
+    code = """
+import tracklake, tracklake.training.train, tracklake.quality_reports.pages.report
+with tracklake.open("lake") as lake:
+    print(tracklake.run("sample", lake="lake").built, lake.subsets().height > 0, lake.tensors().path.exists())
+"""
     done = subprocess.run(
         [sys.executable, "-c", code],
-        cwd=tmp_path,
+        cwd=workplace,
         env=command.environment,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines().count("finished") == 2
+    assert (done.returncode, done.stdout.strip()) == (0, "{} True True"), done.stderr
+
+
+def test_no_module_imports_one_of_the_user():
+    """Our packages are imported as tracklake's, also by what is imported late."""
+    generic = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(FOLDERS)})\b", re.MULTILINE)
+    modules = [module for name in FOLDERS for module in (ROOT / name).rglob("*.py")]
+    assert len(modules) > 100
+    assert [str(module) for module in modules if generic.search(module.read_text())] == []
 
 
 def test_the_notebook_is_committed_without_outputs():

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import sklearn
-import skops.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, random_examples, track
@@ -99,14 +97,29 @@ def test_stored_and_read_back(forest, tmp_path):
         assert getattr(back, name) == getattr(forest, name)
     assert back.settings == FEW
     assert [file.name for file in tmp_path.iterdir()] == ["forest.skops"], "nothing is left beside it"
-    found = skops.io.get_untrusted_types(file=tmp_path / "forest.skops")
+    from skops.io import get_untrusted_types  # slow to import: not while tests are collected
+
+    found = get_untrusted_types(file=tmp_path / "forest.skops")
     assert found == ["sklearn.tree._tree.Tree"], "numbers are all that is read, and no code"
 
 
 def rewrite(file, **changes):
     """Store the parts of a file again, some of them changed."""
-    content = skops.io.load(file, trusted=["sklearn.tree._tree.Tree"])
-    skops.io.dump({name: changes[name](part) if name in changes else part for name, part in content.items()}, file)
+    from skops.io import dump, load
+
+    content = load(file, trusted=["sklearn.tree._tree.Tree"])
+    dump({name: changes[name](part) if name in changes else part for name, part in content.items()}, file)
+
+
+def store(content):
+    """Put something else into the file."""
+
+    def change(file):
+        from skops.io import dump
+
+        dump(content, file)
+
+    return change
 
 
 def in_header(**changes):
@@ -156,6 +169,8 @@ def save_version_1(file):
 
 def set_version(file):
     """Change scikit-learn's version where skops notes it."""
+    import sklearn
+
     with zipfile.ZipFile(file) as stored:
         members = {name: stored.read(name) for name in stored.namelist()}
     schema = members["schema.json"].replace(
@@ -175,8 +190,8 @@ DAMAGES = {
     "something else": (lambda file: file.write_text("forest"), UNREADABLE),
     "a pickle": (lambda file: file.write_bytes(pickle.dumps({"header": "{}"})), UNREADABLE),
     "an earlier version": (save_version_1, UNREADABLE),
-    "other contents": (lambda file: skops.io.dump([1, 2], file), UNREADABLE),
-    "a missing part": (lambda file: skops.io.dump({"header": "{}"}, file), UNREADABLE + r" \('classifier'\)"),
+    "other contents": (store([1, 2]), UNREADABLE),
+    "a missing part": (store({"header": "{}"}), UNREADABLE + r" \('classifier'\)"),
     "a type of someone else's": (
         lambda file: rewrite(file, classifier=lambda _: Foreign()),
         UNREADABLE + ".*Untrusted types found in the file: .*Foreign",
