@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from tracklake.pipeline.lake.errors import QueryError
+from tracklake.pipeline.lake.files import STORE
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 
@@ -106,6 +107,9 @@ def query_errors() -> Iterator[None]:
             "the lake was closed before this result was fetched; fetch it first, or open it again"
         ) from closed
     except duckdb.Error as failed:
+        unread = isinstance(failed, duckdb.InvalidInputException | duckdb.IOException)
+        if unread and f"{STORE}/" in str(failed):  # the file's path
+            raise QueryError(f"{failed}\nThe file is damaged; `tracklake check` says how it is made again.") from failed
         tables = ", ".join(table.name for table in TABLES)
         macros = ", ".join(macro.signature for macro in MACROS)
         raise QueryError(f"{failed}\nTables: {tables}.\nMacros: {macros}.") from failed

@@ -147,6 +147,10 @@ def test_check_reads_a_lake_that_another_process_writes(command, small):
     assert "is writing to this lake" in done.err
     assert "catalog and folders did not agree with the manifest, and were left so" in done.out
     assert "its bytes are not those that were written" in done.err
+    last = root / load(root).live("vehicles")[-1].path  # not the first, whose columns are looked at on opening
+    last.write_bytes(b"x" * last.stat().st_size)
+    asked = command.here("sql", "FROM vehicles", "--lake", root)
+    assert (asked.code, "`tracklake check`" in asked.err, "Macros:" in asked.err) == (1, True, False), asked.err
 
 
 def test_a_damaged_copy_in_a_folder_is_found_and_linked_again(command, small):
