@@ -4,6 +4,7 @@ import json
 import pickle
 import zipfile
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -112,14 +113,8 @@ def rewrite(file, **changes):
 
 
 def store(content):
-    """Put something else into the file."""
-
-    def change(file):
-        from skops.io import dump
-
-        dump(content, file)
-
-    return change
+    """Put something else into the file; skops is imported late, since that takes seconds."""
+    return lambda file: import_module("skops.io").dump(content, file)
 
 
 def in_header(**changes):
