@@ -141,7 +141,7 @@ def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: 
 
 def _write_selects(root: Path, manifest: Manifest) -> dict[str, str]:
     """Return a SELECT of the live rows of every table, by name."""
-    folder = str(root.resolve())
+    folder = root.resolve().as_posix()  # with slashes on Windows, too, as `_write_read` looks for folders
     return {
         table.name: _write_select(table, manifest, lambda path: escape_pattern(f"{folder}/{path}")) for table in TABLES
     }

@@ -117,7 +117,7 @@ def connect(lake: Path | str) -> LakeConnection:
         },
     )
     create_views(connection, root, manifest)
-    live = [str(root / file.path) for table in TABLES for file in manifest.live(table.name)]
+    live = [f"{root.as_posix()}/{file.path}" for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
     allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})
     for setting in (

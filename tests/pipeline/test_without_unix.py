@@ -5,10 +5,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path, PureWindowsPath
+from types import SimpleNamespace
 
 import pytest
 from highd_files import write_recording
 
+from tracklake.pipeline.lake import catalog
 from tracklake.pipeline.lake.files import escape_name, list_files, read_partition
 from tracklake.schemas import TRACKS
 
@@ -83,6 +85,15 @@ def test_files_of_a_lake_are_listed_with_slashes(monkeypatch: pytest.MonkeyPatch
         patched.setattr(os, "walk", lambda _top: iter(found))
         listed = list_files(PureWindowsPath("C:\\lake"), [".files"])
     assert listed == {".files/tracks/subset=01-upper/part-1.parquet"}
+
+
+def test_a_folder_above_the_lake_is_no_partition_with_backslashes_either():
+    """Otherwise DuckDB would take every row's data set from the folder in which the lake lies."""
+    file = SimpleNamespace(path=".files/tracks/dataset=highd/subset=01-upper/part-1.parquet")
+    manifest, root = SimpleNamespace(live=lambda _table: [file]), PureWindowsPath("C:\\dataset=ngsim\\lake")
+    select = catalog._write_selects(SimpleNamespace(resolve=lambda: root), manifest)["tracks"]
+    assert "CAST('highd' AS VARCHAR)" in select
+    assert "hive_partitioning = true" not in select
 
 
 @pytest.mark.parametrize(
