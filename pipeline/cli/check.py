@@ -96,24 +96,29 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
     """Compare every live file with its checksum, mend what can be mended, and return what is damaged."""
     manifest = load(root)
     copies = find_false_copies(root, manifest)
-    for name in copies:
-        terminal.print_problem(f"{root / name}: not the bytes of the live file, of which it is a copy", label="damaged")
+    left = [DamagedFile("", name, "not the bytes of the live file, of which it is a copy") for name in copies]
+    for copy in left:
+        terminal.print_problem(f"{root / copy.path}: {copy.reason}", label="damaged")
     if copies or not is_settled(root, manifest):
-        outcome = "are up to date again" if _mend(root, terminal, copies=copies) else "were left so"
+        is_mended = _mend(root, terminal, copies=copies)
+        outcome = "are up to date again" if is_mended else "were left so"
         terminal.print_line(f"catalog and folders did not agree with the manifest, and {outcome}")
+        left = [] if is_mended else left
     manifest = load(root)
     damaged = find_damaged_files(root, manifest)
     files = [file for commit in manifest.commits.values() for file in commit.all_files if file.sha256 is not None]
     size = sum(file.bytes for file in files)
     for file in damaged:
         terminal.print_problem(f"{root / file.path}: {file.reason}", label="damaged")
-    record |= {"files": len(files), "bytes": size, "damaged": [file._asdict() for file in damaged]}
+    record |= {"files": len(files), "bytes": size, "damaged": [file._asdict() for file in (*damaged, *left)]}
     if damaged:
         _mend(root, terminal, damaged)
         terminal.print_problem(f"{len(damaged)} of {len(files):,} files are damaged. {_advise(root, manifest)}")
+    elif left:
+        terminal.print_problem(f"{len(left)} copies are damaged: run `tracklake check` again later")
     else:
         terminal.print_line(f"{len(files):,} files ({size / 1e6:,.1f} MB): all as they were written")
-    return damaged
+    return [*damaged, *left]
 
 
 def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), copies: Sequence[str] = ()) -> bool:

@@ -160,6 +160,14 @@ def test_a_damaged_copy_in_a_folder_is_found_and_linked_again(command, small):
     shutil.copytree(root, copied)
     shown = next((copied / "tracks").rglob("*.parquet"))
     before = shown.read_bytes()
+    with open_for_writing(copied):
+        shown.unlink()  # a copy in the place of a link
+        shown.write_bytes(before)
+        flip(shown)
+        left = command.here("check", "--lake", copied)
+    assert (left.code, "1 copies are damaged" in left.err) == (1, True), left.err
+    shown.unlink(missing_ok=True)
+    shown.write_bytes(before)
     flip(shown)
     done = command.here("check", "--lake", copied)
     assert done.code == 0
