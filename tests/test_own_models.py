@@ -79,6 +79,9 @@ def test_a_model_of_ones_own_is_trained_evaluated_and_drawn(command, lake, workp
         assert (config["recipe"]["batch_size"], config["recipe"]["learning_rate"]) == (32, 2e-3)
         assert here("evaluate", "MyModel", "--out", "scores.csv", *options).code == 0
         assert here("predict", "MyModel", "--out", "drawn.svg", *options).code == 0
+        (workplace / "mymodule.py").write_text(MODULE + "\n# changed\n")
+        changed = here("evaluate", "MyModel", *options)
+        assert (changed.code, "the file of `mymodule:MyModel` has changed since" in changed.err) == (1, True)
         del sys.modules["mymodule"]
         (workplace / "mymodule.py").unlink()
         gone = here("evaluate", "MyModel", *options)

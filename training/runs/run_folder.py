@@ -22,6 +22,7 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, Recipe, find_model
+from tracklake.training.models.own import OWN_FILES
 from tracklake.training.runs.checkpoint import RESTART, UnfinishedError, describe_damage, is_unfinished
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def describe_run(
 ) -> dict[str, Any]:
     """Return the content of `config.json` without the versions; a model without recipe does not learn.
 
-    `code` is the digest of the file of a user's own model, so that a training is not resumed with other code.
+    `code` is the digest of the file of a user's own model, so that no run is used with other code.
     """
     run = {
         "version": RUN_VERSION,
@@ -64,8 +65,6 @@ def describe_run(
         "tensors": digest_tensors(folder),
     }
     if ":" in model:  # a user's own
-        from tracklake.training.models.own import OWN_FILES
-
         run["code"] = OWN_FILES[model.partition(":")[0]][1]
     return dict(json.loads(json.dumps(run, allow_nan=False)))
 
@@ -130,6 +129,8 @@ def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]
     except (UsageError, *UNREADABLE) as wrong:
         advice = "run the command where the module is found" if ":" in config["model"] else AGAIN
         raise StaleRunError(f"{path}: {wrong}; {advice}") from None
+    if ":" in model.name and config.get("code") != OWN_FILES[model.module][1]:
+        raise StaleRunError(f"{path}: the file of `{model.name}` has changed since; restore it, or {AGAIN}")
     if model.learns:
         _load_weights(predictor, path / "weights.pt")
         predictor.eval()
