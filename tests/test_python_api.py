@@ -111,7 +111,9 @@ def test_tensors_are_those_of_the_lake(opened):
 
 
 def test_an_unknown_table_is_answered_with_the_nearest(opened):
-    with pytest.raises(tracklake.TracklakeError, match=r"no table 'trakcs': expected tracks\. docs/tables\.md"):
+    with pytest.raises(
+        tracklake.TracklakeError, match=r"no table 'trakcs' \(docs/tables\.md lists all\); did you mean tracks\?"
+    ):
         opened.table("trakcs")
 
 

@@ -3,7 +3,6 @@
 import errno
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
@@ -24,7 +23,7 @@ from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
 from tracklake.schemas.files import write_output
-from tracklake.schemas.text import make_visible
+from tracklake.schemas.text import make_visible, suggest_name
 
 if TYPE_CHECKING:
     from io import IOBase
@@ -279,9 +278,7 @@ def show_name(terminal: Terminal, name: str) -> None:
         terminal.print_json({"macro": macro.signature, "meaning": macro.explanation})
     else:
         known = [*TABLE_BY_NAME, *(each.name for each in MACROS)]
-        near = get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise UsageError(f"no table or macro {name!r}{hint} `tracklake sql --list` shows all.")
+        raise UsageError(f"no table or macro {name!r} (`tracklake sql --list` shows all); {suggest_name(name, known)}")
 
 
 def _take_first_sentence(text: str) -> str:

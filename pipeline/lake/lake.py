@@ -1,6 +1,5 @@
 """A lake as one object: SQL, tables and tensors."""
 
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -12,6 +11,7 @@ from tracklake.pipeline.lake.manifest import MANIFEST, load
 from tracklake.pipeline.lake.query import LakeConnection, Parameters, connect
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.pipeline.lake.writer import follow_move
+from tracklake.schemas.text import suggest_name
 
 if TYPE_CHECKING:
     from tracklake.training.data.tensor_folder import TensorFolder
@@ -71,8 +71,7 @@ class Lake:
             LakeError: no table of this name.
         """
         if name not in TABLE_BY_NAME:
-            near = get_close_matches(name, TABLE_BY_NAME, n=1) or sorted(TABLE_BY_NAME)
-            raise LakeError(f"no table {name!r}: expected {' or '.join(near)}. docs/tables.md lists all tables.")
+            raise LakeError(f"no table {name!r} (docs/tables.md lists all); {suggest_name(name, TABLE_BY_NAME)}")
         return scan(self.path, load(self.path), TABLE_BY_NAME[name])
 
     def subsets(self) -> pl.DataFrame:

@@ -140,7 +140,7 @@ STAGE = Stage(
     scope="lake",
     after=(),  # the report shows what there is
     settings=(_describe_settings,),
-    version=6,
+    version=7,
     build=build,
     extra_inputs=_find_inputs,
 )

@@ -7,6 +7,7 @@ from markupsafe import Markup
 
 from tracklake.quality_reports.pages.rendering import describe_origins, make_environment
 from tracklake.quality_reports.plots import charts as plots
+from tracklake.quality_reports.plots.axes import KMH_PER_MPS
 from tracklake.quality_reports.summaries import Row
 from tracklake.schemas.quality import Quality, SplitBalance, Splits
 
@@ -20,6 +21,14 @@ SHARED = {
     "cut": "neighbors cut off",
 }
 """Drawn shares of the evaluation part, and their names."""
+SHIFTED = {
+    "vehicles_per_lane_s": "vehicles per lane and second",
+    "speed": "speed, m/s",
+    "left": "share of samples that change to the left",
+    "right": "share of samples that change to the right",
+    "brake": "share of samples that brake",
+}
+"""Quantities whose distributions are compared, with the units of their means."""
 
 
 def render_splits(quality: Quality) -> str | None:
@@ -47,8 +56,9 @@ def render_splits(quality: Quality) -> str | None:
                     "settings": json.loads(recipe["parameters"]),
                     **{
                         name: [row for row in splits[name] if row["split"] == recipe["split"]]
-                        for name in ("balance", "members", "leakage", "context", "shifts", "left_out")
+                        for name in ("balance", "members", "leakage", "context", "left_out")
                     },
+                    "shifts": name_shifts([{**row} for row in splits["shifts"] if row["split"] == recipe["split"]]),
                     "rates": [
                         (dataset, Markup(plots.draw_split(splits["members"], splits["balance"], name, dataset)))
                         for name, dataset in _list_datasets(splits["balance"], recipe["split"])
@@ -58,6 +68,18 @@ def render_splits(quality: Quality) -> str | None:
             ],
         )
     )
+
+
+def name_shifts(shifts: Sequence[Row]) -> list[Row]:
+    """Return shifts with quantities in words and units; speeds are in m/s, and on a second row in km/h."""
+    rows = []
+    for row in shifts:
+        rows.append({**row, "quantity": SHIFTED.get(row["quantity"], row["quantity"])})
+        if row["quantity"] == "speed":
+            means = ("mean", "other_mean", "std", "other_std")
+            in_kmh = {name: None if row[name] is None else KMH_PER_MPS * row[name] for name in means}
+            rows.append({**row, "quantity": "speed, km/h", **in_kmh})
+    return rows
 
 
 def compare_splits(splits: Splits) -> list[Row]:

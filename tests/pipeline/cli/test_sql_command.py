@@ -166,7 +166,7 @@ def test_the_listing_of_a_name_says_what_its_columns_are(command):
     assert {"tables", "macros"} == json.loads(command.here("sql", "--list", "--json").out).keys()
     wrong = command.here("sql", "--list", "trakcs")
     assert wrong.code == 2
-    assert "no table or macro 'trakcs'; did you mean tracks?" in wrong.err
+    assert "no table or macro 'trakcs' (`tracklake sql --list` shows all); did you mean tracks?" in wrong.err
 
 
 def test_a_wrong_name_gets_duckdbs_guess_and_what_there_is(command, lake):

@@ -321,3 +321,12 @@ def test_the_summary_names_other_settings_although_no_figure_differs(against, ta
     compared["made_with"] = [{"name": "validate.thresholds.high_jerk_mps3", "then": 15.0, "now": 14.0}]
     assert summarise(compared)[0]["name"] == "settings and versions"
     assert summarise(compared)[0]["changed"] == 1
+
+
+def test_speeds_stand_in_km_per_hour_beside_metres_per_second(against, tables):
+    compared = against(tables)
+    row = {"dataset": "highd", "subset": "01-upper", "figure": "mean_speed_mps", **pair(10.0, 12.5, 2.5)}
+    compared["subsets"]["changed"] = [row]
+    html = render_comparison(compared)
+    assert '<td class="n">10 <small>36 km/h</small></td><td class="n">12.5 <small>45 km/h</small></td>' in html
+    assert ">+2.5 <small>9 km/h</small></td>" in html

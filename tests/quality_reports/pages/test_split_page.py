@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tracklake.quality_reports.pages.report import build_report
-from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits
+from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, name_shifts
 
 CSP, BALANCED = "csp-2018", "flow-balanced"
 PAIR = {"dataset": "highd", "part": "train", "other_part": "eval"}
@@ -114,3 +114,13 @@ def test_a_split_of_one_part_says_so(open_lake, tables):
     assert "No split of this lake has both a training and an evaluation part." in html
     assert html.count("It has one part only.") == 2
     assert html.count("<svg") == 2
+
+
+def test_the_speeds_of_the_parts_stand_in_both_units():
+    row = {"quantity": "speed", "mean": 10.0, "other_mean": None, "std": 2.0, "other_std": 0.5, "shift": 0.25}
+    brake = {**row, "quantity": "brake", "mean": 0.125}
+    assert name_shifts([row, brake]) == [
+        {**row, "quantity": "speed, m/s"},
+        {**row, "quantity": "speed, km/h", "mean": 36.0, "std": 7.2, "other_std": 1.8},
+        {**brake, "quantity": "share of samples that brake"},
+    ]
