@@ -4,11 +4,22 @@ from tracklake.schemas.columns import StructureError as StructureError
 from tracklake.schemas.columns import Table as Table
 from tracklake.schemas.columns import column as column
 from tracklake.schemas.completeness import COMPLETENESS as COMPLETENESS
+from tracklake.schemas.drives import DRIVES as DRIVES
+from tracklake.schemas.drives import STATIONS as STATIONS
 from tracklake.schemas.findings import FINDINGS as FINDINGS
 from tracklake.schemas.ingestion import INGEST_LOG as INGEST_LOG
 from tracklake.schemas.ingestion import REJECTS as REJECTS
+from tracklake.schemas.messages import BSM as BSM
+from tracklake.schemas.messages import EGO_STATES as EGO_STATES
 from tracklake.schemas.missing_starts import MISSING_STARTS as MISSING_STARTS
 from tracklake.schemas.missing_starts import START_CUTOFFS as START_CUTOFFS
+from tracklake.schemas.perception import ASSOCIATION as ASSOCIATION
+from tracklake.schemas.perception import DETECTIONS as DETECTIONS
+from tracklake.schemas.perception import DRIVE_FINDINGS as DRIVE_FINDINGS
+from tracklake.schemas.perception import LIDAR_CLUSTERS as LIDAR_CLUSTERS
+from tracklake.schemas.perception import LIDAR_RETURNS as LIDAR_RETURNS
+from tracklake.schemas.perception import SURROUNDING as SURROUNDING
+from tracklake.schemas.perception import SURROUNDING_TRUTH as SURROUNDING_TRUTH
 from tracklake.schemas.samples import NEIGHBORS as NEIGHBORS
 from tracklake.schemas.samples import SAMPLE_COUNTS as SAMPLE_COUNTS
 from tracklake.schemas.samples import SAMPLE_DROPS as SAMPLE_DROPS
@@ -58,4 +69,15 @@ TABLES: tuple[Table, ...] = (
     SPLIT_LEAKAGE,
     SPLIT_CONTEXT,
     SPLIT_SHIFTS,
+    DRIVES,
+    STATIONS,
+    BSM,
+    EGO_STATES,
+    DETECTIONS,
+    LIDAR_RETURNS,
+    LIDAR_CLUSTERS,
+    ASSOCIATION,
+    SURROUNDING,
+    SURROUNDING_TRUTH,
+    DRIVE_FINDINGS,
 )

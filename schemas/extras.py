@@ -12,6 +12,7 @@ EXTRAS = {
     "matlab": ("scipy",),
     "sample": ("sumo",),
     "distributed": ("prefect_dask",),
+    "onboard": ("pyproj", "rosbags", "scipy", "sklearn"),
 }
 """Modules that each extra installs, by the extra's name in pyproject.toml."""
 
