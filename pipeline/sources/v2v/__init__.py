@@ -1,0 +1,1 @@
+"""Logs of instrumented vehicles: messages, bags, and what a drive is made of."""
