@@ -1,8 +1,11 @@
 """Small highD recordings that go through the whole pipeline in a second or two, and what is counted in them."""
 
+import shutil
 from pathlib import Path
 
 from highd_files import META_HEADER, TRACKS_HEADER, VEHICLES_HEADER, meta_row, track_row
+
+from tracklake.pipeline.lake.session_end import record_end
 
 VEHICLES = 8
 """Vehicles on each of the two carriageways."""
@@ -32,3 +35,13 @@ def write_highd(folder: Path, number: str, *, speed_mps: float = 30.0) -> list[P
         paths.append(folder / f"{number}_{kind}.csv")
         paths[-1].write_text("\n".join([header, *rows]) + "\n")
     return paths
+
+
+def copy_lake(made: Path, folder: Path, name: str) -> tuple[Path, Path]:
+    """Copy raw/ and the lake made of it into another folder, as if the lake had been made there."""
+    raw = shutil.copytree(made / "raw", folder / "raw")
+    root = shutil.copytree(made / name, folder / name)
+    manifest = root / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(str(made / "raw"), str(raw)))
+    record_end(root)
+    return raw, root

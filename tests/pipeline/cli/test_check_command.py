@@ -7,7 +7,7 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from small_recordings import write_highd
+from small_recordings import copy_lake, write_highd
 
 from tracklake.pipeline.lake import DamagedFileError, is_settled, load, open_for_writing
 from tracklake.pipeline.settings import Settings
@@ -32,15 +32,21 @@ def find_live(root: Path, table: str) -> Path:
     return root / load(root).live(table)[0].path
 
 
-@pytest.fixture
-def small(command, tmp_path) -> tuple[Path, Path]:
-    """A source of two recordings, and a lake into which they were ingested."""
-    raw, root = tmp_path / "raw", tmp_path / "my lake"
-    raw.mkdir()
+@pytest.fixture(scope="module")
+def ingested(command, plain_flows, tmp_path_factory) -> Path:
+    """A folder with raw/ of two recordings, and a lake into which they were ingested."""
+    del plain_flows
+    folder = tmp_path_factory.mktemp("ingested")
     for recording in ("01", "02"):
-        write_highd(raw, recording)
-    assert command.here("ingest", raw, "--lake", root, "--quiet").code == 0
-    return raw, root
+        write_highd(folder / "raw", recording)
+    assert command.here("ingest", folder / "raw", "--lake", folder / "my lake", "--quiet").code == 0
+    return folder
+
+
+@pytest.fixture
+def small(ingested, tmp_path) -> tuple[Path, Path]:
+    """Source and lake, of one's own; the lake remembers the files where this test has them."""
+    return copy_lake(ingested, tmp_path, "my lake")
 
 
 def test_flipped_bits_are_found_and_made_again(command, small):

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from small_recordings import ENTRIES, KINDS, write_highd
+from small_recordings import ENTRIES, KINDS, copy_lake, write_highd
 
 from tracklake.pipeline.ingest.removal import remove_recordings
 from tracklake.pipeline.lake import Commit, LakeError, connect, load, open_for_writing
-from tracklake.pipeline.lake.session_end import record_end
 from tracklake.pipeline.orchestration import flows
 
 HEADER = "Vehicle_ID,Frame_ID,Global_Time,Local_X,Local_Y,v_Vel"
@@ -77,12 +76,7 @@ def made(command, plain_flows, empty_charts, tmp_path_factory) -> Path:
 @pytest.fixture
 def copy(made, tmp_path) -> tuple[Path, Path]:
     """Raw folder and lake, of one's own; the lake remembers the files where this test has them."""
-    shutil.copytree(made / "raw", tmp_path / "raw")
-    shutil.copytree(made / "lake", tmp_path / "lake")
-    manifest = tmp_path / "lake" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace(str(made / "raw"), str(tmp_path / "raw")))
-    record_end(tmp_path / "lake")
-    return tmp_path / "raw", tmp_path / "lake"
+    return copy_lake(made, tmp_path, "lake")
 
 
 def test_tables_of_removed_files_stay_and_are_named_in_one_note(command, ingest, copy):
