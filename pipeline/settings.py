@@ -136,9 +136,9 @@ class Settings(BaseModel):
             ]
             raise _make_error(problems, sources) from error
         if self.thresholds:  # the rules' modules are imported only where some are set
-            from tracklake.quality_reports.rules.registry import RULES, find_threshold_faults
+            from tracklake.quality_reports.rules.registry import ALL_RULES, find_threshold_faults
 
-            faults = find_threshold_faults(RULES, self.thresholds).items()
+            faults = find_threshold_faults(ALL_RULES, self.thresholds).items()
             if faults:
                 found = [(("thresholds", name), fault, self.thresholds[name]) for name, fault in faults]
                 raise _make_error(found, sources)

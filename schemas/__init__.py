@@ -15,6 +15,7 @@ from tracklake.schemas.missing_starts import MISSING_STARTS as MISSING_STARTS
 from tracklake.schemas.missing_starts import START_CUTOFFS as START_CUTOFFS
 from tracklake.schemas.perception import ASSOCIATION as ASSOCIATION
 from tracklake.schemas.perception import DETECTIONS as DETECTIONS
+from tracklake.schemas.perception import DRIVE_CHECKS as DRIVE_CHECKS
 from tracklake.schemas.perception import DRIVE_FINDINGS as DRIVE_FINDINGS
 from tracklake.schemas.perception import LIDAR_CLUSTERS as LIDAR_CLUSTERS
 from tracklake.schemas.perception import LIDAR_RETURNS as LIDAR_RETURNS
@@ -80,4 +81,5 @@ TABLES: tuple[Table, ...] = (
     SURROUNDING,
     SURROUNDING_TRUTH,
     DRIVE_FINDINGS,
+    DRIVE_CHECKS,
 )

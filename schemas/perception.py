@@ -181,3 +181,20 @@ DRIVE_FINDINGS = Table(
         "worst": column(pl.Float64, "the most extreme value in the run, in the rule's unit"),
     },
 )
+
+
+DRIVE_CHECKS = Table(
+    "drive_checks",
+    "One row per rule of a drive: how many messages or ticks it was checked on, and how many break it.",
+    key=("rule",),
+    columns={
+        **PLACE,
+        "rule": column(pl.String, "the rule's name"),
+        "severity": column(pl.String, "error, warning or info", isin=SEVERITIES),
+        "checked": column(pl.Int64, "messages or ticks with what the rule reads; 0: not checked", ge=0),
+        "entries": column(pl.Int64, "messages or ticks that break it", ge=0),
+        "vehicles": column(pl.Int32, "vehicles with one", ge=0),
+        "runs": column(pl.Int32, "rows of drive_findings", ge=0),
+        "worst": column(pl.Float64, "the most extreme value, in the rule's unit; null = none breaks it", nullable=True),
+    },
+)

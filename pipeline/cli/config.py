@@ -16,7 +16,7 @@ from tracklake.pipeline.settings import (
     locate_setting,
     read_sources,
 )
-from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.quality_reports.rules.registry import ALL_RULES, resolve
 from tracklake.schemas.files import SETTINGS_FILE
 
 
@@ -52,7 +52,7 @@ def _list_settings(settings: Settings, options: dict[str, Any]) -> dict[str, dic
     protocol = settings.get_protocol()
     values: dict[Key, Any] = {}
     for name, value in settings.model_dump(mode="json").items():
-        table = resolve(RULES, settings.thresholds) if name == "thresholds" else value
+        table = resolve(ALL_RULES, settings.thresholds) if name == "thresholds" else value
         values |= (
             {(name, inner): own for inner, own in table.items()}
             if table and isinstance(table, dict)

@@ -18,7 +18,7 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
-from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import remove_unfinished
@@ -63,7 +63,11 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
         commit.tail: {name: commit.built_from["thresholds"].get(name, defaults[name]) for name in defaults}
         for commit in manifest.of_stage("validate")
     }
-    usual = max(used.values(), key=list(used.values()).count, default=resolve(RULES, settings.thresholds))
+    usual = max(
+        used.values(),
+        key=list(used.values()).count,
+        default=resolve(RULES, select_thresholds(RULES, settings.thresholds)),
+    )
     return {
         "thresholds": {name: value for name, value in usual.items() if value != defaults[name]},
         "thresholds_elsewhere": {

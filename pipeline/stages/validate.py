@@ -9,13 +9,18 @@ from tracklake.pipeline.stages.readers import SubsetReader
 from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
 from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
 from tracklake.quality_reports.rules.findings import judge_subset
-from tracklake.quality_reports.rules.registry import RULES, resolve
+from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
 from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, find_lacking
 from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
 
 
 def _describe_rules(settings: Settings) -> dict[str, Any]:
-    return {"rules": [rule.name for rule in RULES], "thresholds": resolve(RULES, settings.thresholds)}
+    return {"rules": [rule.name for rule in RULES], "thresholds": resolve(RULES, _select(settings))}
+
+
+def _select(settings: Settings) -> dict[str, float]:
+    """Select the set thresholds that rules over tracks have."""
+    return select_thresholds(RULES, settings.thresholds)
 
 
 def build(reader: SubsetReader, settings: Settings) -> StageResult:
@@ -23,7 +28,7 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     tracks, vehicles = reader.table(TRACKS, *tracks_needed()), reader.table(VEHICLES, "vehicle_id", *VEHICLE_COLUMNS)
     facts = reader.table(SUBSETS, *SUBSET_COLUMNS, "columns_missing")
     scene = Scene(tracks, vehicles, *facts.select(SUBSET_COLUMNS).row(0))
-    judged = judge(scene, find_lacking(vehicles, facts), settings.thresholds)
+    judged = judge(scene, find_lacking(vehicles, facts), _select(settings))
     status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
     # No NGSIM recording has lane markings, so a note about each of them would tell nothing.
     lacking = [rule.name for rule in judged.unchecked if "lane_markings_m" not in rule.columns]

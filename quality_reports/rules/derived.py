@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tracklake.quality_reports.rules import along_tracks as along
 from tracklake.quality_reports.rules import within_frames as within
+from tracklake.quality_reports.rules.along_messages import DRIVE_READS
 from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
 
 MOTION = ("vehicle_id", "frame", "x_m", "speed_mps", "frame_rate_hz")
@@ -54,11 +55,9 @@ DERIVED: dict[str, Derived] = {
 
 
 def trace(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of `tracks`, `vehicles` and `subsets` behind some columns, in order of appearance."""
-    found: dict[str, None] = {}
-    for name in names:
-        found.update(dict.fromkeys(DERIVED[name].reads if name in DERIVED else (name,)))
-    return tuple(found)
+    """Return the columns of the lake's tables behind some columns, in order of appearance."""
+    reads = {name: each.reads for name, each in DERIVED.items()} | DRIVE_READS
+    return tuple(dict.fromkeys(column for name in names for column in reads.get(name, (name,))))
 
 
 def prepare(scene: Scene, names: Iterable[str]) -> pl.DataFrame:

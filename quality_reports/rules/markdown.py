@@ -1,13 +1,15 @@
 """Page of the rules as Markdown, derived from their declarations: see `make docs`."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from tracklake.quality_reports.rules.registry import RULES, Rule
+from tracklake.quality_reports.rules.registry import DRIVE_RULES, RULES, Rule
 from tracklake.quality_reports.rules.rule import Case
 from tracklake.schemas.markdown import format_table
 from tracklake.schemas.references import link_references
 
+NOUNS = {"entries": "An entry", "messages": "A message", "ticks": "A tick"}
+"""What breaks a rule, by what it judges."""
 HEAD = """# Rules
 
 Derived from `quality_reports/`; do not edit (`make docs` writes it).
@@ -22,11 +24,24 @@ a car of 4 m x 2 m, in frame 1 of 25 Hz, in lane 1, at x = y = 0, at 20 m/s and 
 null.
 """
 
+DRIVES = """## Rules for drives
+
+A drive's findings (`drive_findings`) are runs of consecutive messages of one station, or of adjacent ticks of one
+vehicle, that break one rule; `drive_checks` counts what each rule was checked on. In the
+examples a line is a message or a tick of one vehicle, which stands at 0 degrees latitude and longitude.
+"""
+
 
 def write_rules() -> str:
     """Write the whole page."""
-    overview = format_table(("rule", "severity", "unit", "worst"), map(_summarise, RULES))
-    return "\n".join([HEAD, *overview, "", *(line for rule in RULES for line in _write_section(rule))])
+    lines = [HEAD, *_write_overview(RULES), *(line for rule in RULES for line in _write_section(rule))]
+    lines += [DRIVES, *_write_overview(DRIVE_RULES), *(line for rule in DRIVE_RULES for line in _write_section(rule))]
+    return "\n".join(lines)
+
+
+def _write_overview(rules: Sequence[Rule]) -> list[str]:
+    """Return the lines of a table of rules."""
+    return [*format_table(("rule", "severity", "unit", "worst"), map(_summarise, rules)), ""]
 
 
 def _summarise(rule: Rule) -> tuple[str, ...]:
@@ -40,7 +55,7 @@ def _write_section(rule: Rule) -> Iterator[str]:
     thresholds = (f"`{each.name}` = {each.default:g} {each.unit} ({each.range})" for each in rule.thresholds)
     yield f"## {rule.name}"
     yield ""
-    yield f"An entry breaks it when {rule.meaning}."
+    yield f"{NOUNS[rule.over]} breaks it when {rule.meaning}."
     yield ""
     yield f"- Thresholds: {', '.join(thresholds)}"
     yield f"- Reads: {', '.join(f'`{name}`' for name in rule.columns)}"

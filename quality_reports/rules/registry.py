@@ -8,6 +8,7 @@ import pandera.polars as pa
 import polars as pl
 from pandera.errors import SchemaErrors
 
+from tracklake.quality_reports.rules.drive import DRIVE_RULES
 from tracklake.quality_reports.rules.motion import MOTION_RULES
 from tracklake.quality_reports.rules.place import PLACE_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
@@ -15,6 +16,8 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.text import suggest_name
 
 __all__ = [
+    "ALL_RULES",
+    "DRIVE_RULES",
     "RULES",
     "Rule",
     "Severity",
@@ -28,10 +31,13 @@ __all__ = [
     "find_threshold_faults",
     "resolve",
     "select_broken",
+    "select_thresholds",
 ]
 
 RULES: tuple[Rule, ...] = (*MOTION_RULES, *PLACE_RULES)
-"""Rules in use, in the order of the report."""
+"""Rules over tracks, in the order of the report."""
+ALL_RULES = (*RULES, *DRIVE_RULES)
+"""Rules in use, those for drives last."""
 
 
 class ThresholdError(UsageError):
@@ -63,6 +69,12 @@ def resolve(rules: Sequence[Rule], overrides: Mapping[str, float] | None = None)
         raise ThresholdError(f"thresholds: {name}: {fault}, got {(overrides or {})[name]!r}")
     defaults = {name: default for rule in rules for name, default in rule.defaults.items()}
     return defaults | {name: float(value) for name, value in (overrides or {}).items()}
+
+
+def select_thresholds(rules: Sequence[Rule], overrides: Mapping[str, float]) -> dict[str, float]:
+    """Select the overrides of thresholds that these rules have."""
+    known = {name for rule in rules for name in rule.defaults}
+    return {name: value for name, value in overrides.items() if name in known}
 
 
 def find_threshold_faults(rules: Sequence[Rule], overrides: Mapping[str, Any]) -> dict[str, str]:

@@ -39,6 +39,8 @@ class Threshold:
     @property
     def range(self) -> str:
         """Values that are allowed, in words."""
+        if self.least is not None and self.greatest is not None:
+            return f"{self.least:g} to {self.greatest:g}"
         return f"{self.least:g} or more" if self.least is not None else f"{self.greatest:g} or less"
 
     def allows(self, value: float) -> bool:
@@ -53,7 +55,8 @@ class Case:
     Args:
         entries: values by column of `tracks` and `vehicles`, one per entry. By default each entry belongs to
             another vehicle (a car, 4 m x 2 m) in frame 1, in lane 1, at x = y = 0, 20 m/s, without acceleration;
-            other columns are null.
+            other columns are null. Of a rule for drives, values of `bsm`, or of ticks with placed messages, one per
+            message or tick: by default all are of one vehicle, at 0 degrees latitude and longitude, and none is lost.
         breaks: indices of the entries that break the rule.
         frame_rate_hz: frame rate of the source.
         lane_markings_m: y_m of the lane markings, leftmost first.
@@ -84,6 +87,7 @@ class Rule:
         extreme: which end of `value` is the worst.
         compared: how exactly, in words: what equals a threshold in the source's decimals must not exceed it.
         case: its example.
+        over: what it judges: entries of tracks, or a drive's messages or ticks, for which "entry" above stands too.
     """
 
     name: str
@@ -97,6 +101,7 @@ class Rule:
     extreme: Literal["min", "max"]
     compared: str
     case: Case
+    over: Literal["entries", "messages", "ticks"] = "entries"
 
     @property
     def defaults(self) -> dict[str, float]:
