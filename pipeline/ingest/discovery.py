@@ -29,9 +29,11 @@ from tracklake.schemas.text import make_visible
 
 TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, ARCHIVE_SUFFIX, "")
+LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".bag", ".db3", ".mcap", ".yaml")
+"""Endings of an instrumented vehicle's logs."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""
-PROSE = (".txt", ".dat", *TABLES, ARCHIVE_SUFFIX, "")
+PROSE = (".txt", ".dat", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
 """Endings that other files share: an unrecognised file with one is skipped and named, not refused."""
 HASHES = ".hashes.json"
 """Name of the file in the lake that remembers raw files' hashes."""
@@ -227,7 +229,9 @@ def _list_candidates(source: Path) -> tuple[list[Path], list[str]]:
 
 def _open_raw(path: Path, source: Path) -> RawFile:
     """Name a file relative to SOURCE; control characters and bytes that are no UTF-8 are escaped in the name."""
-    return RawFile(path, make_visible(path.name if source.is_file() else path.relative_to(source).as_posix()))
+    if source.is_file():
+        return RawFile(path, make_visible(path.name), is_source=True)
+    return RawFile(path, make_visible(path.relative_to(source).as_posix()))
 
 
 def _describe_formats(sources: list[Source]) -> str:

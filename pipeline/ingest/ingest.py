@@ -1,7 +1,7 @@
 """Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from tracklake.pipeline.sources.accounting import account_rows
 from tracklake.pipeline.sources.csv import measure_unpacked
 from tracklake.pipeline.sources.source import Canonical, Part
 from tracklake.pipeline.stages.stage import Job, make_commit, make_job
-from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES, Table
 
 VERSION = 2
 """Number to raise when the code makes other tables of the same files."""
@@ -191,12 +191,14 @@ def build(root: Path, job: Job) -> Commit:
 
 def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files, dict[str, Any]]:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
-    canonical = SOURCE_BY_NAME[dataset].to_canonical(parts, recording)
-    if not canonical.subsets:
-        raise SourceError(_explain_emptiness(recording, canonical))
+    source = SOURCE_BY_NAME[dataset]
+    canonical = source.to_canonical(parts, recording)
+    if not canonical.subsets and not canonical.drives:
+        raise SourceError(_explain_emptiness(recording, canonical, source.lacking))
     info = {
         "notes": [*_recall_notes(root, job), *canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
+        "drives": [drive.name for drive in canonical.drives],
         "row_order": canonical.row_order,
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
@@ -204,7 +206,7 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
     return _write_tables(root, job, canonical), info
 
 
-def _explain_emptiness(recording: str, canonical: Canonical) -> str:
+def _explain_emptiness(recording: str, canonical: Canonical, lacking: str) -> str:
     """Return why no row of a recording could be used: the commonest reasons, and a line of each."""
     reasons = (
         canonical.rejects.sort("file", "line")
@@ -218,7 +220,7 @@ def _explain_emptiness(recording: str, canonical: Canonical) -> str:
     ]
     more = [f"{reasons['rows'][REASONS_SHOWN:].sum():,} for other reasons"] if len(reasons) > REASONS_SHOWN else []
     return (
-        f"recording {recording}: no carriageway has entries. Expected rows that can be used, got dropped ones only: "
+        f"recording {recording}: {lacking}. Expected rows that can be used, got dropped ones only: "
         f"{', '.join([*shown, *more])}. Restore the original files, or repair these lines."
     )
 
@@ -254,9 +256,13 @@ def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
 def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
     files: Files = {}
-    for subset in canonical.subsets:
-        values = {"dataset": dataset, "subset": subset.name}
-        for table, frame in ((TRACKS, subset.tracks), (VEHICLES, subset.vehicles), (SUBSETS, subset.facts)):
+    made: list[tuple[str, Mapping[Table, pl.DataFrame]]] = [
+        *((own.name, {TRACKS: own.tracks, VEHICLES: own.vehicles, SUBSETS: own.facts}) for own in canonical.subsets),
+        *((drive.name, drive.tables) for drive in canonical.drives),
+    ]
+    for name, tables in made:
+        values = {"dataset": dataset, "subset": name}
+        for table, frame in tables.items():
             written = write_table(root, table, frame, values, job.fingerprint, where=f"recording {recording}")
             files.setdefault(table.name, []).extend(written)
     for table, frame in (

@@ -10,7 +10,7 @@ from tracklake.pipeline.ingest.discovery import Digests
 from tracklake.pipeline.ingest.ingest import SOURCE_BY_NAME, VERSION
 from tracklake.pipeline.lake import Commit, Manifest
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.planner import Planner
+from tracklake.pipeline.stages.planner import Planner, find_recordings
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME, STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, StageError
 
@@ -74,7 +74,7 @@ def describe_stages(root: Path, manifest: Manifest, settings: Settings) -> list[
 def _describe_ingestion(root: Path, manifest: Manifest) -> StageState:
     """Compare each recording with its raw files, by size and time of change, and with the readers' versions."""
     digests = Digests(root)
-    commits = [commit for commit in manifest.of_stage(INGEST) if commit.info.get("subsets")]
+    commits = find_recordings(manifest)
     reasons = {commit.tail: _explain_recording(commit, digests) for commit in commits}
     stale = {tail: reason for tail, reason in reasons.items() if reason}
     gone = [path for commit in commits for path in _list_sources(commit) if not path.exists()]

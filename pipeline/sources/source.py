@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import polars as pl
 
-from tracklake.schemas.columns import Dataset
+from tracklake.schemas.columns import Dataset, Table
 from tracklake.schemas.errors import TracklakeError
 
 RowOrder = Literal["vehicle", "frame", "other"]
@@ -29,6 +29,7 @@ class RawFile:
         member: name of the member in its archive; None for a file of its own.
         columns: the user's description of its columns, as JSON; empty without one.
         recording: the user's name for the recording of a file that does not tell it; empty without one.
+        is_source: whether the user named this file, and no folder that holds it.
     """
 
     path: Path
@@ -38,6 +39,7 @@ class RawFile:
     member: str | None = None
     columns: str = ""
     recording: str = ""
+    is_source: bool = False
 
     @property
     def folder(self) -> str:
@@ -103,11 +105,20 @@ class Subset:
 
 
 @dataclass(frozen=True)
+class Drive:
+    """One drive of an instrumented vehicle in canonical form: its name, and its rows by table."""
+
+    name: str
+    tables: Mapping[Table, pl.DataFrame]
+
+
+@dataclass(frozen=True)
 class Canonical:
     """One recording in canonical form, with every row of its files accounted for.
 
     Its carriageways with entries, the rows of schemas.INGEST_LOG (one per file), REJECTS and COMPLETENESS, messages for
-    the user, and what the rows of its files are sorted by: vehicle and frame, frame and vehicle, or neither.
+    the user, and what the rows of its files are sorted by: vehicle and frame, frame and vehicle, or neither. Recordings
+    of an instrumented vehicle have drives instead of carriageways.
     """
 
     subsets: tuple[Subset, ...]
@@ -116,6 +127,7 @@ class Canonical:
     completeness: pl.DataFrame
     notes: tuple[str, ...] = ()
     row_order: RowOrder = "vehicle"
+    drives: tuple[Drive, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -148,6 +160,7 @@ class Source:
         group: function that gathers recognised files into units.
         to_canonical: function of the parts of one recording and its name; returns its tables.
         spill: function that reads a file of several recordings into a staging folder, a folder per recording.
+        lacking: words for a recording of which no row can be used.
     """
 
     name: Dataset
@@ -160,3 +173,4 @@ class Source:
     group: Callable[[Sequence[RawFile]], Grouping]
     to_canonical: Callable[[Sequence[Part], str], Canonical]
     spill: Callable[[RawFile, Path], Spilled] | None = None
+    lacking: str = "no carriageway has entries"

@@ -9,7 +9,7 @@ from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load,
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
-from tracklake.pipeline.stages.stage import INGEST, Job, Stage, StageError, StageResult, make_commit, make_job
+from tracklake.pipeline.stages.stage import INGEST, Job, Scope, Stage, StageError, StageResult, make_commit, make_job
 from tracklake.schemas import TRACKS
 
 
@@ -44,7 +44,7 @@ class Planner:
         """Return the commits of a stage by key, each as the stage would make it now."""
         if name not in self._commits:
             if name == INGEST:
-                self._commits[name] = {commit.key: commit for commit in _find_recordings(self._manifest)}
+                self._commits[name] = {commit.key: commit for commit in find_recordings(self._manifest)}
             else:
                 self._commits[name] = {job.key: self._find_commit(name, job) for job in self.plan(name)}
         return self._commits[name]
@@ -58,7 +58,7 @@ class Planner:
         return commit
 
     def _plan(self, stage: Stage) -> list[Job]:
-        inputs = {name: self.require(name) for name in stage.after}
+        inputs = {name: self._select(stage, self.require(name)) for name in stage.after}
         values = stage.describe_settings(self._settings)
         extra = stage.extra_inputs(self._root, self._manifest, self._settings) if stage.extra_inputs else {}
 
@@ -74,18 +74,34 @@ class Planner:
             }
             return [make(stage.name, "", all_prints, {})]
         jobs = []
-        for recording in _find_recordings(self._manifest):
-            subsets = [own for own in recording.info["subsets"] if own["freeway"] or stage.scope == "recording"]
-            if subsets:
-                facts = {"dataset": recording.info["dataset"], "subsets": [own["subset"] for own in subsets]}
+        for recording in find_recordings(self._manifest):
+            if subsets := _list_subsets(recording, stage.scope):
+                facts = {"dataset": recording.info["dataset"], "subsets": subsets}
                 prints = {name: _find_fingerprint(found, name, recording.tail) for name, found in inputs.items()}
                 jobs.append(make(f"{stage.name}/{recording.tail}", recording.tail, prints, facts))
         return jobs
 
+    def _select(self, stage: Stage, commits: Mapping[str, Commit]) -> Mapping[str, Commit]:
+        """Return the recordings that a stage over the whole lake builds on: drives, where it comes after their stages.
 
-def _find_recordings(manifest: Manifest) -> list[Commit]:
-    """Return the commits of ingestion that hold subsets; lines that belong to no recording have none."""
-    return [commit for commit in manifest.of_stage(INGEST) if commit.info.get("subsets")]
+        Without this a drive that is added would make splits and tensors stale, which know nothing of drives.
+        """
+        of_drives = any(self._stages[name].scope == "drive" for name in stage.after if name in self._stages)
+        if stage.scope != "lake" or of_drives:
+            return commits
+        return {key: commit for key, commit in commits.items() if not commit.info.get("drives")}
+
+
+def find_recordings(manifest: Manifest) -> list[Commit]:
+    """Return the commits of ingestion that hold subsets or drives; lines that belong to no recording have none."""
+    return [commit for commit in manifest.of_stage(INGEST) if commit.info.get("subsets") or commit.info.get("drives")]
+
+
+def _list_subsets(recording: Commit, scope: Scope) -> list[str]:
+    """Return the names of a recording's subsets, or drives, that stages of a scope work on."""
+    if scope == "drive":
+        return list(recording.info.get("drives", ()))
+    return [own["subset"] for own in recording.info["subsets"] if own["freeway"] or scope == "recording"]
 
 
 def _find_fingerprint(commits: Mapping[str, Commit], stage: str, tail: str) -> str | None:

@@ -17,7 +17,7 @@ from tracklake.schemas.hashing import hash_values
 
 INGEST = "ingest"
 """Name of the stage that makes the recordings; every other stage works on what it committed."""
-Scope = Literal["recording", "freeway recording", "lake"]
+Scope = Literal["recording", "freeway recording", "drive", "lake"]
 
 
 class StageError(TracklakeError):
@@ -74,11 +74,12 @@ class Stage:
         name: name of the stage, and of its command where it has one.
         meaning: one line for help texts.
         scope: what one job works on; freeway recordings are those with freeway subsets, and only these are built.
+            Recordings are carriageways seen from above; drives are recordings of an instrumented vehicle.
         after: stages whose tables it reads, `ingest` among them. Without any, it takes the lake as it is.
         settings: what its result depends on: names of settings, or functions that give values by name.
         version: number to raise when the code makes other results of the same inputs.
         build: (reader, settings) to frames by table, or a StageResult. The reader is a SubsetReader, once for every
-            subset of the recording; a LakeReader for the scope `lake`.
+            subset (or drive) of the recording; a LakeReader for the scope `lake`.
         batch_entries: number of entries up to which small recordings are built together: `build` then takes a list of
             LakeReaders and returns a list of StageResults. 0: recordings are built one by one.
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`

@@ -10,7 +10,7 @@ from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.lake import load, open_for_writing, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import Stage, StageError, StageResult
-from tracklake.schemas import SUBSET_STATUS, TRACKS, VEHICLES, StructureError
+from tracklake.schemas import BSM, SUBSET_STATUS, TRACKS, VEHICLES, StructureError
 
 
 def build_status(reader, settings):
@@ -38,6 +38,17 @@ TOTAL = Stage(
     settings=(lambda settings: {"workers": settings.workers},),
     version=1,
     build=lambda reader, _: StageResult(info={"excluded": int(reader.table(SUBSET_STATUS)["excluded"].sum())}),
+)
+OF_DRIVES = Stage(
+    name="of_drives",
+    meaning="Note the drives' messages.",
+    scope="drive",
+    after=("ingest",),
+    version=1,
+    build=lambda reader, _: StageResult(notes=[f"{reader.title}: {reader.table(BSM).height}"]),
+)
+OVER_DRIVES = Stage(
+    **{**vars(TOTAL), "name": "over_drives", "after": ("of_drives",), "build": lambda *_: StageResult()}
 )
 STAGES = (TOY, TOTAL)
 SETTINGS = Settings()
@@ -117,6 +128,28 @@ def test_a_stage_over_the_lake_has_nothing_to_do_where_one_before_it_made_nothin
     with open_for_writing(tmp_path / "other"):
         pass
     assert plan_stage(tmp_path / "other", "total", SETTINGS, STAGES) == []
+
+
+def test_drives_and_carriageways_have_stages_of_their_own(tmp_path, root):
+    stages = (*STAGES, OF_DRIVES, OVER_DRIVES)
+    assert plan_stage(root, "of_drives", SETTINGS, stages) == [], "no drive is in the lake"
+    run(root, "toy", stages=stages)
+    run(root, "total", stages=stages)
+    folder = tmp_path / "drives" / "a"
+    folder.mkdir(parents=True)
+    for receiver in (1, 2):
+        (folder / f"{receiver}.csv").write_text(f"{receiver},7,{receiver},0,5,6,0,40,-83,0,9,90,0,0,0,0,0,0,0\n")
+    with open_for_writing(root) as writer:
+        (job,) = ingest.plan(discover(folder.parent, digest=Digests(root)), writer.manifest)
+        writer.commit(ingest.build(root, job))
+    assert plan_stage(root, "of_drives", SETTINGS, stages)[0].inputs == {
+        "dataset": "v2v",
+        "subsets": ["a-rx1", "a-rx2"],
+    }
+    assert find_outstanding(root, "toy", SETTINGS, stages) == find_outstanding(root, "total", SETTINGS, stages) == []
+    (made,) = run_stage(root, "of_drives", SETTINGS, stages=stages)
+    assert (made.key, made.info["notes"]) == ("of_drives/v2v/a", ["a-rx1: 1", "a-rx2: 1"])
+    assert plan_stage(root, "over_drives", SETTINGS, stages) == [], "of_drives made no tables"
 
 
 def test_tables_are_checked_and_undeclared_reads_are_found(root):

@@ -1,0 +1,25 @@
+"""Formats of an instrumented vehicle's logs, recognised by the first bytes of a file."""
+
+from tracklake.pipeline.sources.csv import BOM
+from tracklake.pipeline.sources.v2v.bsmp1 import recognise_bsmp1
+from tracklake.pipeline.sources.v2v.truth import TRUTH_MARK
+
+BSMP1, TRUTH = "bsmp1", "drive-truth"
+"""Dialects of text files: messages, and the truth of a synthetic drive."""
+ROS1, ROS2, ROS2_STORAGE = "ros1-bag", "ros2-bag", "ros2-storage"
+"""Dialects of bags: a file, the metadata of a bag that is a folder, and the files with its messages."""
+RECOGNISED_BY = {BSMP1: recognise_bsmp1}
+"""Functions that recognise logs of messages, by dialect."""
+
+
+def detect(head: bytes, _name: str) -> str | None:
+    """Return the dialect of a drive's log, or None for a file of another kind."""
+    if head.startswith(b"#ROSBAG V2.0"):
+        return ROS1
+    if head.startswith(b"\x89MCAP0") or (head.startswith(b"SQLite format 3\0") and b"topics" in head):
+        return ROS2_STORAGE
+    if head.removeprefix(BOM).startswith(TRUTH_MARK):
+        return TRUTH
+    if b"rosbag2_bagfile_information" in head[:1000]:
+        return ROS2
+    return next((dialect for dialect, recognises in RECOGNISED_BY.items() if recognises(head)), None)
