@@ -132,7 +132,7 @@ def place_messages(ticks: pl.DataFrame, messages: pl.DataFrame, ego_states: pl.D
     ahead, right = turn_to_heading(
         (east + sent_east - own_east, north + sent_north - own_north), pl.col("heading_deg_ego")
     )
-    fresh = pl.col("now_s") - pl.col("time_s") <= MAX_AGE_S
+    fresh = pl.col("now_s") - pl.col("time_s") <= MAX_AGE_S + 1e-5  # of a float's last digits
     placed = joined.select(message_x_m=pl.when(fresh).then(ahead), message_y_m=pl.when(fresh).then(right))
     return pl.concat([ticks, placed], how="horizontal")
 

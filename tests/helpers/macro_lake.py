@@ -3,15 +3,19 @@
 from pathlib import Path
 
 import polars as pl
+from drive_lake import make_drive
 from small_lake import put
 
 from tracklake.pipeline.lake import open_for_writing
-from tracklake.schemas import SUBSETS, TRACKS, VEHICLES, Table
+from tracklake.schemas import BSM, SUBSETS, SURROUNDING, SURROUNDING_TRUTH, TRACKS, VEHICLES, Table
 
 CALLS = {
+    "around_ego": "{subset}, 2.55",
+    "drive_errors": "{subset}",
     "flow_density": "{subset}, 2",
     "lane_changes": "{subset}",
     "leader_follower": "{subset}",
+    "message_gaps": "{subset}, 0.15",
     "near": "{subset}, 3, 50, 2, 60",
     "scene": "{subset}, 3",
     "track": "{subset}, 1",
@@ -34,7 +38,7 @@ def entry(vehicle: int, frame: int, x: float, lane: int | None, speed: float, **
 def put_subset(
     root: Path, entries: list[dict[str, object]], subset: str = "a", dataset: str = "highd", seconds: float = 5.0
 ) -> None:
-    """One subset of 2 Hz with its entries, its vehicles and itself."""
+    """One subset of 2 Hz with its entries, its vehicles and itself, and a drive of the same name."""
     values = {"dataset": dataset, "subset": subset}
 
     def fill(table: Table, rows: list[dict[str, object]]) -> pl.DataFrame:
@@ -58,8 +62,11 @@ def put_subset(
         "entries": tracks.height, "ids_split": 0, "on_ramp_lanes": [], "columns_missing": [],
         "source_files": [{"file": "a.csv", "sha256": "00"}],
     }  # fmt: skip
+    drive = make_drive(subset, dataset)
+    frames = {TRACKS: tracks, VEHICLES: fill(VEHICLES, vehicles), SUBSETS: fill(SUBSETS, [facts])}
+    frames |= {table: drive[table] for table in (BSM, SURROUNDING, SURROUNDING_TRUTH)}
     with open_for_writing(root) as writer:
-        for table, frame in ((TRACKS, tracks), (VEHICLES, fill(VEHICLES, vehicles)), (SUBSETS, fill(SUBSETS, [facts]))):
+        for table, frame in frames.items():
             writer.commit(put(root, f"{table.name}/{dataset}/{subset}", 1, frame, table, **values))
 
 

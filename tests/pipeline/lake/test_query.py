@@ -285,4 +285,5 @@ def test_a_wrong_query_gets_duckdbs_message_and_the_tables(lake: Path, sql: str,
         query(connection, sql).fetchall()
     *_, tables, macros = str(caught.value).splitlines()
     assert tables == f"Tables: {', '.join(table.name for table in TABLES)}."
-    assert macros.startswith("Macros: flow_density(subset, seconds), lane_changes(subset), leader_follower(subset), ")
+    assert macros.startswith("Macros: around_ego(drive, at_s), ")
+    assert " lane_changes(subset), leader_follower(subset), " in macros
