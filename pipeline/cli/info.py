@@ -9,6 +9,7 @@ from typing import Any
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.drives import list_drives, print_drives
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.ingest.staleness import StageState, describe_stages
@@ -36,11 +37,14 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
         with connect(root) as connection:
             rows = collect_metrics(connection, ())
         recordings = _list_recordings([row for row in rows if row["scope"] == "recording"], manifest)
+        drives = list_drives(root, manifest)
         stages = describe_stages(root, manifest, settings)
         sizes = measure_sizes(root, manifest)
         terminal.print_line(f"{root.resolve()}", style="bold")
         terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in rows if row["subset"]}))
-        _show_recordings(terminal, recordings)
+        if recordings or not drives:
+            _show_recordings(terminal, recordings)
+        print_drives(terminal, drives)
         _show_stages(terminal, stages)
         print_table(terminal, ("on disk", "MB"), [[name, f"{size / 1e6:,.1f}"] for name, size in sizes.items()])
         terminal.print_json(
@@ -49,6 +53,7 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
                 "lake_id": manifest.lake_id,
                 "ingested_from": manifest.ingested_from,
                 "recordings": recordings,
+                "drives": drives,
                 "stages": [asdict(state) for state in stages],
                 "bytes": sizes,
             }

@@ -20,7 +20,7 @@ ProtocolOption = Annotated[
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 DatasetOption = Annotated[
-    str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim, highd or custom.")
+    str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim, highd, custom or v2v.")
 ]
 ColumnsOption = Annotated[
     Path | None,

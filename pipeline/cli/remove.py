@@ -7,7 +7,7 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
-from tracklake.pipeline.ingest.removal import remove_recordings
+from tracklake.pipeline.ingest.removal import describe_sizes, remove_recordings
 
 
 def remove(
@@ -22,7 +22,7 @@ def remove(
         removed, outdated = remove_recordings(root, recordings)
         for recording in removed:
             terminal.print_line(
-                f"removed {recording.name}: {', '.join(recording.subsets)}; {recording.entries:,} rows of tracks"
+                f"removed {recording.name}: {', '.join(recording.subsets)}; {describe_sizes([recording])}"
             )
             if recording.files:
                 terminal.print_line(

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal, find_command
-from tracklake.pipeline.lake import connect
+from tracklake.pipeline.cli.drives import describe_drives, list_drives
+from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
@@ -46,7 +47,7 @@ def show_result(terminal: Terminal, result: RunResult) -> None:
 def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
     """Print the report's figures, its path, and two commands to try next."""
     terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]}))
-    head = quality["headline"]
+    head, drives = quality["headline"], list_drives(lake, load(lake))
     excluded, judged = _format_count(head["excluded_subsets"]), head["eligible_starts"]
     late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"
     lines = {
@@ -56,6 +57,12 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         "quality": f"{_format_count(head['vehicles_with_errors'])} vehicles with errors; " + late,
         "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_describe_balance(quality)}",
     }
+    if drives and not head["subsets"]:
+        lines = {"rows": lines["rows"]}  # the others are of recordings from above
+    if drives:
+        lines = {"drives": describe_drives(drives), **lines}
+        of_drives = {row["subset"]: row["origin"] for row in drives}
+        terminal.print_origin(describe_synthetic(of_drives, noun="drive", maker="instrument"))
     scores = [score for score in quality["model_scores"] if score["rows"]]
     for score in scores:
         known = [row for row in score["rows"] if row["rmse_m"] is not None]
@@ -71,6 +78,10 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     protocol_option = "" if protocol == "csp" else f" --protocol {protocol}"
     terminal.print_line("\nTry next:")
     command = find_command()
+    if drives and not head["subsets"]:
+        for query in ("FROM drives", "SELECT subset, vehicle_id, messages, lost FROM stations ORDER BY lost DESC"):
+            terminal.print_line(f'  {command} sql "{query}"{lake_option}')
+        return
     terminal.print_line(
         f'  {command} sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{lake_option}'
     )

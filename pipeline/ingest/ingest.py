@@ -1,5 +1,6 @@
 """Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
 
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -127,7 +128,13 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
         commit = manifest.commits.get(job.key)
         if commit is None:
             continue
-        if lost := find_lost(job, commit):
+        if others := _find_other_drive(job, commit):
+            messages[job.key] = (
+                f"recording {job.title}: another drive of this name is in the lake, from {others[0]['path']}, which is "
+                f"still there, and now came {job.built_from['sources'][0]['path']}. Give both at once (a folder above "
+                "them), name this one with --recording NAME, or let it replace the other with --replace."
+            )
+        elif lost := find_lost(job, commit):
             names = (source["file"] for source in job.built_from["sources"])
             messages[job.key] = (
                 f"recording {job.title}: it is in the lake already, from {', '.join(s['file'] for s in lost)}, and now "
@@ -140,7 +147,21 @@ def find_replaced(jobs: Sequence[Job], manifest: Manifest) -> dict[str, str]:
 def find_lost(job: Job, commit: Commit) -> list[dict[str, Any]]:
     """Return the sources of a recording's commit that a job for it does not hold, neither by name nor by content."""
     names, hashes = ({source[part] for source in job.built_from["sources"]} for part in ("file", "sha256"))
-    return [s for s in commit.built_from["sources"] if s["file"] not in names and s["sha256"] not in hashes]
+    sources = commit.built_from["sources"]
+    others = _find_other_drive(job, commit)
+    return others or [s for s in sources if s["file"] not in names and s["sha256"] not in hashes]
+
+
+def _find_other_drive(job: Job, commit: Commit) -> list[dict[str, Any]]:
+    """Return the sources of a drive's commit where they are all elsewhere than those of a job for the same name.
+
+    Logs of several drives often have the same names, so that these do not tell a new version from another drive.
+    """
+    now, before = job.built_from["sources"], commit.built_from["sources"]
+    shared = any({s[part] for s in now} & {s[part] for s in before} for part in ("path", "sha256"))
+    if not commit.info.get("drives") or shared:
+        return []
+    return [source for source in before if os.path.lexists(source["path"])]
 
 
 def _make_job(dataset: str, title: str, files: Sequence[RawFile], recording: str | None) -> Job:

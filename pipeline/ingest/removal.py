@@ -9,14 +9,14 @@ from typing import Any
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.lake import Commit, LakeError, Manifest, load, open_for_writing
 from tracklake.pipeline.stages.stage import Job
-from tracklake.schemas import TRACKS
+from tracklake.schemas import BSM, TRACKS
 
 
 @dataclass(frozen=True)
 class Removed:
-    """A recording that was taken out of a lake: its subsets, and its rows in `tracks` and in all tables.
+    """A recording that was taken out of a lake: its subsets or drives, and its rows in `tracks` and in all tables.
 
-    `files` are the raw files that are still where they were read.
+    `files` are the raw files that are still where they were read; `messages` counts rows of `bsm`.
     """
 
     dataset: str
@@ -25,11 +25,19 @@ class Removed:
     entries: int
     rows: int
     files: list[str]
+    messages: int = 0
 
     @property
     def name(self) -> str:
         """Name that `tracklake remove` takes, whatever else is in the lake."""
         return f"{self.dataset}/{self.recording}"
+
+
+def describe_sizes(removed: Sequence[Removed]) -> str:
+    """Return how much was removed: rows of tracks, messages of drives, or both."""
+    entries, messages = sum(each.entries for each in removed), sum(each.messages for each in removed)
+    tracks = [f"{entries:,} rows of tracks"] if entries or not messages else []
+    return " and ".join([*tracks, *([f"{messages:,} messages"] if messages else [])])
 
 
 class Folder:
@@ -137,11 +145,12 @@ def describe_removed(commits: Iterable[Commit], manifest: Manifest) -> list[Remo
             continue
         own = [other for other in manifest.commits.values() if other.tail == commit.tail]
         files = [file for other in own for file in other.all_files]
-        entries_kept = sum(file.rows or 0 for file in commit.files.get(TRACKS.name, []))
-        subsets = sorted(subset["subset"] for subset in commit.info["subsets"])
+        kept, messages = (sum(file.rows or 0 for file in commit.files.get(table.name, [])) for table in (TRACKS, BSM))
+        subsets = sorted([*(subset["subset"] for subset in commit.info["subsets"]), *commit.info.get("drives", ())])
         places = (file.get("path", "") for file in commit.built_from["sources"])
         there = sorted({place for place in places if os.path.lexists(place)})
-        found.append(Removed(dataset, recording, subsets, entries_kept, sum(file.rows or 0 for file in files), there))
+        rows = sum(file.rows or 0 for file in files)
+        found.append(Removed(dataset, recording, subsets, kept, rows, there, messages))
     return found
 
 

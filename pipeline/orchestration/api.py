@@ -33,7 +33,7 @@ def run(
     Args:
         source: a raw file, or a folder of them.
         lake: folder of the lake; it is created if missing.
-        dataset: read the source as this dataset only (ngsim or highd); None: detect it.
+        dataset: read the source as this dataset only (ngsim, highd, custom or v2v); None: detect it.
         replace: whether files of the source may replace other files of the same recording.
         prune: whether to remove recordings whose files once stood in the source and are missing now.
         rebuild: whether to make the lake again from the raw files.

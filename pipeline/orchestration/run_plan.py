@@ -252,10 +252,9 @@ def remove_missing(writer: Writer, request: RunRequest, plan: IngestPlan, result
     writer.remove(removal.find_dependents([*plan.superseded, *missing], writer.manifest))
     result.removed += [recording.name for recording in removed]
     if missing:
-        rows = sum(recording.entries for recording in removed)
+        sizes = removal.describe_sizes(removed)
         result.notes.append(
-            f"{removal.name_recordings(missing)}: no longer in SOURCE, and removed from the lake "
-            f"({rows:,} rows of tracks)"
+            f"{removal.name_recordings(missing)}: no longer in SOURCE, and removed from the lake ({sizes})"
         )
     else:
         result.notes += explain_missing(plan)

@@ -19,7 +19,7 @@ from tracklake.pipeline.stages.score import collect_scores, finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import FOLDER
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
-from tracklake.schemas import SUBSETS
+from tracklake.schemas import DRIVES, SUBSETS
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import remove_unfinished
 from tracklake.schemas.hashing import hash_chunks
@@ -83,8 +83,8 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     from tracklake.quality_reports.pages.report import OTHER_PAGES, build_report
 
     root, manifest, built_from = reader.root, reader.manifest, reader.job.built_from
-    recorded = scan(root, manifest, SUBSETS).filter(pl.col("origin") == "recorded").select("dataset").collect()
-    datasets = set(recorded["dataset"])
+    origins = pl.concat(scan(root, manifest, table).select("dataset", "origin") for table in (SUBSETS, DRIVES))
+    datasets = set(origins.filter(pl.col("origin") == "recorded").collect()["dataset"])
     provenance = {
         **{"lake": None, "lake_id": manifest.lake_id, **describe_origin(root)},
         "python": platform.python_version(),

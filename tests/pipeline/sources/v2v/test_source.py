@@ -1,5 +1,7 @@
 """Drives in the lake: what is recognised, what is one drive, its clock and tables, and the account of every line."""
 
+import json
+
 import polars as pl
 import pytest
 
@@ -146,3 +148,36 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"truth\.csv is the truth of one drive, .* 2 receivers"):
         ingest.build(tmp_path / "lake", job)
+
+
+def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, command, plain_flows):
+    del plain_flows
+    put(
+        "one/trip/a.csv", write_line(), write_line(gentime_us=100_000, count=1), write_line(gentime_us=200_000, count=2)
+    )
+    put("two/trip/a.csv", write_line(gentime_us=9))
+    put("notes/readme.txt", "no log\n")
+    lake = ("--lake", tmp_path / "lake")
+    done = command.here("run", tmp_path / "source" / "one" / "trip", *lake, "--dataset", "v2v")
+    assert done.code == 0, done.err
+    assert "drives  1 drives: 1 senders, 3 messages\nrows    3 read, 0 rejected\nreport" in done.out
+    assert 'sql "FROM drives"' in done.out
+    again = command.here("run", tmp_path / "source" / "one" / "trip", *lake)
+    assert "nothing to do" in again.out
+    shown = command.here("info", *lake).out
+    assert [line.split() for line in shown.splitlines() if line.startswith("trip")] == [
+        ["trip", "recorded", "1", "3", "0", "0", "0.2"]
+    ]
+    other = command.here("ingest", tmp_path / "source" / "two" / "trip", *lake)
+    assert other.code == 3
+    assert "recording trip: another drive of this name is in the lake" in other.err
+    assert command.here("ingest", tmp_path / "source" / "two" / "trip", *lake, "--recording", "later").code == 0
+    assert json.loads(command.here("info", *lake, "--json").out)["drives"][0]["subset"] == "later"
+    assert "1 messages" in command.here("remove", "v2v/later", *lake).out
+    assert command.here("check", *lake).code == 0
+    assert command.here("ingest", tmp_path / "source" / "notes", *lake).code == 1
+    put("one/other/a.csv", write_line(gentime_us=7))
+    assert command.here("run", tmp_path / "source" / "one", *lake).code == 0
+    (tmp_path / "source" / "one" / "trip" / "a.csv").unlink()
+    pruned = command.here("run", tmp_path / "source" / "one", *lake, "--prune")
+    assert "recording trip: no longer in SOURCE, and removed from the lake (3 messages)" in pruned.out

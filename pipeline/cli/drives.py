@@ -1,0 +1,42 @@
+"""Drives of a lake for the terminal: what each holds, and which are synthetic."""
+
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.lake import Manifest, scan
+from tracklake.schemas import DRIVES
+from tracklake.schemas.origin import describe_synthetic
+
+SHOWN = ("subset", "recording", "origin", "seconds", "stations", "messages", "scans", "images")
+"""Columns of `drives` that are shown of each."""
+
+
+def list_drives(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
+    """Return what a lake's drives hold, sorted by name."""
+    return scan(root, manifest, DRIVES).select(SHOWN).sort("subset").collect().to_dicts()
+
+
+def print_drives(terminal: Terminal, drives: list[dict[str, Any]]) -> None:
+    """Print a row per drive, and what of them is synthetic; nothing where there is none."""
+    if not drives:
+        return
+    terminal.print_origin(
+        describe_synthetic({row["subset"]: row["origin"] for row in drives}, noun="drive", maker="instrument")
+    )
+    rows = [
+        [row["subset"], row["origin"], *(f"{row[name]:,}" for name in SHOWN[4:]), f"{row['seconds']:,.1f}"]
+        for row in drives
+    ]
+    print_table(terminal, ("drive", "origin", *SHOWN[4:], "s"), rows, right=(False, False, *[True] * 5), fold=True)
+
+
+def describe_drives(drives: list[dict[str, Any]]) -> str:
+    """Return the number of drives, and what they hold together, in a line."""
+    total = {name: sum(row[name] for row in drives) for name in SHOWN[4:]}
+    sensed = "".join(f", {total[name]:,} {what}" for name, what in _SENSED.items() if total[name])
+    return f"{len(drives):,} drives: {total['stations']:,} senders, {total['messages']:,} messages{sensed}"
+
+
+_SENSED = {"scans": "LiDAR scans", "images": "camera images"}
