@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.files import SETTINGS_FILE
-from tracklake.schemas.protocols import CSP, PROTOCOLS, Protocol
+from tracklake.schemas.protocols import CSP, DRIVE_PROTOCOLS, PROTOCOLS, Protocol
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
 from tracklake.schemas.text import suggest_name
 
@@ -156,6 +156,11 @@ class Settings(BaseModel):
     @field_validator("protocol")
     @classmethod
     def _check_protocol(cls, name: str) -> str:
+        if name in DRIVE_PROTOCOLS:
+            known = ", ".join(PROTOCOLS)
+            raise ValueError(
+                f"{name} is for drives, and `tracklake onboard` uses it by itself; expected one of {known}"
+            )
         if name not in PROTOCOLS:
             raise ValueError(f"no protocol is called {name}; {suggest_name(name, PROTOCOLS)}")
         return name

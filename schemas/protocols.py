@@ -116,6 +116,38 @@ PROTOCOLS = {
 }
 """Protocols by name; the first is the default."""
 
+
+@dataclass(frozen=True)
+class DriveProtocol(Protocol):
+    """Recipe of predictions by an instrumented vehicle, from its own log of a drive.
+
+    Args:
+        step_s: time between two samples of a vehicle, on the drive's clock.
+    """
+
+    step_s: float = 0.5
+
+    @property
+    def step_ticks(self) -> int:
+        """Ticks between two samples of a vehicle: those at multiples of it are samples."""
+        return round(self.step_s * self.rate_hz)
+
+
+V2V = DriveProtocol(
+    name="v2v-2021",
+    rate_hz=10,
+    history_s=1.9,
+    horizon_s=2.0,
+    min_future_s=2.0,
+    nearest=0,
+    split="by-trajectory",
+    train_share=0.7,
+    scored_s=(0.5, 1.0, 1.5, 2.0),
+    headline="mae",
+)
+DRIVE_PROTOCOLS = {V2V.name: V2V}
+"""Protocols of drives by name. `tracklake onboard` uses them; the stages over carriageways do not."""
+
 MEANINGS: Mapping[str, str] = {
     "csp": "The windows of convolutional social pooling, Deo and Trivedi (2018), on a split that does not leak: "
     "flow-balanced, which is ours. Left open: the paper does not say how short a future may be; as its code, we ask "
@@ -132,5 +164,11 @@ MEANINGS: Mapping[str, str] = {
     "grid-2021": "Lane change by random forest and occupancy grid, Choi et al. (2021): 2 s of history, 2 s of future "
     "at 10 Hz, 70 % of the recordings for training, mean absolute errors at every half second. Left open, and set by "
     "us: which recordings train (drawn by `split_seed`), how short a future may be; its own recordings are not public.",
+    "v2v-2021": "Prediction by an instrumented vehicle (`tracklake onboard`), Choi et al. (2021): 20 positions in, 20 "
+    "out at 10 Hz, 70 % of the trajectories for training. A trajectory is one vehicle of one drive; vehicles that are "
+    "one vehicle of an overhead recording stand in one part. Positions are relative to the instrumented vehicle at the "
+    "same moment. Left open, and set by us: which trajectories train (drawn by `split_seed`), a sample every 0.5 s, "
+    "and that 2 s of history are 20 positions, 1.9 s from the first to the last. It is for drives; samples, splits and "
+    "tensors of carriageways cannot be made of it.",
 }
 """Meaning of each protocol: its source, and the choices that the source leaves open."""

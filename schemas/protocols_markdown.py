@@ -3,7 +3,7 @@
 import sys
 
 from tracklake.schemas.markdown import format_table
-from tracklake.schemas.protocols import HEADLINES, MEANINGS, PROTOCOLS, Protocol
+from tracklake.schemas.protocols import DRIVE_PROTOCOLS, HEADLINES, MEANINGS, PROTOCOLS, Protocol
 from tracklake.schemas.references import link_references
 
 HEAD = """# Protocols
@@ -13,7 +13,8 @@ Derived from `schemas/protocols.py`; do not edit (`make docs` writes it).
 A protocol is a named recipe of sampling, split and metrics, hashed: two figures are comparable only where the
 digests of their protocols agree. `tracklake run SOURCE --protocol NAME` makes samples, split and tensors of it (the
 setting `protocol`, or TRACKLAKE_PROTOCOL); `train`, `evaluate` and `export` take the same flag. The settings
-`min_future_s`, `drop_error_findings`, `nearest` and `split` change a protocol, and its digest with it.
+`min_future_s`, `drop_error_findings`, `nearest` and `split` change a protocol, and its digest with it. `v2v-2021` is
+for drives: `tracklake onboard` uses it, `--protocol` does not take it.
 """
 
 OWN_SHARES = {"csp-2018": 0.7}
@@ -27,10 +28,11 @@ HEADINGS = (
 
 def write_protocols() -> str:
     """Write the whole page."""
-    lines = [HEAD, *format_table(HEADINGS, map(_describe, PROTOCOLS.values()))]
+    protocols = PROTOCOLS | DRIVE_PROTOCOLS
+    lines = [HEAD, *format_table(HEADINGS, map(_describe, protocols.values()))]
     lines += ["", "H and F are positions of a history, the sample's own included, and of a future. Headlines:", ""]
     lines += [f"- `{name}`: {meaning}" for name, meaning in HEADLINES.items()]
-    for name in PROTOCOLS:
+    for name in protocols:
         lines += ["", f"## {name}", "", link_references(MEANINGS[name])]
     return "\n".join(lines) + "\n"
 

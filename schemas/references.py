@@ -101,8 +101,8 @@ CHOI = Reference(
     "Choi et al. (2021)",
     "Choi, D., Yim, J., Baek, M., Lee, S. (2021). Machine Learning-Based Vehicle Trajectory Prediction Using V2V "
     "Communications and On-Board Sensors. Electronics 10(4), 420.",
-    "protocol grid-2021, lane changes by random forest, grid cells, stacked-lstm and lstm-encoder-decoder; 932 "
-    "trajectories of the authors' own vehicles",
+    "protocols grid-2021 and v2v-2021, lane changes by random forest, grid cells, stacked-lstm and "
+    "lstm-encoder-decoder; 932 trajectories of the authors' own vehicles",
     doi="10.3390/electronics10040420",
 )
 MESSAOUD = Reference(

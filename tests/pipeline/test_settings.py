@@ -41,6 +41,10 @@ def test_what_is_set_takes_its_place(tmp_path, monkeypatch):
     ("asked", "message"),
     [
         ({"protocol": "mine"}, "setting protocol: no protocol is called mine; expected one of csp, csp-2018"),
+        (
+            {"protocol": "v2v-2021"},
+            "setting protocol: v2v-2021 is for drives, and `tracklake onboard` uses it by itself",
+        ),
         ({"min_future_s": 5.1}, "expected 5 or less, the horizon of the protocol csp"),
         ({"protocol": "grid-2021", "min_future_s": 2.5}, "expected 2 or less, the horizon of the protocol grid-2021"),
         ({"protocol": "csp-2018", "splits": ["flow-balanced"]}, "expected 'csp-2018' among them"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tracklake.schemas.protocols import CSP, HEADLINES, MEANINGS, PROTOCOLS, Protocol
+from tracklake.schemas.protocols import CSP, DRIVE_PROTOCOLS, HEADLINES, MEANINGS, PROTOCOLS, V2V, Protocol
 from tracklake.schemas.protocols_markdown import write_protocols
 from tracklake.schemas.references import link_references
 from tracklake.schemas.split_recipes import SPLIT_NAMES
@@ -30,10 +30,11 @@ CHANGED = {
         ("highd-flow-balanced", "flow-balanced", 0.8, 5, 16, 25, (5, 10, 15, 20, 25), "rmse"),
         ("mha-2020", "flow-balanced", 0.8, 5, 16, 15, (5, 10, 15), "rmse-by-axis"),
         ("grid-2021", "by-recording-random", 0.7, 10, 21, 20, (5, 10, 15, 20), "mae"),
+        ("v2v-2021", "by-trajectory", 0.7, 10, 20, 20, (5, 10, 15, 20), "mae"),
     ],
 )
 def test_the_named_protocols(name, split, share, rate_hz, history_ticks, horizon_ticks, scored_ticks, headline):
-    protocol = PROTOCOLS[name]
+    protocol = (PROTOCOLS | DRIVE_PROTOCOLS)[name]
     assert (protocol.name, protocol.split, protocol.train_share, protocol.headline) == (name, split, share, headline)
     assert (protocol.rate_hz, protocol.history_ticks, protocol.horizon_ticks) == (rate_hz, history_ticks, horizon_ticks)
     assert protocol.scored_ticks == scored_ticks
@@ -41,7 +42,7 @@ def test_the_named_protocols(name, split, share, rate_hz, history_ticks, horizon
 
 
 def test_every_protocol_is_explained_and_of_a_split_and_a_headline_that_there_are():
-    assert list(PROTOCOLS) == list(MEANINGS)
+    assert [*PROTOCOLS, *DRIVE_PROTOCOLS] == list(MEANINGS)
     assert {protocol.split for protocol in PROTOCOLS.values()} <= set(SPLIT_NAMES)
     assert {protocol.headline for protocol in PROTOCOLS.values()} <= set(HEADLINES)
     assert PROTOCOLS["csp"] is CSP
@@ -56,7 +57,9 @@ def test_the_digest_covers_every_parameter():
     assert set(CHANGED) == {own.name for own in fields(Protocol)}
     digests = {replace(CSP, **{name: value}).digest for name, value in CHANGED.items()}
     assert len(digests | {CSP.digest}) == len(CHANGED) + 1
-    assert len({protocol.digest for protocol in PROTOCOLS.values()}) == len(PROTOCOLS)
+    every = PROTOCOLS | DRIVE_PROTOCOLS
+    assert len({protocol.digest for protocol in every.values()}) == len(every)
+    assert replace(V2V, step_s=1.0).digest != V2V.digest
 
 
 def test_samples_depend_neither_on_the_split_nor_on_how_errors_are_stated():
@@ -75,7 +78,7 @@ def test_samples_of_protocols_that_fold_no_lanes_are_those_of_before():
 def test_the_page_of_protocols_is_current():
     page = (ROOT / "docs" / "protocols.md").read_text()
     assert page == write_protocols(), "run `make docs`"
-    for name, protocol in PROTOCOLS.items():
+    for name, protocol in (PROTOCOLS | DRIVE_PROTOCOLS).items():
         assert f"\n## {name}\n\n{link_references(MEANINGS[name])}\n" in page
         assert f"| `{name}` | {protocol.rate_hz} |" in page
         assert page.count(protocol.digest) == 1

@@ -5,6 +5,7 @@ behind in the target's own lane or, if there is none, the nearest one behind in 
 `ObservedScene` alone, which holds what is known at the moment of prediction.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -179,13 +180,15 @@ class Coefficient:
         return max(abs(self.keep), abs(self.left), abs(self.right))
 
 
-def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: float) -> list[Coefficient]:
+def choose_features(
+    feature: Singles, maneuver: Bytes, *, least: float, most: float, names: Sequence[str] = FEATURE_NAMES
+) -> list[Coefficient]:
     """Choose features that correlate with the classes and not with each other, of all candidates (B, features).
 
     A chosen feature has a strength of at least `least`. Of two that correlate by more than `most`, the stronger stays.
 
     Returns:
-        All candidates from the strongest to the weakest, equally strong ones in the order of FEATURES.
+        All candidates from the strongest to the weakest, equally strong ones in the order of `names`.
     """
     codes = np.arange(len(LATERAL_MANEUVERS))
     values, classes = _standardise_columns(feature), _standardise_columns(maneuver[:, None] == codes)
@@ -198,11 +201,11 @@ def choose_features(feature: Singles, maneuver: Bytes, *, least: float, most: fl
         if strength[number] < least:
             reason = f"below {least:g}"
         elif twins := [other for other in chosen if between[number, other] > most]:
-            reason = f"as {FEATURE_NAMES[twins[0]]} ({between[number, twins[0]]:.3f})"
+            reason = f"as {names[twins[0]]} ({between[number, twins[0]]:.3f})"
         else:
             chosen.append(int(number))
         keep, left, right = map(float, coefficient[number])
-        table.append(Coefficient(FEATURE_NAMES[number], keep, left, right, chosen=not reason, reason=reason))
+        table.append(Coefficient(names[number], keep, left, right, chosen=not reason, reason=reason))
     return table
 
 

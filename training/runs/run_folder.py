@@ -132,12 +132,12 @@ def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]
     if ":" in model.name and config.get("code") != OWN_FILES[model.module][1]:
         raise StaleRunError(f"{path}: the file of `{model.name}` has changed since; restore it, or {AGAIN}")
     if model.learns:
-        _load_weights(predictor, path / "weights.pt")
+        load_weights(predictor, path / "weights.pt")
         predictor.eval()
     return config, predictor
 
 
-def _load_weights(network: "nn.Module", file: Path) -> None:
+def load_weights(network: "nn.Module", file: Path) -> None:
     """Load a network's weights without running any code of the file."""
     import torch
 

@@ -1,0 +1,136 @@
+"""Training of a network on samples of drives: one visible loop, the run that it writes, and reading it again."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tracklake.schemas.arrays import Singles
+from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.protocols import V2V
+from tracklake.training.models import Recipe, require_torch
+from tracklake.training.onboard.models import (
+    CTRV,
+    Forecaster,
+    find_network,
+    make_forecaster,
+    predict_straight,
+    predict_turns,
+)
+from tracklake.training.onboard.samples import Parts, Samples, augment_samples
+from tracklake.training.runs.config import TrainConfig
+from tracklake.training.runs.run_folder import AGAIN, RUN_VERSION, StaleRunError, load_weights, read_config
+
+if TYPE_CHECKING:
+    from tracklake.training.onboard.networks import FeatureNetwork
+
+FOLDER = "onboard"
+"""Folder of the runs of drives, among the lake's runs: apart from those that are scored on overhead tracks."""
+BATCH = 2048
+"""Samples that are predicted at once."""
+Progress = Callable[[float, float], None]
+"""Called after every epoch with the share that is done, 0 to 1, and the epoch's loss."""
+
+
+def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progress | None = None) -> "FeatureNetwork":
+    """Train a network on the training part, with its mirrored and shifted copies; on a CPU the seed decides all."""
+    import torch
+
+    builder, recipe = find_network(name)
+    require_torch(name)
+    from tracklake.training.onboard import networks
+
+    epochs, size = config.epochs or recipe.epochs, config.batch_size or recipe.batch_size
+    random = np.random.default_rng(config.seed)
+    train = augment_samples(parts.train, random)
+    straight = predict_straight(train, V2V.horizon_ticks)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(config.threads or threads)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            network: FeatureNetwork = getattr(networks, builder)(V2V.horizon_ticks)
+            feature, deviation = torch.from_numpy(train.feature), torch.from_numpy(train.place_m - straight)
+            network.standardise(feature, deviation)
+            network.to(config.device).train()
+            optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate or recipe.learning_rate)
+            for epoch in range(epochs):
+                losses = []
+                order = torch.from_numpy(random.permutation(len(train)))
+                for first in range(0, len(train), size):
+                    numbers = order[first : first + size]
+                    given, true = feature[numbers].to(config.device), deviation[numbers].to(config.device)
+                    loss = ((network(given) - true) / network.scale_m).square().mean()
+                    optimizer.zero_grad(set_to_none=True)
+                    loss.backward()
+                    torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.max_gradient_norm)
+                    optimizer.step()
+                    losses.append(_require_finite(loss.item(), recipe))
+                if progress is not None:
+                    progress((epoch + 1) / epochs, sum(losses) / len(losses))
+    finally:
+        torch.set_num_threads(threads)
+    return network.cpu().eval()
+
+
+def _require_finite(loss: float, recipe: Recipe) -> float:
+    """Return the loss, or raise a TracklakeError where it is not finite."""
+    if not math.isfinite(loss):
+        rate = recipe.learning_rate
+        raise TracklakeError(f"the loss is {loss}: train with a learning rate below {rate:g} (`--learning-rate`)")
+    return loss
+
+
+def run_network(network: "FeatureNetwork", samples: Samples) -> Singles:
+    """Predict places (B, F, 2) in pieces of BATCH samples."""
+    import torch
+
+    with torch.no_grad():
+        feature = torch.from_numpy(samples.feature)
+        pieces = [network(feature[first : first + BATCH]).numpy() for first in range(0, max(1, len(samples)), BATCH)]
+    places: Singles = predict_straight(samples, V2V.horizon_ticks) + np.concatenate(pieces)
+    return places
+
+
+def describe_run(model: str, parts: Parts, config: TrainConfig | None = None) -> dict[str, Any]:
+    """Return the content of a run's `config.json`, as runs of overhead tracks have it; `blocks` tells splits apart."""
+    training = {} if config is None else vars(config) | {"parameters": {}}
+    return {
+        "version": RUN_VERSION,
+        "model": model,
+        "parameters": {},
+        "training": training,
+        "protocol": {"name": V2V.name, "digest": V2V.digest},
+        "split": V2V.split,
+        "train_subsets": sorted(set(parts.train.subset.tolist())),
+        "blocks": [parts.digest],
+    }
+
+
+def open_model(name: str, parts: Parts, runs: Path) -> Forecaster:
+    """Make a model ready: CTRV, or a trained run in the folder `runs`.
+
+    Raises:
+        StaleRunError: there is no such run; it is damaged; or it was trained on other vehicles than those of the part.
+        UsageError: no model has this name.
+    """
+    if name == CTRV:
+        return make_forecaster(name, predict_turns, parts.train)
+    builder, _ = find_network(name)
+    out = runs / name
+    if not (out / "config.json").is_file():
+        raise StaleRunError(f"{out}: no trained run; run `tracklake onboard train {name}` first")
+    config = read_config(out)
+    if (config["protocol"]["digest"], config["blocks"]) != (V2V.digest, [parts.digest]):
+        raise StaleRunError(
+            f"{out}: trained on other drives or with another split; {AGAIN}: `tracklake onboard train {name}`"
+        )
+    require_torch(name)
+    from tracklake.training.onboard import networks
+
+    network: FeatureNetwork = getattr(networks, builder)(V2V.horizon_ticks)
+    load_weights(network, out / "weights.pt")
+    network.eval()
+    return make_forecaster(name, lambda samples: run_network(network, samples), parts.train)
