@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -277,14 +277,14 @@ def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
 def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
     files: Files = {}
-    made: list[tuple[str, Mapping[Table, pl.DataFrame]]] = [
+    made: list[tuple[str, Mapping[Table, pl.DataFrame | Iterable[pl.DataFrame]]]] = [
         *((own.name, {TRACKS: own.tracks, VEHICLES: own.vehicles, SUBSETS: own.facts}) for own in canonical.subsets),
         *((drive.name, drive.tables) for drive in canonical.drives),
     ]
     for name, tables in made:
         values = {"dataset": dataset, "subset": name}
-        for table, frame in tables.items():
-            written = write_table(root, table, frame, values, job.fingerprint, where=f"recording {recording}")
+        for table, rows in tables.items():
+            written = write_table(root, table, rows, values, job.fingerprint, where=f"recording {recording}")
             files.setdefault(table.name, []).extend(written)
     for table, frame in (
         (INGEST_LOG, canonical.log),

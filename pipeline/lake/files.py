@@ -5,8 +5,8 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Callable, Iterable, Mapping
-from itertools import count
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from urllib.parse import quote, unquote
 
@@ -32,6 +32,8 @@ MODELS = "models"
 """Folder of the lake for trained models."""
 LISTING = "files.json"
 """File in every folder of `write_folder` with the names and sizes of its files, to notice one half deleted."""
+GROUP_ROWS = 250_000
+"""Rows in each row group of a Parquet file."""
 ZSTD_LEVEL = 1
 """Compression level of Parquet files; level 3 writes a quarter less and takes half as long again."""
 TABLE_BY_NAME = {table.name: table for table in TABLES}
@@ -58,16 +60,25 @@ def read_partition(table: Table, path: str) -> dict[str, str]:
 
 
 def write_table(
-    root: Path, table: Table, frame: pl.DataFrame, values: Mapping[str, str], fingerprint: str, *, where: str
+    root: Path,
+    table: Table,
+    frame: pl.DataFrame | Iterable[pl.DataFrame],
+    values: Mapping[str, str],
+    fingerprint: str,
+    *,
+    where: str,
 ) -> list[LakeFile]:
     """Validate a frame and put it into the lake under its own name; nothing is visible before it is complete.
 
     A whole file with this fingerprint in its name came from the same inputs and is kept, unless a rebuild made it void
-    (see `find_free_path`). A frame of no rows gives no file: a table without files is an empty table.
+    (see `find_free_path`). A frame of no rows gives no file: a table without files is an empty table. Batches that
+    follow one another in the key's order are written one after the other, so that they need not fit into the memory.
 
     Raises:
         schemas.StructureError: the frame breaks the table's structural rules.
     """
+    if not isinstance(frame, pl.DataFrame):
+        return _write_batches(root, table, frame, values, fingerprint, where)
     if frame.is_empty():
         return []
     table.validate(frame, where=where)
@@ -77,10 +88,51 @@ def write_table(
         stored = frame.drop(*table.partition)
 
         def write(aside: Path) -> None:
-            stored.write_parquet(aside, compression="zstd", compression_level=ZSTD_LEVEL, row_group_size=250_000)
+            stored.write_parquet(aside, compression="zstd", compression_level=ZSTD_LEVEL, row_group_size=GROUP_ROWS)
 
         _write_aside(root, target, write)
     return [_describe_file(root, target, frame.height)]
+
+
+def _write_batches(
+    root: Path, table: Table, batches: Iterable[pl.DataFrame], values: Mapping[str, str], fingerprint: str, where: str
+) -> list[LakeFile]:
+    """Validate and write batches; only the rows of one group of the file are in memory at once."""
+    import pyarrow.parquet as pq
+
+    groups = _group_rows(batches)
+    first = next(groups, None)
+    if first is None:
+        return []
+    target = root / find_free_path(root, name_table_file(table, values, fingerprint))
+    rows = 0
+
+    def write(aside: Path) -> None:
+        nonlocal rows
+        schema = first.drop(*table.partition).to_arrow().schema
+        last = first.clear()
+        with pq.ParquetWriter(aside, schema, compression="zstd", compression_level=ZSTD_LEVEL) as writer:
+            for group in chain([first], groups):
+                table.validate(pl.concat([last, group]), where=where)
+                last, rows = group.tail(1), rows + group.height
+                writer.write_table(group.drop(*table.partition).to_arrow().cast(schema), row_group_size=GROUP_ROWS)
+
+    _write_aside(root, target, write)
+    return [_describe_file(root, target, rows)]
+
+
+def _group_rows(batches: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+    """Yield batches together, with at least GROUP_ROWS rows but for the last; empty ones are left out."""
+    gathered: list[pl.DataFrame] = []
+    rows = 0
+    for batch in batches:
+        gathered.append(batch)
+        rows += batch.height
+        if rows >= GROUP_ROWS:
+            yield pl.concat(gathered)
+            gathered, rows = [], 0
+    if rows:
+        yield pl.concat(gathered)
 
 
 def _describe_file(root: Path, file: Path, rows: int | None) -> LakeFile:

@@ -1,6 +1,6 @@
 """A dataset's source: data and a few functions, listed in an explicit registry."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -106,10 +106,13 @@ class Subset:
 
 @dataclass(frozen=True)
 class Drive:
-    """One drive of an instrumented vehicle in canonical form: its name, and its rows by table."""
+    """One drive of an instrumented vehicle in canonical form: its name, and its rows by table.
+
+    Rows that do not fit into the memory are batches in the order of their key.
+    """
 
     name: str
-    tables: Mapping[Table, pl.DataFrame]
+    tables: Mapping[Table, pl.DataFrame | Iterable[pl.DataFrame]]
 
 
 @dataclass(frozen=True)
