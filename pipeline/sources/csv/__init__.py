@@ -9,6 +9,7 @@ from tracklake.pipeline.sources.csv.archives import is_archive as is_archive
 from tracklake.pipeline.sources.csv.archives import list_members as list_members
 from tracklake.pipeline.sources.csv.line_bytes import BOM as BOM
 from tracklake.pipeline.sources.csv.line_bytes import LINE as LINE
+from tracklake.pipeline.sources.csv.line_bytes import split_lines as split_lines
 from tracklake.pipeline.sources.csv.raw_files import fetch_lines as fetch_lines
 from tracklake.pipeline.sources.csv.raw_files import hash_raw as hash_raw
 from tracklake.pipeline.sources.csv.raw_files import measure_unpacked as measure_unpacked
@@ -20,5 +21,6 @@ from tracklake.pipeline.sources.csv.reader import UNNAMED as UNNAMED
 from tracklake.pipeline.sources.csv.reader import Chunk as Chunk
 from tracklake.pipeline.sources.csv.reader import Layout as Layout
 from tracklake.pipeline.sources.csv.reader import map_chunks as map_chunks
+from tracklake.pipeline.sources.csv.reader import map_lines as map_lines
 from tracklake.pipeline.sources.csv.reader import read_chunks as read_chunks
 from tracklake.pipeline.sources.csv.table_files import NoTableError as NoTableError

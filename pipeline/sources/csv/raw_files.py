@@ -120,6 +120,8 @@ def read_whole_lines(handle: BinaryIO, chunk_bytes: int, file: RawFile, *, headi
             if line := handle.readline():
                 yield line
         while block := handle.read(chunk_bytes):
+            if not block.endswith(b"\n"):
+                block += handle.readline(limit)
             read += len(block)
             if read > limit:
                 raise SourceError(
@@ -127,7 +129,7 @@ def read_whole_lines(handle: BinaryIO, chunk_bytes: int, file: RawFile, *, headi
                     f"about {GZIP_RATIO} times, as trajectories compress. It repeats the same rows, or is damaged; "
                     "look at its rows, remove the repeated ones, and run again."
                 )
-            yield block if block.endswith(b"\n") else block + handle.readline()
+            yield block
 
 
 def fetch_lines(file: RawFile, numbers: pl.Series) -> pl.DataFrame:

@@ -101,24 +101,38 @@ def map_chunks(
 
     `threads` chunks are parsed and worked on at once; one more is held in memory.
     """
+    return map_lines(
+        file,
+        lambda number, data, first_line: work(number, parse_lines(data, layout, first_line=first_line)),
+        threads=threads,
+        heading_lines=layout.header_lines,
+        chunk_bytes=chunk_bytes,
+    )
+
+
+def map_lines(
+    file: RawFile,
+    work: Callable[[int, bytes, int], Result],
+    *,
+    threads: int,
+    heading_lines: int = 0,
+    chunk_bytes: int = CHUNK_BYTES,
+) -> Iterator[Result]:
+    """Apply a function of a chunk's number, its whole lines and the number of the first in threads, as `map_chunks`."""
     line = 1
     numbers = count()
     ahead: deque[Future[Result]] = deque()
-
-    def parse_and_work(number: int, data: bytes, first_line: int) -> Result:
-        return work(number, parse_lines(data, layout, first_line=first_line))
-
     with open_raw(file) as handle, ThreadPoolExecutor(threads) as pool:
-        for data in read_whole_lines(handle, chunk_bytes, file, heading_lines=layout.header_lines):
-            if line > layout.header_lines:
-                ahead.append(pool.submit(parse_and_work, next(numbers), data, line))
+        for data in read_whole_lines(handle, chunk_bytes, file, heading_lines=heading_lines):
+            if line > heading_lines:
+                ahead.append(pool.submit(work, next(numbers), data, line))
             line += count_lines(data)
             if len(ahead) > threads:
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
-    if line == layout.header_lines + 1 > 1:
-        yield parse_and_work(0, b"", line)  # a header without rows is not an empty file
+    if line == heading_lines + 1 > 1:
+        yield work(0, b"", line)  # a header without rows is not an empty file
 
 
 def parse_lines(data: bytes, layout: Layout, *, first_line: int = 1) -> Chunk:

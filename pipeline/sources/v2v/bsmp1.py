@@ -7,12 +7,7 @@ import polars as pl
 
 from tracklake.pipeline.sources.csv import BOM, LINE, Chunk, Layout, map_chunks, read_head
 from tracklake.pipeline.sources.source import RawFile
-from tracklake.pipeline.sources.v2v.messages import (
-    STANDARD_GRAVITY_MPS2,
-    RawMessages,
-    split_impossible,
-    write_ids,
-)
+from tracklake.pipeline.sources.v2v.messages import RawMessages, collect_messages, write_ids
 
 FIELDS = (
     "RxDevice", "FileId", "TxDevice", "Gentime", "TxRandom", "MsgCount", "DSecond", "Latitude", "Longitude",
@@ -32,15 +27,6 @@ MEASURED_AS = {
     "Yawrate": "yaw_rate_degps",
 }
 """Columns of the frame by field: the units are the same."""
-UNAVAILABLE = {
-    "elevation_m": (-409.6, 0.05),
-    "speed_mps": (163.82, 0.01),
-    "heading_deg": (360.0, 0.005),
-    "accel_mps2": (20.01, 0.005),
-    "lateral_accel_mps2": (20.01, 0.005),
-    "vertical_accel_mps2": (-2.54 * STANDARD_GRAVITY_MPS2, 0.05),
-}
-"""J2735's codes for an unavailable value in the units of the file, and how far a rounded one may lie from them."""
 REQUIRED = ("RxDevice", "TxDevice", "Gentime", "Latitude", "Longitude")
 DTYPES: dict[str, pl.DataType] = {
     name: pl.String() if name == "FileId" else pl.Int64() if name in WHOLE else pl.Float64()
@@ -95,24 +81,21 @@ def _convert(file: RawFile, chunks: list[Chunk]) -> RawMessages:
     rows = pl.concat([chunk.frame for chunk in chunks] or [pl.DataFrame(schema={LINE: pl.Int64(), **DTYPES})])
     random_id = rows["TxRandom"].fill_null(0)
     ids = write_ids(random_id.clip(0, MAX_ID).to_numpy().astype("u4"))
+    is_logged = random_id.is_between(1, MAX_ID) | (rows["TxDevice"] == 0)
     frame = rows.rename(MEASURED_AS).with_columns(
-        pl.when((pl.col(name) - code).abs() > tolerance).then(pl.col(name)).alias(name)
-        for name, (code, tolerance) in UNAVAILABLE.items()
-    )
-    frame = frame.with_columns(
         # Without a random id, which is 0 or empty then, the device stands for itself.
-        ids.zip_with(random_id.is_between(1, MAX_ID), rows["TxDevice"].cast(pl.String)).alias("temporary_id"),
+        ids.zip_with(is_logged, rows["TxDevice"].cast(pl.String)).alias("temporary_id"),
         receiver=pl.col("RxDevice").cast(pl.String),
         utc_us=pl.col("Gentime") + EPOCH_US,
         second_mark_ms=pl.col("DSecond"),
         own=pl.col("RxDevice") == pl.col("TxDevice"),
-        sender=pl.col("TxDevice").cast(pl.String),
+        sender=pl.when(pl.col("TxDevice") != 0).then(pl.col("TxDevice").cast(pl.String)),
         message_count=pl.col("MsgCount"),
     )
-    kept, impossible = split_impossible(file, frame)
-    return RawMessages(
-        kept,
-        pl.concat([*(chunk.rejects for chunk in chunks), impossible]).sort(LINE),
+    return collect_messages(
+        file,
+        [frame],
+        [chunk.rejects for chunk in chunks],
         sum(chunk.rows_read for chunk in chunks),
         synthetic=bool((rows["FileId"] == SYNTHETIC_FILE_ID).any()),
     )

@@ -1,5 +1,6 @@
 """What the readers of message logs return, whatever the format: one frame of messages, and every line accounted for."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, fetch_lines
+from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA, fetch_lines, split_lines
 from tracklake.pipeline.sources.source import RawFile
 from tracklake.schemas.messages import BSM
 
@@ -26,14 +27,52 @@ MESSAGE_SCHEMA: dict[str, pl.DataType] = {
     **{name: BSM.dtypes[name] for name in MEASURED},
 }
 """Columns of messages as they were logged."""
-TRANSMISSIONS = ("neutral", "park", "forwardGears", "reverseGears")
-"""States of the transmission by their number in J2735; others are reserved or unavailable."""
 STANDARD_GRAVITY_MPS2 = 9.80665
 """Acceleration in m/s2 that J2735 counts as 1 g."""
+J2735: dict[str, tuple[float, int | None]] = {
+    "lat_deg": (10_000_000, 900_000_001),
+    "lon_deg": (10_000_000, 1_800_000_001),
+    "elevation_m": (10, -4096),
+    "speed_mps": (50, 8191),
+    "heading_deg": (80, 28_800),
+    "accel_mps2": (100, 2001),
+    "lateral_accel_mps2": (100, 2001),
+    "vertical_accel_mps2": (50 / STANDARD_GRAVITY_MPS2, -127),
+    "yaw_rate_degps": (100, None),
+    "steering_angle_deg": (1 / 1.5, 127),
+    "semi_major_m": (20, 255),
+    "semi_minor_m": (20, 255),
+    "orientation_deg": (65_535 / 360, 65_535),
+    "length_m": (100, 0),
+    "width_m": (100, 0),
+}
+"""J2735's counts per unit of the column, and its code for an unavailable value; the yaw rate has none.
+
+Logs in other units repeat the codes: 163.82 m/s is no speed.
+"""
+TRANSMISSIONS = ("neutral", "park", "forwardGears", "reverseGears")
+"""States of the transmission by their number in J2735; others are reserved or unavailable."""
 MAX_SECOND_MARK_MS = 60_999
 """Greatest possible second mark in ms, at the end of a leap second; 65535 stands for unavailable."""
 POSSIBLE_US = (1_072_915_200_000_000, 4_102_444_800_000_000)
 """Microseconds since 1970 at 2004-01-01 and 2100-01-01: no message was sent before, and none will be read after."""
+
+BOUNDS = {
+    "heading_deg": (0, 360),
+    "speed_mps": (0, 200),
+    "semi_major_m": (0, 1000),
+    "semi_minor_m": (0, 1000),
+    "orientation_deg": (0, 360),
+    "length_m": (0, 100),
+    "width_m": (0, 20),
+}.items()
+"""Least and greatest possible values; J2735 itself can state less of each."""
+MAX_LINE_CHARS = 1 << 16
+"""Longest line that can be a message: one of J2735 has at most some thousand octets, written as JSON ten times that."""
+MILLISECONDS_FROM, MICROSECONDS_FROM = 1e11, 1e14
+"""Least numbers that count as milliseconds and as microseconds since 1970; lesser ones are seconds."""
+SHOWN_CHARS = 1000
+"""Characters kept of the text of a longer line."""
 
 
 @dataclass(frozen=True)
@@ -55,28 +94,90 @@ class RawMessages:
     synthetic: bool = False
 
 
-def split_impossible(file: RawFile, frame: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+@dataclass(frozen=True)
+class Lines:
+    """Whole lines of a file: `line`, `text` of those that can hold a message, the rejects, and how many there were."""
+
+    usable: pl.DataFrame
+    rejects: pl.DataFrame
+    rows_read: int
+
+
+def screen_lines(data: bytes, first_line: int) -> Lines:
+    """Split whole lines, of which the first has a number, into those that can hold a message and the rejects."""
+    lines = split_lines(data.removeprefix(BOM) if first_line == 1 else data, first_line)
+    text = pl.col("text")
+    reason = pl.coalesce(
+        pl.when(~pl.col("utf8")).then(pl.lit("not UTF-8")),
+        pl.when(text.str.len_bytes() > MAX_LINE_CHARS).then(pl.lit(f"longer than {MAX_LINE_CHARS} characters")),
+        pl.when(text.str.strip_chars() == "").then(pl.lit("blank line")),
+    )
+    judged = lines.with_columns(reason.alias("reason"), text=text.str.strip_chars())
+    return Lines(
+        judged.filter(pl.col("reason").is_null()).select(LINE, "text"),
+        judged.filter(pl.col("reason").is_not_null()).select(LINE, "reason", text.str.slice(0, SHOWN_CHARS)),
+        lines.height,
+    )
+
+
+def collect_messages(
+    file: RawFile,
+    frames: Sequence[pl.DataFrame],
+    rejects: Sequence[pl.DataFrame],
+    rows_read: int,
+    *,
+    notes: tuple[str, ...] = (),
+    synthetic: bool = False,
+) -> RawMessages:
+    """Gather what was read of a file's chunks; messages that cannot be are rejects.
+
+    Columns that the frames lack are null; those that the tables do not know are left out.
+    """
+    frame = pl.concat(frames or [pl.DataFrame(schema={LINE: pl.Int64()})], how="diagonal").sort(LINE)
+    kept, impossible = split_impossible(frame, lambda numbers: fetch_lines(file, numbers))
+    refused = pl.concat([*rejects, impossible], how="vertical_relaxed").sort(LINE)
+    return RawMessages(kept, refused.select(*REJECT_SCHEMA), rows_read, notes, synthetic)
+
+
+def split_impossible(
+    frame: pl.DataFrame, fetch: Callable[[pl.Series], pl.DataFrame]
+) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split messages into those that are possible, in MESSAGE_SCHEMA, and the rejects (`line`, `reason`, `text`).
 
     A message without a position, or with a position, heading, speed, counter or time that cannot be, is impossible.
     Columns that the frame lacks are null, and so are second marks that cannot be.
+
+    Args:
+        frame: messages, in which values that are unavailable may still be codes.
+        fetch: function of line numbers that returns the text of these lines (`line`, `text`).
     """
     given = frame.with_columns(
         pl.lit(None, dtype).alias(name) for name, dtype in MESSAGE_SCHEMA.items() if name not in frame.columns
     )
-    judged = given.with_columns(_find_impossible().alias("reason"))
+    # A log may round the code; a tenth of a count is less than what tells it from the next value.
+    available = given.with_columns(
+        pl.when((pl.col(name) * per_unit - code).abs() > 0.1).then(pl.col(name)).alias(name)
+        for name, (per_unit, code) in J2735.items()
+        if code is not None
+    )
+    judged = available.with_columns(_find_impossible().alias("reason"))
     refused = judged.filter(pl.col("reason").is_not_null()).select(LINE, "reason")
     if not refused.is_empty():
-        refused = refused.join(fetch_lines(file, refused[LINE]), on=LINE, how="left", maintain_order="left")
+        refused = refused.join(fetch(refused[LINE]), on=LINE, how="left", maintain_order="left")
     else:
         refused = pl.DataFrame(schema=REJECT_SCHEMA)
-    mark, heading = pl.col("second_mark_ms"), pl.col("heading_deg").cast(pl.Float32)
+    mark = pl.col("second_mark_ms")
     kept = judged.filter(pl.col("reason").is_null()).with_columns(
         pl.when(mark.is_between(0, MAX_SECOND_MARK_MS)).then(mark).alias("second_mark_ms"),
-        # Single precision rounds 359.99999 to 360.
-        pl.when(heading == 360).then(pl.lit(0.0)).otherwise(heading).alias("heading_deg"),
+        *(_wrap_angle(name) for name in ("heading_deg", "orientation_deg")),
     )
     return kept.select(pl.col(name).cast(dtype) for name, dtype in MESSAGE_SCHEMA.items()), refused
+
+
+def _wrap_angle(name: str) -> pl.Expr:
+    """Return an angle of 0 to 360 degrees in single precision, which rounds 359.99999 to 360, as one below 360."""
+    angle = pl.col(name).cast(pl.Float32)
+    return pl.when(angle == 360).then(pl.lit(0.0)).otherwise(angle).alias(name)
 
 
 def _find_impossible() -> pl.Expr:
@@ -87,12 +188,29 @@ def _find_impossible() -> pl.Expr:
         "position (0, 0)": (lat == 0) & (lon == 0),
         "latitude outside -84 to 80 degrees": ~lat.is_between(-84, 80),
         "longitude not between -180 and 180 degrees": ~lon.is_between(-180, 180, closed="none"),
-        "heading outside 0 to 360 degrees": ~pl.col("heading_deg").is_between(0, 360),
-        "negative speed": pl.col("speed_mps") < 0,
         "message count outside 0 to 127": ~pl.col("message_count").is_between(0, 127),
         "time before 2004 or after 2100": ~pl.coalesce("utc_us", "received_us").is_between(*POSSIBLE_US),
+        **{f"{name} is not finite": ~pl.col(name).is_finite() for name in J2735},
+        **{f"{name} outside {low:g} to {high:g}": ~pl.col(name).is_between(low, high) for name, (low, high) in BOUNDS},
     }
     return pl.coalesce(pl.when(applies).then(pl.lit(reason)) for reason, applies in impossible.items())
+
+
+def read_times(text: pl.Series) -> pl.Series:
+    """Read UTC times as microseconds since 1970; null where a text is none.
+
+    A number counts seconds, milliseconds or microseconds since 1970, by its size; other texts are ISO 8601, in UTC
+    where they name no offset.
+    """
+    plain = text.str.strip_suffix("[UTC]").str.strip_suffix("Z").str.replace(" ", "T", literal=True)
+    times = plain.str.to_datetime("%Y-%m-%dT%H:%M:%S%.f", time_unit="us", strict=False).to_physical()
+    if times.null_count() == text.null_count():
+        return times
+    number = plain.cast(pl.Float64, strict=False)
+    offset = plain.str.to_datetime("%Y-%m-%dT%H:%M:%S%.f%z", time_unit="us", time_zone="UTC", strict=False)
+    scale = pl.when(number < MILLISECONDS_FROM).then(1e6).when(number < MICROSECONDS_FROM).then(1e3).otherwise(1.0)
+    counted = pl.when(number.is_finite() & (number.abs() < 1e18)).then((number * scale).round())
+    return pl.select(pl.coalesce(times, counted.cast(pl.Int64, strict=False), offset.to_physical())).to_series()
 
 
 def write_ids(numbers: npt.NDArray[np.uint32]) -> pl.Series:

@@ -2,13 +2,15 @@
 
 from tracklake.pipeline.sources.csv import BOM
 from tracklake.pipeline.sources.v2v.bsmp1 import recognise_bsmp1
+from tracklake.pipeline.sources.v2v.pilot_json import recognise_pilot_json
 from tracklake.pipeline.sources.v2v.truth import TRUTH_MARK
+from tracklake.pipeline.sources.v2v.uper import recognise_hex
 
-BSMP1, TRUTH = "bsmp1", "drive-truth"
-"""Dialects of text files: messages, and the truth of a synthetic drive."""
+BSMP1, PILOT_JSON, HEX, TRUTH = "bsmp1", "pilot-json", "bsm-hex", "drive-truth"
+"""Dialects of text files: three of messages, and the truth of a synthetic drive."""
 ROS1, ROS2, ROS2_STORAGE = "ros1-bag", "ros2-bag", "ros2-storage"
 """Dialects of bags: a file, the metadata of a bag that is a folder, and the files with its messages."""
-RECOGNISED_BY = {BSMP1: recognise_bsmp1}
+RECOGNISED_BY = {BSMP1: recognise_bsmp1, PILOT_JSON: recognise_pilot_json, HEX: recognise_hex}
 """Functions that recognise logs of messages, by dialect."""
 
 

@@ -13,11 +13,17 @@ from tracklake.pipeline.sources.source import Canonical, Drive, Part, RawFile, S
 from tracklake.pipeline.sources.v2v.bsmp1 import read_bsmp1
 from tracklake.pipeline.sources.v2v.grouping import group
 from tracklake.pipeline.sources.v2v.messages import MESSAGE_SCHEMA, RawMessages
-from tracklake.pipeline.sources.v2v.recognition import BSMP1, TRUTH, detect
+from tracklake.pipeline.sources.v2v.pilot_json import read_pilot_json
+from tracklake.pipeline.sources.v2v.recognition import BSMP1, HEX, PILOT_JSON, TRUTH, detect
 from tracklake.pipeline.sources.v2v.truth import Truth, read_truth, resolve_truth
+from tracklake.pipeline.sources.v2v.uper import read_hex
 from tracklake.schemas import BSM, COMPLETENESS, DRIVES, EGO_STATES, STATIONS, SURROUNDING_TRUTH, Table
 
-READERS: Mapping[str, Callable[[RawFile], RawMessages]] = {BSMP1: read_bsmp1}
+READERS: Mapping[str, Callable[[RawFile], RawMessages]] = {
+    BSMP1: read_bsmp1,
+    PILOT_JSON: read_pilot_json,
+    HEX: read_hex,
+}
 """Readers of message logs, by dialect."""
 
 

@@ -57,8 +57,8 @@ def test_codes_for_unavailable_become_null(tmp_path):
         ({"Latitude": 80.01}, "latitude outside -84 to 80 degrees"),
         ({"Latitude": -84.01}, "latitude outside -84 to 80 degrees"),
         ({"Longitude": 180}, "longitude not between -180 and 180 degrees"),
-        ({"Heading": 360.1}, "heading outside 0 to 360 degrees"),
-        ({"Speed": -0.5}, "negative speed"),
+        ({"Heading": 360.1}, "heading_deg outside 0 to 360"),
+        ({"Speed": -0.5}, "speed_mps outside 0 to 200"),
         ({"MsgCount": 128}, "message count outside 0 to 127"),
         ({"Gentime": -1}, "time before 2004 or after 2100"),
         ({"Gentime": 2**62}, "time before 2004 or after 2100"),
@@ -129,7 +129,7 @@ def test_real_error_cases():
     assert raw.rejects["line"].to_list() == [2, 3, 4, 5]
     assert raw.rejects["reason"].to_list() == [
         *["latitude outside -84 to 80 degrees"] * 3,
-        "heading outside 0 to 360 degrees",
+        "heading_deg outside 0 to 360",
     ]
     assert raw.rejects["text"][3].startswith("1,1,1,0,0,0,0,34.706185,-86.433355,0,1.2573485488,900.0,")
     assert (raw.rows_read, raw.frame.height) == (138, 134)
