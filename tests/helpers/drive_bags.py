@@ -1,12 +1,14 @@
 """A small bag of a vehicle with a receiver, a LiDAR and a camera, written by the virtual instrumentation."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.synthetic.onboard.bag_files import Camera, Image, write_bag
+from tracklake.pipeline.sources.source import RawFile
+from tracklake.pipeline.synthetic.onboard.bag_files import Camera, Image, Stamped, make_store, write_bag, write_stream
 
 START_US = 1_700_000_000_000_000
 """Moment of the first fix, in microseconds since 1970."""
@@ -45,3 +47,18 @@ def write_small_bag(path: Path, version: Literal[1, 2] = 1, **changes: object) -
     known |= {"mounts": MOUNTS, "messages": iter(TEXTS), "version": version}
     write_bag(path, **(known | changes))
     return path
+
+
+def write_messages(path: Path, messages: Iterable[tuple[str, str, int, object]], version: int = 1) -> Path:
+    """Write messages of any kind: topic, type without `msg`, moment in us since START_US, and the message."""
+    stream = (
+        Stamped(START_US + after_us, topic, name.replace("/", "/msg/"), message)
+        for topic, name, after_us, message in messages
+    )
+    write_stream(path, stream, make_store(version), version)
+    return path
+
+
+def list_files(path: Path) -> list[RawFile]:
+    """Return the files of a bag as they are found in a folder."""
+    return [RawFile(file, file.name) for file in (sorted(path.iterdir()) if path.is_dir() else [path])]

@@ -80,8 +80,8 @@ class Image(NamedTuple):
     classes: tuple[str, ...]
 
 
-class _Stamped(NamedTuple):
-    """A message with the moment at which it is recorded, the first of an order that `heapq.merge` keeps."""
+class Stamped(NamedTuple):
+    """A message with its topic, its type and the moment at which it is recorded."""
 
     utc_us: int
     topic: str
@@ -120,8 +120,8 @@ def write_bag(
         compressed: whether they are compressed, by lz4 in ROS 1 and by zstd in ROS 2.
     """
     require_extras("writing ROS bags", "onboard")
-    store = _make_store(version)
-    make = _Maker(store, version)
+    store = make_store(version)
+    make = MessageMaker(store, version)
     first_us = int(ego["utc_us"][0])
     head = [make.origin(first_us), make.transforms(first_us, mounts or {})]
     if camera is not None:
@@ -139,12 +139,18 @@ def write_bag(
     # The hidden folder is beside the target, so that renaming works.
     with tempfile.TemporaryDirectory(prefix=".bag-", dir=path.parent) as folder:
         unfinished = Path(folder) / path.name
-        _write_stream(unfinished, stream, store, version, storage, compressed=compressed)
+        write_stream(unfinished, stream, store, version, storage, compressed=compressed)
         unfinished.rename(path)
 
 
-def _write_stream(
-    path: Path, stream: Iterable[_Stamped], store: "Typestore", version: int, storage: str, *, compressed: bool
+def write_stream(
+    path: Path,
+    stream: Iterable[Stamped],
+    store: "Typestore",
+    version: int,
+    storage: str = "sqlite3",
+    *,
+    compressed: bool = False,
 ) -> None:
     """Write messages in the order in which they come."""
     from rosbags import rosbag1, rosbag2
@@ -167,7 +173,7 @@ def _write_stream(
             writer.write(connections[each.topic], each.utc_us * 1000, serialize(each.message, each.msgtype))
 
 
-def _make_store(version: int) -> "Typestore":
+def make_store(version: int) -> "Typestore":
     """Return the types of a ROS version, with those of vision_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -184,7 +190,7 @@ def _make_store(version: int) -> "Typestore":
     return store
 
 
-class _Maker:
+class MessageMaker:
     """Makes messages of one ROS version."""
 
     def __init__(self, store: "Typestore", version: int) -> None:
@@ -202,15 +208,15 @@ class _Maker:
         stamp = self("builtin_interfaces/Time", sec=seconds, nanosec=microseconds * 1000)
         return self("std_msgs/Header", stamp=stamp, frame_id=frame, **({"seq": 0} if self._version == 1 else {}))
 
-    def origin(self, utc_us: int) -> _Stamped:
+    def origin(self, utc_us: int) -> Stamped:
         """Make the mark of a synthetic bag."""
-        return _Stamped(utc_us, ORIGIN_TOPIC, "std_msgs/msg/String", self("std_msgs/String", data=ORIGIN_TEXT))
+        return Stamped(utc_us, ORIGIN_TOPIC, "std_msgs/msg/String", self("std_msgs/String", data=ORIGIN_TEXT))
 
-    def text(self, utc_us: int, text: str) -> _Stamped:
+    def text(self, utc_us: int, text: str) -> Stamped:
         """Make a V2V message as it was received."""
-        return _Stamped(utc_us, "/v2v/messages", "std_msgs/msg/String", self("std_msgs/String", data=text))
+        return Stamped(utc_us, "/v2v/messages", "std_msgs/msg/String", self("std_msgs/String", data=text))
 
-    def transforms(self, utc_us: int, mounts: Mapping[str, tuple[float, float, float]]) -> _Stamped:
+    def transforms(self, utc_us: int, mounts: Mapping[str, tuple[float, float, float]]) -> Stamped:
         """Make the places of the sensors on the vehicle, whose frame lies on the ground below its centre."""
         transforms = []
         for sensor, (x_m, y_m, z_m) in mounts.items():
@@ -225,9 +231,9 @@ class _Maker:
                 self("geometry_msgs/TransformStamped", header=header, child_frame_id=FRAMES[sensor], transform=place)
             )
         message = self("tf2_msgs/TFMessage", transforms=transforms)
-        return _Stamped(utc_us, "/tf_static", "tf2_msgs/msg/TFMessage", message)
+        return Stamped(utc_us, "/tf_static", "tf2_msgs/msg/TFMessage", message)
 
-    def camera_info(self, utc_us: int, camera: Camera) -> _Stamped:
+    def camera_info(self, utc_us: int, camera: Camera) -> Stamped:
         """Make the description of a camera without distortion."""
         matrix = np.array([camera.fx_px, 0, camera.cx_px, 0, camera.fy_px, camera.cy_px, 0, 0, 1], np.float64)
         values = {
@@ -248,19 +254,19 @@ class _Maker:
             roi=self("sensor_msgs/RegionOfInterest", **window),
             **({name.upper(): array for name, array in values.items()} if self._version == 1 else values),
         )
-        return _Stamped(utc_us, "/camera/camera_info", "sensor_msgs/msg/CameraInfo", message)
+        return Stamped(utc_us, "/camera/camera_info", "sensor_msgs/msg/CameraInfo", message)
 
-    def ego(self, ego: pl.DataFrame) -> Iterator[_Stamped]:
+    def ego(self, ego: pl.DataFrame) -> Iterator[Stamped]:
         """Make the messages of the receiver and of the inertial sensor, one set per row."""
         for row in ego.iter_rows(named=True):
             utc_us = row["utc_us"]
-            yield _Stamped(utc_us, "/gps/fix", "sensor_msgs/msg/NavSatFix", self._fix(row))
+            yield Stamped(utc_us, "/gps/fix", "sensor_msgs/msg/NavSatFix", self._fix(row))
             if row["heading_deg"] is not None:
-                yield _Stamped(utc_us, "/imu/data", "sensor_msgs/msg/Imu", self._imu(row))
+                yield Stamped(utc_us, "/imu/data", "sensor_msgs/msg/Imu", self._imu(row))
             if row["speed_mps"] is not None:
                 twist = self._twist(row["speed_mps"])
                 stamped = self("geometry_msgs/TwistStamped", header=self.header(utc_us, "base_link"), twist=twist)
-                yield _Stamped(utc_us, "/vehicle/twist", "geometry_msgs/msg/TwistStamped", stamped)
+                yield Stamped(utc_us, "/vehicle/twist", "geometry_msgs/msg/TwistStamped", stamped)
 
     def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> object:
         return self("geometry_msgs/Vector3", x=x, y=y, z=z)
@@ -296,7 +302,7 @@ class _Maker:
             linear_acceleration_covariance=unknown if accel is None else known,
         )
 
-    def scan(self, utc_us: int, points_m: Singles) -> _Stamped:
+    def scan(self, utc_us: int, points_m: Singles) -> Stamped:
         """Make the point cloud of a scan, its beams numbered from the lowest."""
         points = np.zeros(len(points_m), POINT)
         points["x"], points["y"], points["z"] = points_m[:, 0], -points_m[:, 1], points_m[:, 2]
@@ -319,15 +325,15 @@ class _Maker:
             data=points.view(np.uint8).reshape(-1),
             is_dense=True,
         )
-        return _Stamped(utc_us, "/velodyne_points", "sensor_msgs/msg/PointCloud2", message)
+        return Stamped(utc_us, "/velodyne_points", "sensor_msgs/msg/PointCloud2", message)
 
-    def image(self, image: Image) -> _Stamped:
+    def image(self, image: Image) -> Stamped:
         """Make the detector's result for an image."""
         rows = zip(image.boxes_px.tolist(), image.scores.tolist(), image.classes, strict=True)
         header = self.header(image.utc_us, FRAMES["camera"])
         boxes = [self._detection(header, box, score, name) for box, score, name in rows]
         message = self("vision_msgs/Detection2DArray", header=header, detections=boxes)
-        return _Stamped(image.utc_us, "/camera/detections", "vision_msgs/msg/Detection2DArray", message)
+        return Stamped(image.utc_us, "/camera/detections", "vision_msgs/msg/Detection2DArray", message)
 
     def _detection(self, header: object, box: list[float], score: float, name: str) -> object:
         left, top, width, height = box
