@@ -32,6 +32,7 @@ COMMANDS = {
     "evaluate": "Score runs and models at each horizon, beside published figures.",
     "predict": "Draw samples on the road: history, neighbors, truth, predictions and their uncertainty.",
     "lane-forest": "Fit a forest that predicts lane changes; score it, and the grid cells that models predict.",
+    "onboard": "Predict the vehicles around an instrumented vehicle from its own logs; train, evaluate, warn.",
     "export": "Write the lake's data in other projects' formats.",
     "sample": "Generate recordings in the raw formats with SUMO, with known defects and their truth.",
     "serve": "Serve the flows as Prefect deployments, by hand or on a schedule, until interrupted.",

@@ -19,6 +19,7 @@ from tracklake.pipeline.cli.options import (
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS as RUNS
+from tracklake.pipeline.stages.drive_score import FOLDER as ONBOARD
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.errors import explain_file_errors
 from tracklake.schemas.origin import describe_synthetic
@@ -114,11 +115,12 @@ def train(
 
 
 def _check_name(name: str) -> str:
-    """Refuse a name that is no run's: a path, the forest's folder, or a model that does not learn."""
+    """Refuse a name that is no run's: a path, a folder of others, or a model that does not learn."""
     if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
         raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {name!r}")
-    if name == FOREST:
-        raise typer.BadParameter(f"`{name}` is where `tracklake lane-forest` keeps its forest; name the run otherwise")
+    if name in (FOREST, ONBOARD):
+        keeps = "`tracklake lane-forest` keeps its forest" if name == FOREST else "`tracklake onboard` keeps its runs"
+        raise typer.BadParameter(f"`{name}` is where {keeps}; name the run otherwise")
     if name in MODELS and not MODELS[name].learns:
         raise typer.BadParameter(f"{name} does not learn; `tracklake evaluate {name}` scores it")
     return name

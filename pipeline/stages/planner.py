@@ -82,14 +82,15 @@ class Planner:
         return jobs
 
     def _select(self, stage: Stage, commits: Mapping[str, Commit]) -> Mapping[str, Commit]:
-        """Return the recordings that a stage over the whole lake builds on: drives, where it comes after their stages.
+        """Return the recordings that a stage over the whole lake builds on: drives alone, where it comes after theirs.
 
         Without this a drive that is added would make splits and tensors stale, which know nothing of drives.
         """
         of_drives = any(self._stages[name].scope == "drive" for name in stage.after if name in self._stages)
-        if stage.scope != "lake" or of_drives:
+        if stage.scope != "lake":
             return commits
-        return {key: commit for key, commit in commits.items() if not commit.info.get("drives")}
+        others = "subsets" if of_drives else "drives"
+        return {key: commit for key, commit in commits.items() if not commit.info.get(others)}
 
 
 def find_recordings(manifest: Manifest) -> list[Commit]:

@@ -15,8 +15,8 @@ from tracklake.training.onboard.samples import FEATURE_NUMBER, Samples
 CTRV = "ctrv"
 """Name of the model that needs no training."""
 NETWORKS = {
-    "stacked-lstm": ("StackedLstm", Recipe((Phase("mse", 30),), batch_size=100)),
-    "lstm-encoder-decoder": ("RecursiveDecoder", Recipe((Phase("mse", 30),), batch_size=100)),
+    "stacked-lstm": ("StackedLstm", Recipe((Phase("mse", 15),), batch_size=100)),
+    "lstm-encoder-decoder": ("RecursiveDecoder", Recipe((Phase("mse", 15),), batch_size=100)),
 }
 """Class in `networks` and recipe of each model that learns, by its name in the registry of overhead models."""
 MODELS = (CTRV, *NETWORKS)

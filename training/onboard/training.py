@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from tracklake.schemas.arrays import Singles
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import V2V
 from tracklake.training.models import Recipe, require_torch
+from tracklake.training.onboard.collisions import score_warnings
 from tracklake.training.onboard.models import (
     CTRV,
     Forecaster,
@@ -20,14 +22,13 @@ from tracklake.training.onboard.models import (
     predict_turns,
 )
 from tracklake.training.onboard.samples import Parts, Samples, augment_samples
-from tracklake.training.runs.config import TrainConfig
-from tracklake.training.runs.run_folder import AGAIN, RUN_VERSION, StaleRunError, load_weights, read_config
+from tracklake.training.onboard.scores import score_model
+from tracklake.training.runs.config import TrainConfig, find_device
+from tracklake.training.runs.run_folder import AGAIN, RUN_VERSION, StaleRunError, load_weights, read_config, save_run
 
 if TYPE_CHECKING:
     from tracklake.training.onboard.networks import FeatureNetwork
 
-FOLDER = "onboard"
-"""Folder of the runs of drives, among the lake's runs: apart from those that are scored on overhead tracks."""
 BATCH = 2048
 """Samples that are predicted at once."""
 Progress = Callable[[float, float], None]
@@ -42,6 +43,7 @@ def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progre
     require_torch(name)
     from tracklake.training.onboard import networks
 
+    device = find_device(config.device)
     epochs, size = config.epochs or recipe.epochs, config.batch_size or recipe.batch_size
     random = np.random.default_rng(config.seed)
     train = augment_samples(parts.train, random)
@@ -54,14 +56,14 @@ def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progre
             network: FeatureNetwork = getattr(networks, builder)(V2V.horizon_ticks)
             feature, deviation = torch.from_numpy(train.feature), torch.from_numpy(train.place_m - straight)
             network.standardise(feature, deviation)
-            network.to(config.device).train()
+            network.to(device).train()
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate or recipe.learning_rate)
             for epoch in range(epochs):
                 losses = []
                 order = torch.from_numpy(random.permutation(len(train)))
                 for first in range(0, len(train), size):
                     numbers = order[first : first + size]
-                    given, true = feature[numbers].to(config.device), deviation[numbers].to(config.device)
+                    given, true = feature[numbers].to(device), deviation[numbers].to(device)
                     loss = ((network(given) - true) / network.scale_m).square().mean()
                     optimizer.zero_grad(set_to_none=True)
                     loss.backward()
@@ -134,3 +136,50 @@ def open_model(name: str, parts: Parts, runs: Path) -> Forecaster:
     load_weights(network, out / "weights.pt")
     network.eval()
     return make_forecaster(name, lambda samples: run_network(network, samples), parts.train)
+
+
+def evaluate_model(model: Forecaster, parts: Parts, left_out: dict[str, int]) -> dict[str, Any]:
+    """Score a model on the evaluation part: what a run's `metrics.json` holds as its `evaluation`."""
+    return {
+        "model": model.name,
+        "part": "eval",
+        "protocol": V2V.name,
+        "split": parts.digest,
+        "samples": len(parts.eval),
+        "left_out": left_out,
+        "scores": [asdict(row) for row in score_model(model, parts.eval)],
+        "warnings": asdict(score_warnings(model, parts.eval)),
+    }
+
+
+def write_run(
+    out: Path,
+    model: Forecaster,
+    parts: Parts,
+    left_out: dict[str, int],
+    config: TrainConfig,
+    network: Any = None,  # noqa: ANN401  (None, or a torch network)
+) -> dict[str, Any]:
+    """Evaluate a model once, write it as a run, whole or not at all, and return its metrics."""
+    metrics = {"model": model.name, "evaluation": evaluate_model(model, parts, left_out)}
+    save_run(out, describe_run(model.name, parts, config), metrics, network)
+    return metrics
+
+
+def score_untrained(parts: Parts, left_out: dict[str, int], out: Path) -> dict[str, Any]:
+    """Write the model that needs no training as a run, and return its metrics."""
+    return write_run(out, make_forecaster(CTRV, predict_turns, parts.train), parts, left_out, TrainConfig())
+
+
+def train_run(
+    name: str,
+    parts: Parts,
+    left_out: dict[str, int],
+    out: Path,
+    config: TrainConfig,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Train a network, evaluate it once, write the run, and return its metrics."""
+    network = train_network(name, parts, config, progress)
+    model = make_forecaster(name, lambda samples: run_network(network, samples), parts.train)
+    return write_run(out, model, parts, left_out, config, network)

@@ -129,8 +129,6 @@ class Plan:
 
 def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
     """Combine model, tensor folder and settings; TracklakeError where they do not allow a training."""
-    import torch
-
     if entry.recipe is None:
         raise UsageError(f"model `{entry.name}` does not learn; `tracklake evaluate {entry.name}` scores it")
     train, val = folder.samples_of("train"), folder.samples_of("val")
@@ -144,9 +142,16 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
             f"{folder.path}: patience {config.patience} needs samples in `val` to judge by, and the split "
             f"`{folder.split}` has none: set `validation_part = true` and run `tracklake run`, or train without it"
         )
-    if config.device != "cpu" and not (config.device == "cuda" and torch.cuda.is_available()):
-        raise TracklakeError(f"expected device `cpu`, or `cuda` where torch finds one, got `{config.device}`")
-    device = torch.device("cuda", torch.cuda.current_device()) if config.device == "cuda" else torch.device("cpu")
+    device = find_device(config.device)
     given = {name: value for name in RECIPE_SETTINGS if (value := getattr(config, name)) is not None}
     recipe = replace(entry.recipe, **given)
     return Plan(entry, folder, config, recipe, {**entry.parameters, **config.parameters}, train, val, device)
+
+
+def find_device(name: str) -> "torch.device":
+    """Return the device of a name; TracklakeError where torch finds none."""
+    import torch
+
+    if name != "cpu" and not (name == "cuda" and torch.cuda.is_available()):
+        raise TracklakeError(f"expected device `cpu`, or `cuda` where torch finds one, got `{name}`")
+    return torch.device("cuda", torch.cuda.current_device()) if name == "cuda" else torch.device("cpu")
