@@ -29,7 +29,7 @@ from tracklake.schemas.text import make_visible
 
 TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
-LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".bag", ".db3", ".mcap", ".yaml")
+LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".bag", ".db3", ".mcap", ".zstd", ".yaml")
 """Endings of an instrumented vehicle's logs."""
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""

@@ -6,11 +6,8 @@ from pathlib import PurePosixPath
 
 from tracklake.pipeline.sources.csv import ARCHIVE_SUFFIX
 from tracklake.pipeline.sources.source import Grouping, RawFile, Unit
-from tracklake.pipeline.sources.v2v.recognition import ROS1, ROS2, ROS2_STORAGE
+from tracklake.pipeline.sources.v2v.recognition import BAGS, ROS2_PARTS
 from tracklake.schemas.text import make_visible
-
-REINDEX = "`ros2 bag reindex FOLDER` writes it again"
-"""Advice about a bag without the file that describes it."""
 
 
 def group(files: Sequence[RawFile]) -> Grouping:
@@ -19,11 +16,11 @@ def group(files: Sequence[RawFile]) -> Grouping:
     Where that folder has no other logs, the bag is a drive by itself. A drive has the name of its folder, or of the
     file that the user named; where folders in different places have the same name, their paths tell them apart.
     """
-    usable, refusals = _split_unusable(files)
+    usable, refusals = _split_packed(files)
     by_folder: dict[str, list[RawFile]] = {}
     for file in usable:
         by_folder.setdefault(file.folder, []).append(file)
-    bags = {folder for folder, own in by_folder.items() if any(file.dialect == ROS2 for file in own)}
+    bags = {folder for folder, own in by_folder.items() if all(file.dialect in ROS2_PARTS for file in own)}
     drives: dict[str, list[RawFile]] = {}
     for folder, own in by_folder.items():
         above = str(PurePosixPath(folder).parent)
@@ -45,25 +42,13 @@ def _sort_files(files: Sequence[RawFile]) -> tuple[RawFile, ...]:
     return tuple(sorted(files, key=lambda file: file.name))
 
 
-def _split_unusable(files: Sequence[RawFile]) -> tuple[list[RawFile], list[str]]:
-    """Split off the parts of bags without their other parts, and bags in archives, with messages about them."""
-    folders = {dialect: {file.folder for file in files if file.dialect == dialect} for dialect in (ROS2, ROS2_STORAGE)}
-    usable, refusals = [], []
-    for file in files:
-        if file.member is not None and file.dialect in (ROS1, ROS2, ROS2_STORAGE):
-            refusals.append(f"{file.name}: a bag in an archive, which is not read. Unpack {file.path.name}.")
-        elif file.dialect == ROS2_STORAGE and file.folder not in folders[ROS2]:
-            refusals.append(
-                f"{file.name}: part of a ROS 2 bag without its metadata. Expected metadata.yaml beside it; {REINDEX}."
-            )
-        elif file.dialect == ROS2 and file.folder not in folders[ROS2_STORAGE]:
-            refusals.append(
-                f"{file.name}: the metadata of a ROS 2 bag without its messages. Expected the .db3 or .mcap files that "
-                "it lists beside it. Give the whole folder of the bag."
-            )
-        else:
-            usable.append(file)
-    return usable, refusals
+def _split_packed(files: Sequence[RawFile]) -> tuple[list[RawFile], list[str]]:
+    """Split off the bags in archives, which cannot be read there, with messages about them."""
+    packed = {file.name: file.path.name for file in files if file.member is not None and file.dialect in BAGS}
+    refusals = [
+        f"{name}: a bag in an archive, which is not read. Unpack {archive}." for name, archive in packed.items()
+    ]
+    return [file for file in files if file.name not in packed], refusals
 
 
 def _name_drives(drives: Mapping[str, Sequence[RawFile]]) -> dict[str, str]:

@@ -1,9 +1,12 @@
 """Drives in the lake: what is recognised, what is one drive, its clock and tables, and the account of every line."""
 
 import json
+from zipfile import ZipFile
 
+import drive_bags
 import polars as pl
 import pytest
+from message_logs import REAL, needs_real_messages
 
 from tracklake import open as open_lake
 from tracklake.pipeline.ingest import ingest
@@ -12,6 +15,13 @@ from tracklake.pipeline.lake import open_for_writing
 from tracklake.pipeline.sources import SourceError
 
 PLACE = "40.0,-83.0,200"
+EPOCH_US = 1_072_915_200_000_000
+"""Microseconds from 1970 to the moment from which BsmP1 counts."""
+CORE = {
+    **{"msgCnt": 95, "id": "31325431", "secMark": 20_050, "speed": 0.1, "heading": 250.9125},
+    "position": {"latitude": 40.5, "longitude": -105.0, "elevation": 1472.8},
+}
+"""A decoded message, generated 20.05 s after a full minute."""
 
 
 def write_line(receiver=1, sender=1, gentime_us=0, count=0, place=PLACE):
@@ -102,7 +112,9 @@ def test_what_is_no_log_of_a_drive_is_skipped_or_named(tmp_path, put):
 def test_logs_of_which_nothing_is_usable_are_refused(tmp_path, put):
     put("trip/a.csv", write_line(place="0,0,0"), write_line(place="91,0,0"))
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
-    with pytest.raises(SourceError, match=r"recording trip: no message is usable.* first trip/a\.csv, line 1"):
+    with pytest.raises(
+        SourceError, match=r"recording trip: no message, position or scan is usable.* first trip/a\.csv, line 1"
+    ):
         ingest.build(tmp_path / "lake", job)
 
 
@@ -111,14 +123,85 @@ def _open_new(root):
         return writer.manifest
 
 
-def test_parts_of_bags_and_bags_in_archives_are_refused(tmp_path, put):
-    put("bag/metadata.yaml", "rosbag2_bagfile_information:\n  version: 5\n")
-    (refusal,) = find(tmp_path).refusals
-    assert "bag/metadata.yaml: the metadata of a ROS 2 bag without its messages" in refusal
-    (tmp_path / "source" / "bag" / "metadata.yaml").unlink()
-    (tmp_path / "source" / "bag" / "x_0.mcap").write_bytes(b"\x89MCAP0\r\n")
-    (refusal,) = find(tmp_path).refusals
-    assert "bag/x_0.mcap: part of a ROS 2 bag without its metadata" in refusal
+def test_a_bag_in_a_folder_of_its_own_is_part_of_the_drive_beside_it(tmp_path, put):
+    """A bag of two scans and one message, on the clock of the messages that were logged beside it."""
+    start = drive_bags.START_US - 200_000
+    gentime = start - EPOCH_US
+    put("trip/a.csv", write_line(gentime_us=gentime), write_line(gentime_us=gentime + 200_000, count=1))
+    sent = json.dumps(
+        {"metadata": {"recordGeneratedAt": "2023-11-14T22:13:20Z"}, "payload": {"data": {"coreData": CORE}}}
+    )
+    received_us = drive_bags.START_US + 60_000
+    drive_bags.write_small_bag(tmp_path / "source" / "trip" / "bag", 2, messages=[(received_us, sent)])
+    lake = read(tmp_path)
+    drive = lake.table("drives").collect().row(0, named=True)
+    assert {name: drive[name] for name in ("subset", "origin", "scans", "images", "messages", "stations")} == {
+        **{"subset": "trip", "origin": "synthetic"},
+        **{"scans": 2, "images": 2, "messages": 3, "stations": 2},
+    }
+    assert (drive["camera_fx_px"], drive["camera_y_m"], drive["lidar_z_m"]) == (1000.0, -0.2, 1.9)
+    assert drive["seconds"] == pytest.approx(0.4)
+    # At 0.2 s both the receiver and a message state the ego's position: the receiver's counts.
+    assert lake.table("ego_states").select(pl.col("time_s").round(6), "source").collect().rows() == [
+        (0.0, "bsm"),
+        *((time_s, "gnss") for time_s in (0.2, 0.3, 0.4)),
+    ]
+    returns = lake.table("lidar_returns").select(
+        "scan", "point", pl.col("time_s", "x_m", "y_m", "z_m").cast(pl.Float64).round(3)
+    )
+    assert returns.collect().rows() == [(0, 0, 0.21, 10.5, 2.1, 0.9), (0, 1, 0.21, 5.5, -2.9, 2.4)]
+    assert lake.table("detections").select(pl.col("time_s").round(6), "detection").collect().rows() == [
+        (0.25, 0),
+        (0.25, 1),
+    ]
+    heard = lake.table("bsm").filter(~pl.col("own")).select("temporary_id", pl.col("received_s").round(6)).collect()
+    assert heard.rows() == [("31325431", 0.26)]
+    log = lake.table("ingest_log").select("file", "dialect", "rows_read", "rows_kept").collect()
+    assert log.rows() == [
+        ("trip/a.csv", "bsmp1", 2, 2),
+        ("trip/bag/bag.db3", "ros2-storage", 17, 17),
+        ("trip/bag/metadata.yaml", "ros2-bag", 0, 0),
+    ]
+    alone = discover(tmp_path / "source" / "trip" / "bag", digest=Digests(tmp_path / "other"))
+    assert [unit.recording for _, unit in alone.units] == ["bag"]
+
+
+def test_a_message_of_a_bag_that_no_drive_takes_is_rejected_with_its_text(tmp_path):
+    sent = [json.dumps({"payload": {"data": {"coreData": CORE | change}}}) for change in ({}, {"position": {}})]
+    moments = [drive_bags.START_US + 60_000, drive_bags.START_US + 160_000]
+    drive_bags.write_small_bag(tmp_path / "a.bag", messages=zip(moments, sent, strict=True))
+    lake = read(tmp_path, "a.bag")
+    assert lake.table("drives").select("subset", "messages").collect().rows() == [("a", 1)]
+    (refused,) = lake.table("rejects").select("reason", "text").collect().rows()
+    assert refused == ("no position", sent[1])
+
+
+def test_bags_in_archives_and_without_their_files_are_refused(tmp_path, put):
+    drive_bags.write_small_bag(tmp_path / "a.bag")
+    (tmp_path / "source").mkdir()
+    with ZipFile(tmp_path / "source" / "bags.zip", "w") as archive:
+        archive.write(tmp_path / "a.bag", "a.bag")
+    assert find(tmp_path).refusals == ("bags.zip/a.bag: a bag in an archive, which is not read. Unpack bags.zip.",)
+    put("bag/metadata.yaml", "rosbag2_bagfile_information:\n  relative_file_paths:\n    - x_0.db3\n")
+    (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
+    with pytest.raises(SourceError, match=r"bag/metadata\.yaml: lists 'x_0\.db3', which is not beside it"):
+        ingest.build(tmp_path / "lake", job)
+
+
+@needs_real_messages
+def test_real_logs_become_drives(tmp_path):
+    for name in ("bsmp1_knoxville.csv", "ode_bsm_log.json", "ode_hex_decoded.json", "cvdp_hex_decoded.json"):
+        folder = tmp_path / "source" / name.partition(".")[0]
+        folder.mkdir(parents=True)
+        (folder / name).symlink_to(REAL / name)
+    lake = read(tmp_path)
+    drives = lake.table("drives").select("recording", "messages").sort("recording").collect()
+    log = lake.table("ingest_log").sort("recording").collect()
+    assert (log["rows_read"] == log["rows_kept"] + log["rows_dropped"]).all()
+    assert drives.group_by("recording").agg(pl.col("messages").sum()).sort("recording")["messages"].to_list() == (
+        log["rows_kept"].to_list()
+    )
+    assert set(drives["recording"]) == {"bsmp1_knoxville", "ode_bsm_log", "ode_hex_decoded", "cvdp_hex_decoded"}
 
 
 def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
