@@ -35,6 +35,7 @@ COMMANDS = {
     "onboard": "Predict the vehicles around an instrumented vehicle from its own logs; train, evaluate, warn.",
     "export": "Write the lake's data in other projects' formats.",
     "sample": "Generate recordings in the raw formats with SUMO, with known defects and their truth.",
+    "instrument": "Write what a car of a recording would have logged: V2V messages, LiDAR, camera, and the truth.",
     "serve": "Serve the flows as Prefect deployments, by hand or on a schedule, until interrupted.",
 }
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
