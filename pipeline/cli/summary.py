@@ -9,6 +9,7 @@ from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.cli.drives import describe_drives, list_drives
 from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
+from tracklake.pipeline.stages.drive_score import collect_drive_scores
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
@@ -61,14 +62,12 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         lines = {"rows": lines["rows"]}  # the others are of recordings from above
     if drives:
         lines = {"drives": describe_drives(drives), **lines}
-        of_drives = {row["subset"]: row["origin"] for row in drives}
-        terminal.print_origin(describe_synthetic(of_drives, noun="drive", maker="instrument"))
+        origins = {row["subset"]: row["origin"] for row in drives}
+        terminal.print_origin(describe_synthetic(origins, noun="drive", maker="instrument"))
     scores = [score for score in quality["model_scores"] if score["rows"]]
-    for score in scores:
-        known = [row for row in score["rows"] if row["rmse_m"] is not None]
-        rmse = "  ".join(f"{row['seconds']:g} s {row['rmse_m']:.2f}" for row in known)
-        counts = ", ".join(f"{row['n']:,}" for row in known)  # each has its own: errors over fewer samples may be less
-        lines[f"RMSE, m ({score['model']})"] = f"{rmse}  (n = {counts})" if known else "none"
+    lines |= {f"RMSE, m ({score['model']})": _format_errors(score["rows"], "rmse_m") for score in scores}
+    of_drives = collect_drive_scores(lake, load(lake), lambda message: terminal.print_problem(message, label="skipped"))
+    lines |= {f"MAE, m ({score['model']}, drives)": _format_errors(score["rows"], "mae_m") for score in of_drives}
     width = max(map(len, lines)) + 2
     for name, value in lines.items():
         terminal.print_line(f"{name:<{width}}{value}")
@@ -81,6 +80,8 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     if drives and not head["subsets"]:
         for query in ("FROM drives", "SELECT subset, vehicle_id, messages, lost FROM stations ORDER BY lost DESC"):
             terminal.print_line(f'  {command} sql "{query}"{lake_option}')
+        if of_drives:
+            terminal.print_line(f"  {command} onboard evaluate{lake_option}")
         return
     terminal.print_line(
         f'  {command} sql "SELECT rule, count(*) AS runs FROM findings GROUP BY rule ORDER BY runs DESC"{lake_option}'
@@ -90,6 +91,14 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         if any(score["part"] == "eval" for score in scores)
         else f'  {command} sql "FROM subsets"{lake_option}'
     )
+
+
+def _format_errors(rows: list[dict[str, Any]], figure: str) -> str:
+    """Return the errors by horizon with n: each has its own, as errors over fewer samples may be less."""
+    known = [row for row in rows if row[figure] is not None]
+    errors = "  ".join(f"{row['seconds']:g} s {row[figure]:.2f}" for row in known)
+    counts = ", ".join(f"{row['n']:,}" for row in known)
+    return f"{errors}  (n = {counts})" if known else "none"
 
 
 def _format_count(count: int | None) -> str:

@@ -211,8 +211,11 @@ def match_truth(surrounding: pl.DataFrame, truth: pl.DataFrame) -> pl.DataFrame:
     """Find the true vehicle of each perceived one: (subset, vehicle_id, truth_id), at most one row per vehicle."""
     by_id = truth.filter(pl.col("vehicle_id").is_not_null()).select(*TRACK, "truth_id")
     unsent = surrounding.filter(pl.col("vehicle_id") >= FIRST_LIDAR_ID)
-    pairs = unsent.select(*TRACK, "tick", "rel_x_m", "rel_y_m").join(
-        truth.select("subset", "tick", "truth_id", "rel_x_m", "rel_y_m"), on=("subset", "tick"), suffix="_true"
+    # Strips across the road, as long as the gate: a vehicle is compared with those in its own and the two beside it.
+    strip = (pl.col("rel_x_m") / GATE_M).floor().cast(pl.Int64)
+    true = truth.select("subset", "tick", "truth_id", "rel_x_m", "rel_y_m", strip=strip + pl.lit([-1, 0, 1]))
+    pairs = unsent.select(*TRACK, "tick", "rel_x_m", "rel_y_m", strip=strip).join(
+        true.explode("strip"), on=("subset", "tick", "strip"), suffix="_true"
     )
     away = [pl.col(name) - pl.col(f"{name}_true") for name in ("rel_x_m", "rel_y_m")]
     near = (
