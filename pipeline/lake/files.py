@@ -111,7 +111,9 @@ def _write_batches(
         nonlocal rows
         schema = first.drop(*table.partition).to_arrow().schema
         last = first.clear()
-        with pq.ParquetWriter(aside, schema, compression="zstd", compression_level=ZSTD_LEVEL) as writer:
+        # Dictionaries of measured values take most of the time and save nothing.
+        options = {"compression": "zstd", "compression_level": ZSTD_LEVEL, "use_dictionary": False}
+        with pq.ParquetWriter(aside, schema, **options) as writer:
             for group in chain([first], groups):
                 table.validate(pl.concat([last, group]), where=where)
                 last, rows = group.tail(1), rows + group.height
