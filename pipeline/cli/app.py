@@ -23,6 +23,7 @@ COMMANDS = {
     "samples": "Draw samples with maneuvers and neighbors.",
     "split": "Divide the subsets into train and eval.",
     "tensors": "Write the split as flat arrays.",
+    "fuse": "Track the vehicles around an instrumented vehicle, by its messages, LiDAR and camera.",
     "report": "Write the quality report.",
     "check": 'Compare every file with its checksum, and judge quality gates such as "error_share > 0.05".',
     "info": "Show a lake's recordings, stages, what is stale and why, and sizes on disk.",
@@ -40,7 +41,7 @@ COMMANDS = {
 }
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
 
-MODULES = {"validate": "stage", "samples": "stage", "tensors": "stage"}
+MODULES = {"validate": "stage", "samples": "stage", "tensors": "stage", "fuse": "stage"}
 """Modules of the commands that have none of their own."""
 DIAGNOSIS = "Diagnosis"
 """Title of the options that every command takes, on its help page."""

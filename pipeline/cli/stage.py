@@ -1,4 +1,4 @@
-"""`tracklake validate`, `samples` and `tensors`: stages without options of their own."""
+"""`tracklake validate`, `samples`, `tensors` and `fuse`: stages without options of their own."""
 
 from collections.abc import Callable
 
@@ -29,3 +29,4 @@ def _make_command(name: str) -> Callable[..., None]:
 validate = _make_command("validate")
 samples = _make_command("samples")
 tensors = _make_command("tensors")
+fuse = _make_command("fuse")

@@ -1,6 +1,6 @@
 """The stages after ingestion, in the order in which `tracklake run` goes through them."""
 
-from tracklake.pipeline.stages import assess, pages, repair, report, samples, score, split, tensors, validate
+from tracklake.pipeline.stages import assess, fuse, pages, repair, report, samples, score, split, tensors, validate
 from tracklake.pipeline.stages.stage import Stage
 
 STAGES: tuple[Stage, ...] = (
@@ -11,6 +11,7 @@ STAGES: tuple[Stage, ...] = (
     split.STAGE,
     tensors.STAGE,
     score.STAGE,
+    fuse.STAGE,
     pages.STAGE,
     report.STAGE,
 )

@@ -1,0 +1,75 @@
+"""Fuse: the vehicles around an instrumented vehicle, by its messages, LiDAR and camera."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import polars as pl
+
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.readers import SubsetReader
+from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
+from tracklake.pipeline.transforms.onboard.surrounding import Scan, Sensors, fuse_drive
+from tracklake.schemas import ASSOCIATION, BSM, DRIVES, EGO_STATES, LIDAR_CLUSTERS, SURROUNDING, Table
+from tracklake.schemas.drives import TICK_RATE_HZ
+from tracklake.schemas.extras import require_extras
+
+SCANS_PER_READ = 50
+"""LiDAR scans that are in memory at once."""
+LONGEST_S = 86_400.0
+"""Longest drive that is tracked, in s: a day; a longer one has a wrong clock."""
+
+
+def read_scans(returns: pl.LazyFrame, count: int) -> Iterator[Scan]:
+    """Yield the scans of LIDAR_RETURNS in the order of time, a few in memory at once.
+
+    Args:
+        returns: rows of the drive, sorted by scan.
+        count: number of scans, `drives.scans`.
+    """
+    for first in range(0, count, SCANS_PER_READ):
+        inside = pl.col("scan").is_between(first, first + SCANS_PER_READ - 1)
+        rows = returns.filter(inside).select("scan", "time_s", "x_m", "y_m", "z_m").collect()
+        starts = np.flatnonzero(np.diff(rows["scan"].to_numpy(), prepend=-1))
+        points = rows.select("x_m", "y_m", "z_m").to_numpy()
+        times = rows["time_s"].to_numpy()[starts].tolist()
+        yield from zip(times, np.split(points, starts[1:]), strict=True) if times else ()
+
+
+def build(reader: SubsetReader, _: Settings) -> StageResult:
+    """Track the vehicles around the ego over one drive."""
+    require_extras("`tracklake fuse`", "onboard")
+    facts = reader.table(DRIVES).row(0, named=True)
+    ego_states = reader.table(EGO_STATES)
+    reason = None
+    if ego_states.is_empty():
+        reason = "no position of the ego was logged"
+    elif facts["seconds"] > LONGEST_S:
+        reason = f"it lasts {facts['seconds']:,.0f} s, more than a day, so a clock is wrong"
+    if reason is not None:
+        empty = {table: table.empty() for table in (LIDAR_CLUSTERS, ASSOCIATION, SURROUNDING)}
+        return StageResult(empty, notes=[f"{reader.subset}: vehicles around the ego are not tracked: {reason}"])
+    ticks = int(facts["seconds"] * TICK_RATE_HZ + 1e-6) + 1
+    fused = fuse_drive(reader.table(BSM), ego_states, ticks, Sensors())
+    unknown = fused.counts["ticks_without_ego"]
+    note = f"{reader.subset}: the ego's position is unknown at {unknown:,} of {ticks:,} ticks, which have no rows"
+    return StageResult(
+        {table: _add_place(table, frame, reader) for table, frame in fused.tables.items()},
+        info=dict(fused.counts),
+        notes=[note] * bool(unknown),
+    )
+
+
+def _add_place(table: Table, frame: pl.DataFrame, reader: SubsetReader) -> pl.DataFrame:
+    """Return a frame with the columns of its place, in the table's order."""
+    place = [pl.lit(value).alias(name) for name, value in reader.partition.items()]
+    return frame.with_columns(place).select(list(table.dtypes))
+
+
+STAGE = Stage(
+    name="fuse",
+    meaning="Track the vehicles around an instrumented vehicle, by its messages, LiDAR and camera.",
+    scope="drive",
+    after=(INGEST,),
+    version=1,
+    build=build,
+)
