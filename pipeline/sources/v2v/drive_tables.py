@@ -6,11 +6,10 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.sources.accounting import FILE
-from tracklake.pipeline.sources.csv import LINE
 from tracklake.pipeline.sources.source import Drive, RawFile, SourceError
-from tracklake.pipeline.sources.v2v.assembly import assemble_messages
+from tracklake.pipeline.sources.v2v.assembly import Assembled, assemble_messages, date_messages
 from tracklake.pipeline.sources.v2v.bags import BagContents
+from tracklake.pipeline.sources.v2v.clocks import count_seconds
 from tracklake.pipeline.sources.v2v.logs import Logs
 from tracklake.pipeline.sources.v2v.point_clouds import Scans
 from tracklake.pipeline.sources.v2v.truth import resolve_truth
@@ -31,7 +30,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC).replace(tzinfo=None)
 
 def make_drive(
     name: str, recording: str, messages: pl.DataFrame, bag: BagContents | None, logs: Logs, files: Sequence[RawFile]
-) -> tuple[Drive, pl.DataFrame]:
+) -> tuple[Drive, Assembled]:
     """Make the tables of a drive.
 
     Args:
@@ -43,10 +42,12 @@ def make_drive(
         files: files of the folder.
 
     Returns:
-        the drive, and the messages that it does not take (file, line, reason).
+        the drive and its messages, with those that it does not take.
     """
-    start_us = _find_start(messages, bag, logs, recording)
-    assembled = assemble_messages(messages, start_us)
+    dated = date_messages(messages)
+    start_us = _find_start(dated, bag, logs, recording)
+    refused = logs.impossible.join(messages.select("receiver"), on="receiver", how="semi", nulls_equal=True)
+    assembled = assemble_messages(dated, start_us, refused)
     states = [assembled.bsm.filter("own").select(_STATES, source=pl.lit("bsm"))]
     place = {"dataset": pl.lit("v2v"), "subset": pl.lit(name)}
     tables: dict[Table, pl.DataFrame] = {STATIONS: assembled.stations, BSM: assembled.bsm}
@@ -73,7 +74,7 @@ def make_drive(
         for table, frame in {DRIVES: row, **tables}.items()
     }
     returns = {} if bag is None else {LIDAR_RETURNS: _read_returns(bag.scans, start_us, name)}
-    return Drive(name, {**frames, **returns}), assembled.rejects.select(FILE, LINE, "reason")
+    return Drive(name, {**frames, **returns}), assembled
 
 
 _STATES = [name for name in EGO_STATES.dtypes if name not in ("dataset", "subset", "source")]
@@ -98,7 +99,7 @@ def _list_moments(bag: BagContents) -> list[int]:
 
 
 def _set_clock(frame: pl.DataFrame, start_us: int) -> pl.DataFrame:
-    return frame.with_columns(time_s=(pl.col("utc_us") - start_us) / 1_000_000)
+    return frame.with_columns(time_s=count_seconds("utc_us", start_us))
 
 
 def _describe_messages(tables: dict[Table, pl.DataFrame]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA
 from tracklake.pipeline.sources.source import Part, RawFile
 from tracklake.pipeline.sources.v2v.bags import BagContents, read_bag
 from tracklake.pipeline.sources.v2v.bsmp1 import read_bsmp1
-from tracklake.pipeline.sources.v2v.messages import MESSAGE_SCHEMA, RawMessages
+from tracklake.pipeline.sources.v2v.messages import MESSAGE_SCHEMA, SENDER_SCHEMA, RawMessages
 from tracklake.pipeline.sources.v2v.pilot_json import decode_texts, read_pilot_json
 from tracklake.pipeline.sources.v2v.recognition import BAGS, BSMP1, HEX, PILOT_JSON, TRUTH
 from tracklake.pipeline.sources.v2v.truth import Truth, read_truth
@@ -34,6 +34,7 @@ class Logs:
         messages: rows of MESSAGE_SCHEMA with the number of their file.
         bag: what bags sensed; None where there is none.
         truths: truth of the drive, one per file of it.
+        impossible: senders of messages that cannot be (SENDER_SCHEMA).
         rejects: rows of FILED_SCHEMA, one per line or message that was not kept.
         texts: rows of FILED_SCHEMA without reason, of messages that have no line of their own.
         rows_read: lines and messages read, by file.
@@ -41,6 +42,7 @@ class Logs:
     """
 
     messages: pl.DataFrame
+    impossible: pl.DataFrame
     bag: BagContents | None
     truths: tuple[Truth, ...]
     rejects: pl.DataFrame
@@ -80,6 +82,7 @@ def read_logs(parts: Sequence[Part]) -> Logs:
     empty = pl.DataFrame(schema={**MESSAGE_SCHEMA, FILE: pl.Int64()})
     return Logs(
         pl.concat([empty, *(frame.select(empty.columns) for frame in frames)]),
+        pl.concat([pl.DataFrame(schema=SENDER_SCHEMA), *(raw.impossible for raw in logs.values())]),
         bag,
         truths,
         pl.concat([pl.DataFrame(schema=FILED_SCHEMA), *(each.select(*FILED_SCHEMA) for each in rejects)]),

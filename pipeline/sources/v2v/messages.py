@@ -1,7 +1,7 @@
 """What the readers of message logs return, whatever the format: one frame of messages, and every line accounted for."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ MESSAGE_SCHEMA: dict[str, pl.DataType] = {
     **{name: BSM.dtypes[name] for name in MEASURED},
 }
 """Columns of messages as they were logged."""
+SENDER_SCHEMA = {name: MESSAGE_SCHEMA[name] for name in ("receiver", "own", "sender", "temporary_id")}
+"""Columns that tell who sent a message, and who logged it."""
 STANDARD_GRAVITY_MPS2 = 9.80665
 """Acceleration in m/s2 that J2735 counts as 1 g."""
 J2735: dict[str, tuple[float, int | None]] = {
@@ -85,6 +87,7 @@ class RawMessages:
         rows_read: data lines or messages read; always the sum of the two.
         notes: messages for the user.
         synthetic: whether messages carry the mark of generated ones.
+        impossible: who sent the messages among the rejects (SENDER_SCHEMA).
     """
 
     frame: pl.DataFrame
@@ -92,6 +95,7 @@ class RawMessages:
     rows_read: int
     notes: tuple[str, ...] = ()
     synthetic: bool = False
+    impossible: pl.DataFrame = field(default_factory=lambda: pl.DataFrame(schema=SENDER_SCHEMA))
 
 
 @dataclass(frozen=True)
@@ -134,15 +138,15 @@ def collect_messages(
     Columns that the frames lack are null; those that the tables do not know are left out.
     """
     frame = pl.concat(frames or [pl.DataFrame(schema={LINE: pl.Int64()})], how="diagonal").sort(LINE)
-    kept, impossible = split_impossible(frame, lambda numbers: fetch_lines(file, numbers))
+    kept, impossible, senders = split_impossible(frame, lambda numbers: fetch_lines(file, numbers))
     refused = pl.concat([*rejects, impossible], how="vertical_relaxed").sort(LINE)
-    return RawMessages(kept, refused.select(*REJECT_SCHEMA), rows_read, notes, synthetic)
+    return RawMessages(kept, refused.select(*REJECT_SCHEMA), rows_read, notes, synthetic, senders)
 
 
 def split_impossible(
     frame: pl.DataFrame, fetch: Callable[[pl.Series], pl.DataFrame]
-) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split messages into those that are possible, in MESSAGE_SCHEMA, and the rejects (`line`, `reason`, `text`).
+) -> tuple[pl.DataFrame, pl.DataFrame, pl.DataFrame]:
+    """Split messages into those that are possible and those that are not.
 
     A message without a position, or with a position, heading, speed, counter or time that cannot be, is impossible.
     Columns that the frame lacks are null, and so are second marks that cannot be.
@@ -150,6 +154,9 @@ def split_impossible(
     Args:
         frame: messages, in which values that are unavailable may still be codes.
         fetch: function of line numbers that returns the text of these lines (`line`, `text`).
+
+    Returns:
+        the possible messages in MESSAGE_SCHEMA; `line`, `reason`, `text` of the others; SENDER_SCHEMA of the others.
     """
     given = frame.with_columns(
         pl.lit(None, dtype).alias(name) for name, dtype in MESSAGE_SCHEMA.items() if name not in frame.columns
@@ -161,7 +168,8 @@ def split_impossible(
         if code is not None
     )
     judged = available.with_columns(_find_impossible().alias("reason"))
-    refused = judged.filter(pl.col("reason").is_not_null()).select(LINE, "reason")
+    impossible = judged.filter(pl.col("reason").is_not_null())
+    refused = impossible.select(LINE, "reason")
     if not refused.is_empty():
         refused = refused.join(fetch(refused[LINE]), on=LINE, how="left", maintain_order="left")
     else:
@@ -171,7 +179,8 @@ def split_impossible(
         pl.when(mark.is_between(0, MAX_SECOND_MARK_MS)).then(mark).alias("second_mark_ms"),
         *(_wrap_angle(name) for name in ("heading_deg", "orientation_deg")),
     )
-    return kept.select(pl.col(name).cast(dtype) for name, dtype in MESSAGE_SCHEMA.items()), refused
+    senders = impossible.select(pl.col(name).cast(dtype) for name, dtype in SENDER_SCHEMA.items())
+    return kept.select(pl.col(name).cast(dtype) for name, dtype in MESSAGE_SCHEMA.items()), refused, senders
 
 
 def _wrap_angle(name: str) -> pl.Expr:
@@ -185,6 +194,7 @@ def _find_impossible() -> pl.Expr:
     lat, lon = pl.col("lat_deg"), pl.col("lon_deg")
     impossible = {
         "no position": lat.is_null() | lon.is_null(),
+        "no id": pl.col("temporary_id").is_null(),
         "position (0, 0)": (lat == 0) & (lon == 0),
         "latitude outside -84 to 80 degrees": ~lat.is_between(-84, 80),
         "longitude not between -180 and 180 degrees": ~lon.is_between(-180, 180, closed="none"),

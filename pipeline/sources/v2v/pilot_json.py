@@ -143,7 +143,7 @@ def decode_texts(texts: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
     """
     is_json = pl.col("text").str.strip_chars_start().str.starts_with("{")
     parts = [_convert_records(texts.filter(is_json)), convert_hex_lines(texts.filter(~is_json))]
-    kept, impossible = split_impossible(
+    kept, impossible, _ = split_impossible(
         pl.concat([frame for frame, _ in parts], how="diagonal").sort(LINE), lambda _numbers: texts.select(LINE, "text")
     )
     return kept, pl.concat([*(rejects for _, rejects in parts), impossible]).sort(LINE)
@@ -217,7 +217,10 @@ def _convert_core(rows: pl.DataFrame) -> pl.DataFrame:
     broken = pl.col("is_raw") & ((pl.col("lat") % 1 != 0) | (pl.col("long") % 1 != 0))
     values = numbers.select(
         *(
-            pl.when("is_raw").then(pl.col(raw) / J2735[name][0]).otherwise(pl.col(decoded) * factor).alias(name)
+            pl.when("is_raw")
+            .then((pl.col(raw) / J2735[name][0]).round(9))
+            .otherwise(pl.col(decoded) * factor)
+            .alias(name)
             for name, (decoded, raw, factor) in QUANTITIES.items()
         ),
         pl.col("msgCnt").cast(pl.Int64, strict=False).alias("message_count"),

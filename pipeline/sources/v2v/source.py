@@ -32,17 +32,22 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
             f"recording {recording}: {truth} is the truth of one drive, and the logs beside it are of {len(names)} "
             f"receivers ({', '.join(names.values())}). Give each its own folder."
         )
-    drives, dropped = [], [pl.DataFrame(schema=DROPPED_SCHEMA)]
+    drives, notes, dropped = [], list(logs.notes), [pl.DataFrame(schema=DROPPED_SCHEMA)]
     files = [part.file for part in parts]
     for receiver, name in names.items():
         # The files of one folder are of one ego, also where only some of them name it.
         own = logs.messages.filter(pl.col("receiver").eq_missing(receiver)) if len(names) > 1 else logs.messages
         bag = logs.bag if receiver is None or len(names) == 1 else None
-        drive, rejects = make_drive(name, recording, own, bag, logs, files)
+        drive, assembled = make_drive(name, recording, own, bag, logs, files)
         drives.append(drive)
-        dropped.append(rejects)
+        dropped.append(assembled.rejects)
+        if assembled.ids_in_doubt:
+            notes.append(
+                f"drive {name}: {assembled.ids_in_doubt:,} temporary ids may follow one of several others and count as "
+                "vehicles of their own"
+            )
     log, refused = account_files(parts, logs, pl.concat(dropped), recording)
-    return Canonical((), log, refused, COMPLETENESS.empty(), logs.notes, "other", tuple(drives))
+    return Canonical((), log, refused, COMPLETENESS.empty(), tuple(notes), "other", tuple(drives))
 
 
 def _name_drives(logs: Logs, recording: str) -> dict[str | None, str]:
