@@ -1,0 +1,398 @@
+"""Which returns of a LiDAR scan belong to which vehicle, and where that vehicle therefore is.
+
+Clusters are assigned first to vehicles that send messages, then to those that only LiDAR saw before; what remains are
+new vehicles, or no vehicles. Each assignment is gated and the most likely as a whole (the Hungarian method). A vehicle
+then takes all returns within its box, from whatever cluster; what its clusters hold beyond is clustered again and
+offered to the others. So a cluster of two vehicles is parted, and a vehicle in two clusters is joined.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tracklake.pipeline.transforms.onboard.boxes import Boxes, Returns, locate_boxes
+from tracklake.pipeline.transforms.onboard.clusters import (
+    HIDING_M,
+    Scan,
+    cluster_returns,
+    describe_clusters,
+    describe_scan,
+    find_sector,
+    select_returns,
+)
+from tracklake.pipeline.transforms.onboard.measurements import LidarMeasurement, Measured, Predicted, Scanner
+from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges
+from tracklake.schemas.perception import FIRST_LIDAR_ID
+
+GATE = 9.21
+"""99 % quantile of chi squared with 2 degrees of freedom."""
+CLUTTER_PER_M2 = 1 / 175
+"""Density of vehicles that were not predicted: one per lane and 50 m."""
+SEEN_SHARE, SEEN_SHARE_HIDDEN = 0.9, 0.2
+"""Probability that a predicted vehicle in free sight, or behind something nearer, gives returns."""
+HEADING_SD_RAD, NEW_HEADING_SD_RAD = 0.03, 0.08
+"""Standard deviation of a predicted heading, and of the ego's axis as the heading of a new vehicle, in rad."""
+ROUNDS = 3
+"""Times that parted clusters are offered again."""
+MARGIN_M, GREATEST_MARGIN_M = 0.35, 1.0
+"""Distance outside a measured box within which returns are still the vehicle's, in m, before its standard deviation."""
+NEAR_BOX_M = 1.5
+"""A cluster closer than this to a measured vehicle is a part of it or hangs on it, and no new vehicle, in m."""
+LEAST_RETURNS = 3
+"""Returns in different directions or depths that a new vehicle must have."""
+LONGEST_M, WIDEST_M, NARROWEST_M = 26.0, 3.2, 0.5
+"""Greatest length and width, and least greater extent, of what can be a vehicle, in m."""
+LONG_M, LONG_HEIGHT_M = 7.0, 1.8
+"""What is longer than a car and lower than this is a barrier, in m: the beam above the horizon meets every truck."""
+BARRIER_GAP_M = 30.0
+"""Distance from the end of a barrier up to which clusters in line with it belong to it, in m."""
+ROADSIDE_M = 25.0
+"""What lies farther than this beside the ego is off its road, in m."""
+
+
+@dataclass
+class _Choice:
+    """What has been decided on a scan so far."""
+
+    vehicle: Integers
+    """(P,) predicted vehicle of each return; -1 = none yet."""
+    segment: Integers
+    """(P,) cluster of each return without a vehicle."""
+    main: Integers
+    """(V,) the cluster that each vehicle chose; -1 = none."""
+    candidates: Integers
+    """(V,) clusters within each vehicle's gate when it first chose."""
+
+
+def measure_by_lidar(
+    points_m: npt.NDArray[np.floating], predicted: Predicted, scanner: Scanner | None = None
+) -> LidarMeasurement:
+    """Measure predicted and new vehicles by the returns of one scan.
+
+    Args:
+        points_m: (P, 3) returns above the ground, in the ego's frame.
+        predicted: vehicles expected at the moment of the scan.
+        scanner: place of the LiDAR; None = above the ego's centre.
+    """
+    scanner = scanner or Scanner()
+    points = np.asarray(points_m, np.float64).reshape(-1, 3)
+    points = points[select_returns(points)]
+    origin = np.array([scanner.x_m, scanner.y_m])
+    scan, joined = describe_scan(points, origin, scanner.z_m)
+    shifted = Predicted(
+        predicted.vehicle_id,
+        predicted.centre_m - origin,
+        predicted.covariance_m2,
+        predicted.heading_rad,
+        predicted.size_m,
+    )
+    vehicles = predicted.vehicle_id.size
+    choice = _Choice(
+        np.full(scan.range_m.size, -1),
+        cluster_returns(scan, np.arange(scan.range_m.size)),
+        np.full(vehicles, -1),
+        np.zeros(vehicles, np.int64),
+    )
+    sends = predicted.vehicle_id < FIRST_LIDAR_ID
+    for stage in (np.flatnonzero(sends), np.flatnonzero(~sends)):
+        _choose(scan, shifted, stage, choice)
+    found = np.flatnonzero(np.bincount(choice.vehicle + 1, minlength=vehicles + 1)[1:])
+    boxes = _locate_chosen(scan, shifted, found, choice.vehicle)
+    group, new, new_boxes = _find_new(scan, choice, boxes, shifted.heading_rad[found])
+    cluster = np.concatenate([np.arange(found.size), new + found.size])
+    offset = boxes.centre_m - shifted.centre_m[found]
+    measured = Measured(
+        row=np.concatenate([found, np.full(new.size, -1)]),
+        centre_m=np.concatenate([boxes.centre_m, new_boxes.centre_m]) + origin,
+        covariance_m2=np.concatenate([boxes.covariance_m2, new_boxes.covariance_m2]),
+        cluster=cluster,
+        side=np.concatenate([boxes.side, new_boxes.side]),
+        size_m=np.concatenate([boxes.size_m, new_boxes.size_m]),
+    )
+    number = np.full(vehicles, -1)
+    number[found] = np.arange(found.size)
+    label = np.where(choice.vehicle >= 0, number[choice.vehicle] if vehicles else -1, group + found.size)
+    count = int(label.max() + 1) if label.size else 0
+    unknown = np.full(new.size, np.nan)
+    spread = shifted.covariance_m2[found] + boxes.covariance_m2
+    gate = _square(offset, spread)
+    return LidarMeasurement(
+        measured,
+        describe_clusters(points, label[joined], count),
+        {
+            "cluster": cluster.astype(np.int32),
+            "side": measured.side,
+            "distance_m": np.concatenate([np.hypot(*offset.T), unknown]).astype(np.float32),
+            "gate": np.concatenate([gate, unknown]).astype(np.float32),
+            "candidates": np.concatenate([choice.candidates[found], np.zeros(new.size)]).astype(np.int32),
+        },
+    )
+
+
+def _choose(scan: Scan, predicted: Predicted, stage: Integers, choice: _Choice) -> None:
+    """Assign clusters to the vehicles of one stage until none wants one; write `choice`."""
+    for turn in range(ROUNDS):
+        waiting = stage[choice.main[stage] < 0]
+        vehicle, segment, mean, boxes = _measure_pairs(scan, predicted, waiting, choice)
+        if not vehicle.size:
+            return
+        row, column, gated = _assign(scan, predicted, vehicle, segment, mean, boxes)
+        if turn == 0:
+            choice.candidates[stage] = np.bincount(vehicle[gated], minlength=choice.main.size)[stage]
+        if not row.size:
+            return
+        choice.main[row] = column
+        chosen = np.flatnonzero(gated)
+        pair = chosen[_find_pairs(vehicle[chosen], segment[chosen], row, column)]
+        parted = _absorb(scan, choice, row, _pick(boxes, pair), predicted.heading_rad[row])
+        if not parted:
+            return
+
+
+def _measure_pairs(
+    scan: Scan, predicted: Predicted, waiting: Integers, choice: _Choice
+) -> tuple[Integers, Integers, Floats, Boxes]:
+    """Measure each waiting vehicle by each cluster that can be in its gate.
+
+    Returns:
+        (R,) vehicles and clusters, the means of these, and where each vehicle would be.
+    """
+    nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), _no_boxes()
+    free = np.flatnonzero(choice.vehicle < 0)
+    if not (free.size and waiting.size):
+        return nothing
+    order = free[np.argsort(choice.segment[free], kind="stable")]
+    names, first, count = np.unique(choice.segment[order], return_index=True, return_counts=True)
+    least = np.minimum.reduceat(scan.place_m[order], first)
+    most = np.maximum.reduceat(scan.place_m[order], first)
+    size = np.where(np.isnan(predicted.size_m[waiting]), (12.0, 2.6), predicted.size_m[waiting])
+    spread = np.sqrt(np.linalg.eigvalsh(predicted.covariance_m2[waiting])[:, 1])
+    reach = np.sqrt(GATE) * (spread + 0.5) + np.hypot(*size.T) / 2
+    centre = predicted.centre_m[waiting][:, None]
+    outside = np.maximum(np.maximum(least - centre, centre - most), 0)
+    near = np.hypot(outside[..., 0], outside[..., 1]) <= reach[:, None]
+    row, column = np.nonzero(near)
+    if not row.size:
+        return nothing
+    within, pair = expand_ranges(first[column], count[column])
+    hidden = _find_hidden(scan, order, first, count)
+    vehicle = waiting[row]
+    boxes = _locate(scan, order[within], pair, hidden[column], predicted, vehicle, whole=False)
+    mean = np.add.reduceat(scan.place_m[order], first) / count[:, None]
+    return vehicle, names[column], mean[column], boxes
+
+
+def _locate(
+    scan: Scan, points: Integers, owner: Integers, hidden: Flags, predicted: Predicted, vehicle: Integers, whole: bool
+) -> Boxes:
+    """Measure predicted vehicles, of which some may occur more than once, by their returns."""
+    returns = Returns(
+        scan.place_m[points], scan.height_m[points], owner, hidden, scan.on_top[points], scan.step_rad, whole
+    )
+    return locate_boxes(
+        returns,
+        predicted.heading_rad[vehicle],
+        np.full(vehicle.size, HEADING_SD_RAD),
+        predicted.size_m[vehicle],
+        predicted.vehicle_id[vehicle] < FIRST_LIDAR_ID,
+    )
+
+
+def _find_hidden(scan: Scan, order: Integers, first: Integers, count: Integers) -> Flags:
+    """Tell of (S,) groups of returns whether something nearer stands beside either end: (S, 2) left and right."""
+    place = scan.place_m[order]
+    mean = np.add.reduceat(place, first) / count[:, None]
+    group = np.repeat(np.arange(count.size), count)
+    middle = np.arctan2(mean[:, 1], mean[:, 0])
+    turn = (scan.azimuth_rad[order] - middle[group] + np.pi) % (2 * np.pi) - np.pi
+    sectors = scan.nearest_m.size
+    hidden = []
+    for sign in (-1, 1):
+        last = np.lexsort((sign * turn, group))[np.cumsum(count) - 1]
+        sector = find_sector(scan.azimuth_rad[order[last]], sectors)
+        beside = scan.nearest_m[(sector[:, None] + sign * np.arange(4)) % sectors].min(1)
+        hidden.append(beside < scan.range_m[order[last]] - HIDING_M)
+    return np.column_stack(hidden)
+
+
+def _assign(
+    scan: Scan, predicted: Predicted, vehicle: Integers, segment: Integers, mean: Floats, boxes: Boxes
+) -> tuple[Integers, Integers, Flags]:
+    """Choose the most likely set of pairs.
+
+    A pair is chosen only if it is more likely than a missed vehicle and an unknown cluster.
+
+    Returns:
+        The chosen vehicles and their clusters, and (R,) which pairs are within the gate.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    spread = predicted.covariance_m2[vehicle] + boxes.covariance_m2
+    square = _square(boxes.centre_m - predicted.centre_m[vehicle], spread)
+    centre = predicted.centre_m[vehicle]
+    sector = find_sector(np.arctan2(centre[:, 1], centre[:, 0]), scan.nearest_m.size)
+    distance = np.hypot(*centre.T)
+    behind = scan.nearest_m[sector] < distance - np.nan_to_num(predicted.size_m[vehicle, 0], nan=5.0) - 3.0
+    share = np.where(behind, SEEN_SHARE_HIDDEN, SEEN_SHARE)
+    missed = 2 * np.log((1 - share) * CLUTTER_PER_M2 / share)
+    cost = square + boxes.surprise + np.log(np.linalg.det(2 * np.pi * spread)) + missed
+    gated = (square <= GATE) & (boxes.surprise <= GATE) & (cost < 0)
+    gated &= ~_find_parts(vehicle, mean, boxes, predicted.heading_rad[vehicle], gated)
+    rows, row = np.unique(vehicle[gated], return_inverse=True)
+    columns, column = np.unique(segment[gated], return_inverse=True)
+    costs = np.zeros((rows.size, columns.size))
+    costs[row, column] = cost[gated]
+    left, right = linear_sum_assignment(costs)
+    taken = costs[left, right] < 0
+    return rows[left[taken]], columns[right[taken]], gated
+
+
+def _find_parts(vehicle: Integers, mean: Floats, boxes: Boxes, heading: Floats, gated: Flags) -> Flags:
+    """Tell which of (R,) pairs have a cluster within the box that a nearer cluster in the gate gives the vehicle.
+
+    The side of a vehicle far ahead gives returns metres apart: clusters that are parts of the one with its rear.
+    """
+    inside = _measure_depth(mean, boxes, heading) <= 0
+    distance = np.hypot(*mean.T)
+    inside &= (vehicle[:, None] == vehicle) & gated & (distance[:, None] > distance)
+    return np.asarray(inside.any(1))
+
+
+def _find_pairs(vehicle: Integers, segment: Integers, row: Integers, column: Integers) -> Integers:
+    """Return the positions in (R,) pairs of some pairs."""
+    width = int(max(segment.max(), column.max())) + 1
+    key = vehicle * width + segment
+    order = np.argsort(key)
+    return np.asarray(order[np.searchsorted(key, row * width + column, sorter=order)])
+
+
+def _absorb(scan: Scan, choice: _Choice, row: Integers, boxes: Boxes, heading: Floats) -> bool:
+    """Give vehicles the free returns within their boxes, and cluster anew what their clusters hold beyond.
+
+    Returns:
+        Whether such returns remain.
+    """
+    free = np.flatnonzero(choice.vehicle < 0)
+    depth = _measure_depth(scan.place_m[free], boxes, heading)
+    owner = depth.argmin(1)
+    inside = depth[np.arange(free.size), owner] <= 0
+    choice.vehicle[free[inside]] = row[owner[inside]]
+    touched = np.unique(np.concatenate([choice.segment[free[inside]], choice.main[row]]))
+    rest = free[~inside & np.isin(choice.segment[free], touched)]
+    if rest.size:
+        choice.segment[rest] = choice.segment.max() + 1 + cluster_returns(scan, rest)
+    return bool(rest.size)
+
+
+def _measure_depth(place: Floats, boxes: Boxes, heading: Floats, margin_m: float | None = None) -> Floats:
+    """Return how far (N, 2) places lie outside each of K boxes with a margin, in m; negative inside. (N, K)."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    axes = np.stack([[cos, sin], [-sin, cos]])  # (2, 2, K): along and across, x and y
+    middle = np.einsum("aik,ki->ak", axes, boxes.centre_m)
+    along, across = (place @ axes[axis] - middle[axis] for axis in (0, 1))
+    if margin_m is None:
+        spread = np.sqrt(np.linalg.eigvalsh(boxes.covariance_m2)[:, 1])
+        margin = np.minimum(MARGIN_M + spread, GREATEST_MARGIN_M)
+    else:
+        margin = np.full(heading.size, margin_m)
+    half = boxes.size_m / 2 + margin[:, None] + boxes.size_sd_m
+    result: Floats = np.maximum(np.abs(along) - half[:, 0], np.abs(across) - half[:, 1])
+    return result
+
+
+def _locate_chosen(scan: Scan, predicted: Predicted, found: Integers, vehicle: Integers) -> Boxes:
+    """Measure the vehicles with returns by all that they have."""
+    if not found.size:
+        return _no_boxes()
+    taken = np.flatnonzero(vehicle >= 0)
+    order = taken[np.argsort(vehicle[taken], kind="stable")]
+    owner = np.searchsorted(found, vehicle[order])
+    count = np.bincount(owner)
+    hidden = _find_hidden(scan, order, np.cumsum(count) - count, count)
+    return _locate(scan, order, owner, hidden, predicted, found, whole=True)
+
+
+def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tuple[Integers, Integers, Boxes]:
+    """Group the returns that no vehicle has, and tell which groups are vehicles.
+
+    A cluster within the usual box of a nearer one belongs to it: the side of a vehicle far ahead gives returns metres
+    apart.
+
+    Returns:
+        (P,) group of each return from 0, undefined where a vehicle has it; the groups that are vehicles; their boxes.
+    """
+    group = np.zeros(choice.vehicle.size, np.int64)
+    free = np.flatnonzero(choice.vehicle < 0)
+    if not free.size:
+        return group, np.empty(0, np.int64), _no_boxes()
+    owner = cluster_returns(scan, free)
+    boxes, mean = _locate_new(scan, free, owner, whole=False)
+    straight = np.zeros(len(mean))
+    inside = _measure_depth(mean, boxes, straight) <= 0
+    # (child, parent): clusters are numbered from the nearest on, and a parent must not be a child itself.
+    inside = np.tril(inside, -1)
+    inside &= ~inside.any(1)
+    parent = np.where(inside.any(1), inside.argmax(1), np.arange(len(mean)))
+    _, renumbered = np.unique(parent, return_inverse=True)
+    owner = renumbered[owner]
+    boxes, mean = _locate_new(scan, free, owner, whole=True)
+    vehicle = _is_vehicle(boxes, mean, np.bincount(owner))
+    if known.side.size:
+        vehicle &= (_measure_depth(mean, known, heading, NEAR_BOX_M) > 0).all(1)
+    group[free] = owner
+    new = np.flatnonzero(vehicle)
+    return group, new, _pick(boxes, new)
+
+
+def _locate_new(scan: Scan, free: Integers, owner: Integers, whole: bool) -> tuple[Boxes, Floats]:
+    """Measure boxes of groups of returns along the ego's axis, and the means of their returns."""
+    order = np.argsort(owner, kind="stable")
+    points, owner = free[order], owner[order]
+    count = np.bincount(owner)
+    first = np.cumsum(count) - count
+    hidden = _find_hidden(scan, points, first, count)
+    returns = Returns(
+        scan.place_m[points], scan.height_m[points], owner, hidden, scan.on_top[points], scan.step_rad, whole
+    )
+    groups = count.size
+    boxes = locate_boxes(
+        returns,
+        np.zeros(groups),
+        np.full(groups, NEW_HEADING_SD_RAD),
+        np.full((groups, 2), np.nan),
+        np.zeros(groups, np.bool_),
+    )
+    return boxes, np.add.reduceat(scan.place_m[points], first) / count[:, None]
+
+
+def _is_vehicle(boxes: Boxes, mean: Floats, returns: Integers) -> Flags:
+    """Tell what can be a vehicle by its extents, its returns and its place; walls, barriers and posts cannot."""
+    long, wide = boxes.seen_m.T
+    barrier = (long > LONGEST_M) | ((long > LONG_M) & (boxes.height_m < LONG_HEIGHT_M))
+    fits = ~barrier & (wide <= WIDEST_M) & (np.maximum(long, wide) >= NARROWEST_M)
+    if barrier.any():
+        line = _pick(boxes, np.flatnonzero(barrier))
+        line.size_m[:, 0] += 2 * BARRIER_GAP_M
+        fits &= (_measure_depth(mean, line, np.zeros(line.side.size), 0.0) > 0).all(1)
+    return np.asarray(fits & (returns >= LEAST_RETURNS) & (np.abs(mean[:, 1]) <= ROADSIDE_M))
+
+
+def _square(offset: Floats, covariance: Floats) -> Floats:
+    """Return squared Mahalanobis distances of (K, 2) offsets."""
+    solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
+    result: Floats = (offset * solved).sum(-1)
+    return result
+
+
+def _pick(boxes: Boxes, rows: Integers) -> Boxes:
+    """Return some of the boxes."""
+    fields: Mapping[str, npt.NDArray[np.generic]] = vars(boxes)
+    return Boxes(**{name: values[rows] for name, values in fields.items()})  # type: ignore[arg-type]  # all are arrays
+
+
+def _no_boxes() -> Boxes:
+    """Return boxes of no vehicles."""
+    pair = np.empty((0, 2))
+    return Boxes(pair, np.empty((0, 2, 2)), pair, pair, pair, np.empty(0), np.empty(0), np.empty(0, np.int64))
