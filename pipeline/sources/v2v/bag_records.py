@@ -31,6 +31,8 @@ MAX_CHUNK_BYTES = 1 << 28
 """Most bytes that a compressed chunk or message may unpack to; recorders make chunks of about 1 MB."""
 MAX_GROWTH, MIN_BUDGET_BYTES = 300, 1 << 28
 """Most bytes that a file may unpack to in all, per byte of its own; LZ4 cannot reach 256. And what every file may."""
+BLOCK_BYTES = 1 << 20
+"""Number of bytes that are unpacked at once."""
 MAX_METADATA_BYTES = 1 << 22
 """Greatest size of a metadata.yaml that is read."""
 ADVICE = {
@@ -173,11 +175,13 @@ def unpack_data(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
     Raises:
         ValueError: it unpacks to more bytes than the limit.
     """
+    content = bytearray()
     with _open_packed(data) as stream:
-        content: bytes = stream.read(limit + 1)
-    if len(content) > limit:
-        raise ValueError(f"unpacks to more than {limit:,} bytes")
-    return content
+        while block := stream.read(BLOCK_BYTES):
+            content += block
+            if len(content) > limit:
+                raise ValueError(f"unpacks to more than {limit:,} bytes")
+    return bytes(content)
 
 
 def _open_packed(source: bytes | Path) -> _Stream:
@@ -201,7 +205,7 @@ def _unpack(file: RawFile, stack: ExitStack) -> Path:
     budget = _Budget(file.path)
     copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tracklake-bag-"))) / "unpacked"
     with _explain_damage(file, MCAP_MAGIC, 0), _open_packed(file.path) as packed, copy.open("wb") as unpacked:
-        while block := packed.read(1 << 24):
+        while block := packed.read(BLOCK_BYTES):
             budget.spend(len(block))
             unpacked.write(block)
     return copy

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.pipeline.sources.source import RawFile
-from tracklake.pipeline.sources.v2v.bag_records import RosMessage, decode, open_bag
+from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.pipeline.sources.v2v.bag_records import Record, RosMessage, decode, open_bag
 from tracklake.pipeline.sources.v2v.mounts import Mount
 from tracklake.schemas.arrays import Singles
 
@@ -20,6 +20,8 @@ FLOATS = {7: "f4", 8: "f8"}
 """Types of coordinates by their number in PointField."""
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
 """Least distance from the LiDAR, below which drivers put beams without a return, and greatest from the ego, in m."""
+MAX_HEIGHT_M = 5.0
+"""Greatest height in m above the ground: no vehicle is as high, bridges and trees are higher."""
 GROUND_M, GROUND_SLOPE = 0.3, 0.005
 """Returns lower than this above the ground are the road's, in m, and how much that grows per m of distance, for roads
 that rise and for a scanner that is not level. The least bumper is about as high."""
@@ -38,7 +40,7 @@ class Removed:
     """Returns that were left out, and why."""
 
     no_return: int = 0
-    too_far: int = 0
+    out_of_reach: int = 0
     ground: int = 0
 
 
@@ -66,18 +68,31 @@ class Scans:
 
     def __iter__(self) -> Iterator[Scan]:
         """Read the scans one by one."""
-        self.removed.no_return = self.removed.too_far = self.removed.ground = 0
+        self.removed.no_return = self.removed.out_of_reach = self.removed.ground = 0
         number = 0
         for file, moments in zip(self.files, self.moments_us, strict=True):
             if not any(moment is not None for moment in moments):
                 continue
-            assert self.mount is not None
             with open_bag(file) as bag:
-                for record, utc_us in zip(bag.read({(self.topic, POINT_CLOUD)}), moments, strict=True):
+                records = bag.read({(self.topic, POINT_CLOUD)})
+                for utc_us in moments:
+                    points_m = self._read_next(file, records, bag.version, used=utc_us is not None)
                     if utc_us is not None:
-                        cloud = decode(record, bag.version)
-                        yield Scan(number, utc_us, locate_returns(read_points(cloud), self.mount, self.removed))
+                        yield Scan(number, utc_us, points_m)
                         number += 1
+
+    def _read_next(self, file: RawFile, records: Iterator[Record], version: int, *, used: bool) -> Singles:
+        """Read the returns of the next cloud; of one that is not used, none."""
+        try:
+            record = next(records)
+            if not used or self.mount is None:
+                return np.empty((0, 3), np.float32)
+            return locate_returns(read_points(decode(record, version)), self.mount, self.removed)
+        except (StopIteration, ValueError):
+            raise SourceError(
+                f"{file.name}: holds other scans than when it was first read. Expected a whole bag that stays as it "
+                "is. Run the same command again."
+            ) from None
 
 
 def read_points(cloud: RosMessage) -> npt.NDArray[np.void]:
@@ -128,9 +143,9 @@ def locate_returns(points: npt.NDArray[np.void], mount: Mount, removed: Removed)
             own *= np.diag(mount.rotation).astype(np.float32)[:, None]
         own += place
         distance = np.hypot(own[0], own[1])
-        near = seen & (distance <= MAX_RANGE_M)
+        near = seen & (distance <= MAX_RANGE_M) & (own[2] <= MAX_HEIGHT_M)
         kept = near & (own[2] >= GROUND_M + np.float32(GROUND_SLOPE) * distance)
     removed.no_return += int(points.size - seen.sum())
-    removed.too_far += int(seen.sum() - near.sum())
+    removed.out_of_reach += int(seen.sum() - near.sum())
     removed.ground += int(near.sum() - kept.sum())
     return np.ascontiguousarray(own[:, kept].T)

@@ -56,7 +56,7 @@ def test_what_was_written_is_read(tmp_path: Path, version: Literal[1, 2], option
     np.testing.assert_allclose(first.points_m, [[10.5, 2.1, 0.9], [5.5, -2.9, 2.4]], atol=1e-6)
     assert (first.scan, first.utc_us, second.scan, second.points_m.shape) == (0, START_US + 10_000, 1, (0, 3))
     removed = bag.scans.removed
-    assert (len(bag.scans), removed.no_return, removed.too_far, removed.ground) == (2, 0, 1, 1)
+    assert (len(bag.scans), removed.no_return, removed.out_of_reach, removed.ground) == (2, 0, 1, 1)
 
 
 def test_each_file_of_a_bag_is_recognised(tmp_path: Path) -> None:
