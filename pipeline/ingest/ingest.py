@@ -216,15 +216,18 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
     canonical = source.to_canonical(parts, recording)
     if not canonical.subsets and not canonical.drives:
         raise SourceError(_explain_emptiness(recording, canonical, source.lacking))
+    tables = _write_tables(root, job, canonical)
+    of_batches = (note for drive in canonical.drives for note in drive.describe_batches())
+    suspicions = _suspect_truncation(root, list_files(job), canonical)
     info = {
-        "notes": [*_recall_notes(root, job), *canonical.notes, *_suspect_truncation(root, list_files(job), canonical)],
+        "notes": [*_recall_notes(root, job), *canonical.notes, *of_batches, *suspicions],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "drives": [drive.name for drive in canonical.drives],
         "row_order": canonical.row_order,
         "rows_read": int(canonical.log["rows_read"].sum()),
         "rows_dropped": int(canonical.log["rows_dropped"].sum()),
     }
-    return _write_tables(root, job, canonical), info
+    return tables, info
 
 
 def _explain_emptiness(recording: str, canonical: Canonical, lacking: str) -> str:

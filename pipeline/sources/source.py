@@ -108,11 +108,13 @@ class Subset:
 class Drive:
     """One drive of an instrumented vehicle in canonical form: its name, and its rows by table.
 
-    Rows that do not fit into the memory are batches in the order of their key.
+    Rows that do not fit into the memory are batches in the order of their key; what there is to say about them is known
+    after the last one.
     """
 
     name: str
     tables: Mapping[Table, pl.DataFrame | Iterable[pl.DataFrame]]
+    describe_batches: Callable[[], tuple[str, ...]] = tuple
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,8 @@ def make_drive(
         for table, frame in {DRIVES: row, **tables}.items()
     }
     returns = {} if bag is None else {LIDAR_RETURNS: _read_returns(bag.scans, start_us, name)}
-    return Drive(name, {**frames, **returns}), assembled
+    describe = bag.scans.describe_removed if bag is not None else tuple
+    return Drive(name, {**frames, **returns}, describe), assembled
 
 
 _STATES = [name for name in EGO_STATES.dtypes if name not in ("dataset", "subset", "source")]

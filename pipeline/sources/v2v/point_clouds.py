@@ -62,6 +62,16 @@ class Scans:
     mount: Mount | None = None
     removed: Removed = field(default_factory=Removed)
 
+    def describe_removed(self) -> tuple[str, ...]:
+        """Tell which returns the last iteration left out, and why, in a note or none."""
+        own = self.removed
+        if not len(self):
+            return ()
+        return (
+            f"{self.topic}: LiDAR returns left out: {own.ground:,} of the road, {own.out_of_reach:,} beyond "
+            f"{MAX_RANGE_M:g} m or above {MAX_HEIGHT_M:g} m, {own.no_return:,} points without a return",
+        )
+
     def __len__(self) -> int:
         """Count the scans that are used."""
         return sum(moment is not None for moments in self.moments_us for moment in moments)

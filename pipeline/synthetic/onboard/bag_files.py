@@ -307,6 +307,7 @@ class MessageMaker:
         points = np.zeros(len(points_m), POINT)
         points["x"], points["y"], points["z"] = points_m[:, 0], -points_m[:, 1], points_m[:, 2]
         elevation_deg = np.degrees(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
+        elevation_deg = np.nan_to_num(elevation_deg)
         points["ring"] = np.clip(np.round((elevation_deg - LOWEST_RING_DEG) / RING_STEP_DEG), 0, RINGS - 1)
         kinds = {"<f4": 7, "<u2": 4}  # numbers of FLOAT32 and UINT16
         fields = [

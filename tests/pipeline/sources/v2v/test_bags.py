@@ -6,11 +6,13 @@ from typing import Any, Literal
 import drive_bags
 import numpy as np
 import polars as pl
+import pyarrow as pa
 import pymap3d
 import pytest
 from drive_bags import EGO, START_US, list_files, write_messages, write_small_bag
 from polars.testing import assert_frame_equal
 
+from tracklake.pipeline.sources.source import RawFile
 from tracklake.pipeline.sources.v2v.bags import BagContents, is_bag, read_bag
 from tracklake.pipeline.synthetic.onboard.bag_files import MessageMaker, make_store
 
@@ -57,6 +59,19 @@ def test_what_was_written_is_read(tmp_path: Path, version: Literal[1, 2], option
     assert (first.scan, first.utc_us, second.scan, second.points_m.shape) == (0, START_US + 10_000, 1, (0, 3))
     removed = bag.scans.removed
     assert (len(bag.scans), removed.no_return, removed.out_of_reach, removed.ground) == (2, 0, 1, 1)
+
+
+def test_a_file_that_is_compressed_as_a_whole_is_read(tmp_path: Path) -> None:
+    """ROS 2 names it after the file that it holds."""
+    (plain,) = [file for file in list_files(write_small_bag(tmp_path / "a", 2)) if file.path.suffix == ".db3"]
+    packed = RawFile(tmp_path / "a.db3.zstd", "a.db3.zstd")
+    with pa.CompressedOutputStream(str(packed.path), "zstd") as stream:
+        stream.write(plain.path.read_bytes())
+    assert is_bag(packed.path.read_bytes()[:4096], packed.name)
+    bag = read_bag([packed])
+    assert (bag.ego.height, bag.rows_read, len(list(bag.scans))) == (3, (17,), 2)
+    (note,) = bag.scans.describe_removed()
+    assert note.endswith("left out: 1 of the road, 1 beyond 100 m or above 5 m, 0 points without a return")
 
 
 def test_each_file_of_a_bag_is_recognised(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def clouds(draw: st.DrawFn) -> tuple[Any, list[tuple[float, float, float]]]:
 
 
 def locate_slowly(points: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """Keep returns over 0.5 m from the LiDAR and up to 100 m from the ego, over a road that may rise, up to 5 m high."""
+    """Keep returns over 0.5 m from the LiDAR, up to 100 m from the ego, over a road that may rise, up to 5 m high."""
     kept = []
     for x, y, z in points:
         if not all(map(math.isfinite, (x, y, z))) or math.dist((0, 0, 0), (x, y, z)) < 0.5:
