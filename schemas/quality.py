@@ -4,10 +4,11 @@ A key is `Annotated[type, meaning]`, or `Annotated[type, meaning, unit]` where t
 `UNITS`). docs/quality_json.md is derived from these classes.
 """
 
-from typing import Annotated, Final
+from typing import Annotated, Final, NotRequired
 
 from typing_extensions import TypedDict
 
+from tracklake.schemas.quality_drives import Drives
 from tracklake.schemas.quality_tracks import (
     Dataset,
     Direction,
@@ -361,4 +362,5 @@ class Quality(TypedDict):
     completeness: list[Completeness]
     ingestion: Ingestion
     model_scores: list[ModelScores]
+    drives: NotRequired[Drives]
     provenance: Provenance

@@ -3,7 +3,7 @@
 import sys
 import types
 from collections.abc import Iterator
-from typing import Annotated, get_args, get_origin, get_type_hints
+from typing import Annotated, NotRequired, get_args, get_origin, get_type_hints
 
 from typing_extensions import is_typeddict
 
@@ -54,6 +54,12 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Samples and splits", "", ("samples", "splits")),
     ("Source files", "", ("completeness", "ingestion")),
     ("Models", "", ("model_scores",)),
+    (
+        "Drives",
+        "Only where the lake holds drives of instrumented vehicles. Distances are of vehicles' centres from the\n"
+        "ego's; errors are against the truth of synthetic drives. `drives.drives` counts messages of other vehicles.",
+        ("drives",),
+    ),
     ("Provenance", "", ("provenance",)),
 )
 """Title, introduction and keys of each section of the page."""
@@ -78,7 +84,7 @@ def _describe(
 ) -> Iterator[tuple[str, str, str, str]]:
     """Yield (key, type, unit, meaning) of every value below a path."""
     origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Annotated:
+    if origin in (Annotated, NotRequired):
         yield from _describe(path, *arguments)
     elif origin is list:
         yield from _describe(f"{path}[]", arguments[0], meaning, unit)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from drive_lake import make_drive, put_drive
+from known_drive import make_drive, put_drive
 
 from tracklake.pipeline.lake import connect, query
 from tracklake.pipeline.lake.macros import MACROS
@@ -37,7 +37,7 @@ def test_every_question_is_tried():
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A lake with the drive of helpers/drive_lake.py, which the sample's lake has none of."""
+    """A lake with the drive of helpers/known_drive.py, which the sample's lake has none of."""
     root = tmp_path_factory.mktemp("drive")
     put_drive(root, make_drive())
     with connect(root) as connection:

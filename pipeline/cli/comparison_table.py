@@ -105,7 +105,7 @@ def _list_made_with(manifest: Manifest) -> dict[str, Any]:
     """Collect settings and versions by stage from the manifest."""
     found: dict[str, dict[str, list[Any]]] = {}
     for entry in sorted(manifest.commits.values(), key=lambda entry: entry.key):
-        if entry.stage in ("pages", "report"):
+        if entry.stage in ("pages", "drive_pages", "report"):
             continue  # no table
         for name in (name for name in MADE_WITH if name in entry.built_from):
             values = found.setdefault(entry.stage, {}).setdefault(name, [])

@@ -10,12 +10,15 @@ from tracklake.pipeline.cli.drives import describe_drives, list_drives
 from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
+from tracklake.quality_reports.drives import describe_drive
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
 from tracklake.schemas.text import quote_shell
 
 NUMBER = re.compile(r"\d[\d.,]*")
+MOST_DRIVES = 10
+"""Most drives that have a line of their own."""
 FEW_NOTES = 3
 """Most notes that differ only in names and numbers and are printed one by one."""
 
@@ -61,7 +64,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     if drives and not head["subsets"]:
         lines = {"rows": lines["rows"]}  # the others are of recordings from above
     if drives:
-        lines = {"drives": describe_drives(drives), **lines}
+        lines = {"drives": describe_drives(drives), **_describe_each_drive(quality), **lines}
         origins = {row["subset"]: row["origin"] for row in drives}
         terminal.print_origin(describe_synthetic(origins, noun="drive", maker="instrument"))
     scores = [score for score in quality["model_scores"] if score["rows"]]
@@ -99,6 +102,13 @@ def _format_errors(rows: list[dict[str, Any]], figure: str) -> str:
     errors = "  ".join(f"{row['seconds']:g} s {row[figure]:.2f}" for row in known)
     counts = ", ".join(f"{row['n']:,}" for row in known)
     return f"{errors}  (n = {counts})" if known else "none"
+
+
+def _describe_each_drive(quality: dict[str, Any]) -> dict[str, str]:
+    """Return a line per drive of the report, and how many are left out."""
+    drives = quality["drives"]["drives"] if "drives" in quality else []
+    lines = {f"  {row['drive']}": describe_drive(row) for row in drives[:MOST_DRIVES]}
+    return lines | ({"  ...": f"and {len(drives) - MOST_DRIVES} more"} if len(drives) > MOST_DRIVES else {})
 
 
 def _format_count(count: int | None) -> str:

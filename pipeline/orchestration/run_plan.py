@@ -88,7 +88,7 @@ class RunRequest:
 
     def list_stages(self) -> list[Stage]:
         """Return the requested stages after ingestion; with the report, the pages that it links to."""
-        wanted = {*self.steps, *({"pages"} if "report" in self.steps else ())}
+        wanted = {*self.steps, *({"pages", "drive_pages"} if "report" in self.steps else ())}
         return [stage for stage in STAGES if stage.name in wanted]
 
 

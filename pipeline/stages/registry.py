@@ -1,6 +1,19 @@
 """The stages after ingestion, in the order in which `tracklake run` goes through them."""
 
-from tracklake.pipeline.stages import assess, fuse, pages, repair, report, samples, score, split, tensors, validate
+from tracklake.pipeline.stages import (
+    assess,
+    drive_findings,
+    drive_pages,
+    fuse,
+    pages,
+    repair,
+    report,
+    samples,
+    score,
+    split,
+    tensors,
+    validate,
+)
 from tracklake.pipeline.stages.stage import Stage
 
 STAGES: tuple[Stage, ...] = (
@@ -12,7 +25,9 @@ STAGES: tuple[Stage, ...] = (
     tensors.STAGE,
     score.STAGE,
     fuse.STAGE,
+    drive_findings.STAGE,
     pages.STAGE,
+    drive_pages.STAGE,
     report.STAGE,
 )
 """Every stage after ingestion."""

@@ -17,7 +17,7 @@ from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_r
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
-from tracklake.quality_reports.pages.page_names import FOLDER
+from tracklake.quality_reports.pages.page_names import DRIVES_FOLDER, FOLDER
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
 from tracklake.schemas import DRIVES, SUBSETS
 from tracklake.schemas.documents import read_json
@@ -97,7 +97,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
         },
         "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
     }
-    made = manifest.of_stage("pages")
+    made = [*manifest.of_stage("pages"), *manifest.of_stage("drive_pages")]
     with connect(root) as connection:
         notes: list[str] = []
         scores = collect_scores(root, manifest, notes.append)
@@ -106,10 +106,11 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     files += [write_report_file(root, name, content) for name, content in report.others.items()]
     for name in {*OTHER_PAGES} - report.others.keys():
         (root / REPORTS / name).unlink(missing_ok=True)
-    # Pages of subsets that are no longer in the lake, which the overview does not link to.
+    # Pages of subsets and drives that are no longer in the lake, which the overview does not link to.
     live = {root / file.path for commit in made for file in commit.files[REPORTS]}
-    remove_files(root, [file for file in (root / REPORTS / FOLDER).glob("*.html") if file not in live])
-    for folder in (root / REPORTS, root / REPORTS / FOLDER):
+    folders = [root / REPORTS / name for name in (FOLDER, DRIVES_FOLDER)]
+    remove_files(root, [file for folder in folders for file in folder.glob("*.html") if file not in live])
+    for folder in (root / REPORTS, *folders):
         remove_unfinished(folder)
     return StageResult(files={REPORTS: files}, notes=notes)
 

@@ -58,7 +58,7 @@ class Gate:
     Args:
         text: as it was given.
         conditions: comparisons of metrics.
-        scope: what is judged one by one: subsets, recordings, datasets, or the lake.
+        scope: what is judged one by one: subsets, recordings, drives, datasets, or the lake.
     """
 
     text: str
@@ -155,8 +155,9 @@ def judge_gate(gate: Gate, rows: Sequence[Row]) -> GateResult:
             if not there:
                 problem = f"nothing is judged: there is no {condition.metric.name} {condition.sign} {condition.value}"
                 return GateResult(gate, problem=f"{problem}; {suggest_name(str(condition.value), known)}")
-    if not any(row["entries"] for row in there):
-        return GateResult(gate, problem="nothing is judged: the lake holds no recordings")
+    if not any(row["entries"] or row.get("drives") for row in there):
+        what = "drives" if gate.scope == "drive" else "recordings"
+        return GateResult(gate, problem=f"nothing is judged: the lake holds no {what}")
     return GateResult(gate, [_judge_row(gate, row) for row in there])
 
 

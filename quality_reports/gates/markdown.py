@@ -29,13 +29,14 @@ writes it as JUnit XML, which CI systems show: a case for the files, and one for
 
 A gate compares metrics with values: `<`, `<=`, `>`, `>=`, `==` and `!=`, numbers (`5%` is 0.05) or texts. It is
 judged on each subset by itself. `per recording`, `per dataset` or `per lake` at its end judges those; a metric that
-subsets do not have is judged on recordings. `and` joins comparisons, and several gates are several `--fail-on`.
+subsets do not have is judged on recordings, and one of drives on each drive. `and` joins comparisons, and several
+gates are several `--fail-on`.
 
 A gate fails if all its comparisons hold in one place. It does not pass either
 
 - if a value is not known, because the stage that makes it has not run, or the files lack what it needs (`unknown`; an
   `error` in JUnit XML). A comparison that selects the others, such as `and dataset == highd`, makes such a gate pass.
-- if nothing is judged: the lake is empty, or there is no dataset, recording, subset, site or origin of the name.
+- if nothing is judged: the lake is empty, or there is no dataset, recording, subset, drive, site or origin of the name.
 
 Gates are judged on the tables as they are. If settings or files have changed since, a note says which stage is not up
 to date. Where files are damaged, no gate is judged.
@@ -55,7 +56,7 @@ def write_gates() -> str:
     of_rules = ", ".join(OF_RULES)
     rows += [(f"`RULE.{name}`", of_rules, unit, meaning) for name, (meaning, unit) in RULE_FIGURES.items()]
     table = format_table(("metric", "per", "unit", "meaning"), rows)
-    return "\n".join([HEAD, *table, "", "`RULE` is the name of one of the [rules](rules.md).", ""])
+    return "\n".join([HEAD, *table, "", "`RULE` is the name of one of the [rules](rules.md) over tracks.", ""])
 
 
 if __name__ == "__main__":

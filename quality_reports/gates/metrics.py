@@ -1,16 +1,19 @@
 """Metrics that quality gates compare: their names, and their values per subset, recording, dataset and lake."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tracklake.quality_reports.drives import collect_drives
 from tracklake.quality_reports.rules.registry import RULES
 from tracklake.quality_reports.summaries import Connection, collect_rules, query
 from tracklake.quality_reports.verdicts import BAD, CARE, GOOD, judge
 
-SCOPES = ("subset", "recording", "dataset", "lake")
-"""Scopes of metrics: what one value is of, the smallest first."""
-OF_RECORDINGS = SCOPES[1:]
+SCOPES = ("subset", "recording", "drive", "dataset", "lake")
+"""Scopes of metrics: what one value is of, the smallest first. Drives are recordings of instrumented vehicles."""
+OF_TRACKS = ("subset", "recording", "dataset", "lake")
+OF_RECORDINGS = OF_TRACKS[1:]
+OF_DRIVES = ("drive", "lake")
 OF_RULES = ("subset", "dataset", "lake")
 LABEL, SHARE = "text", "0 to 1"
 """Units of metrics that are text, and of shares."""
@@ -33,7 +36,7 @@ class Metric:
     name: str
     meaning: str
     unit: str = "1"
-    scopes: tuple[str, ...] = SCOPES
+    scopes: tuple[str, ...] = OF_TRACKS
     needs: str = "`tracklake validate`"
     selects: bool = False
     choices: tuple[str, ...] = ()
@@ -48,6 +51,9 @@ RULE_FIGURES = {
     "worst": ("most extreme value; no comparison holds where no entry breaks the rule", "the rule's"),
 }
 """Meanings and units of the metrics of each rule, `RULE.NAME`."""
+
+FUSION = "`tracklake run`, which fuses and checks drives"
+"""What has to have run before findings and errors of drives are known."""
 
 METRICS: tuple[Metric, ...] = (
     Metric("error_share", "share of the entries that break a rule of severity error", SHARE),
@@ -80,11 +86,26 @@ METRICS: tuple[Metric, ...] = (
     Metric("dropped_share", "rows_dropped / rows_read", SHARE, OF_RECORDINGS, "`tracklake ingest`"),
     Metric("missing_entry_share", "announced entries that are missing", SHARE, OF_RECORDINGS, "an announced number"),
     Metric("missing_vehicle_share", "announced vehicles that are missing", SHARE, OF_RECORDINGS, "an announced number"),
-    Metric("dataset", "highd, ngsim or custom", LABEL, SCOPES[:3], selects=True),
-    Metric("recording", "name of the recording", LABEL, SCOPES[:2], selects=True),
-    Metric("subset", "name of the subset", LABEL, SCOPES[:1], selects=True),
-    Metric("site", "place of the recording", LABEL, SCOPES[:2], selects=True),
-    Metric("origin", "recorded or synthetic", LABEL, SCOPES[:2], selects=True),
+    Metric("drives", "drives in the lake", scopes=("lake",), needs="a recording"),
+    Metric("drive_message_loss_share", "messages of other vehicles that were lost", SHARE, OF_DRIVES, "messages"),
+    Metric(
+        "drive_latency_s", "received - generated, median; of the lake the longest", "s", OF_DRIVES, "logged reception"
+    ),
+    Metric("drive_findings", "runs of messages or ticks that break a rule", scopes=OF_DRIVES, needs=FUSION),
+    Metric("drive_errors", "those of severity error", scopes=OF_DRIVES, needs=FUSION),
+    Metric(
+        "drive_position_error_m",
+        "distance of fused positions from the truth, median; of the lake the greatest",
+        "m",
+        OF_DRIVES,
+        f"a synthetic drive, and {FUSION}",
+    ),
+    Metric("dataset", "highd, ngsim or custom", LABEL, OF_TRACKS[:3], selects=True),
+    Metric("recording", "name of the recording", LABEL, OF_TRACKS[:2], selects=True),
+    Metric("subset", "name of the subset", LABEL, OF_TRACKS[:1], selects=True),
+    Metric("drive", "name of the drive", LABEL, ("drive",), selects=True),
+    Metric("site", "place of the recording", LABEL, OF_TRACKS[:2], selects=True),
+    Metric("origin", "recorded or synthetic", LABEL, SCOPES[:3], selects=True),
     *(
         Metric(
             f"{rule.name}.{name}", meaning, unit, OF_RULES, "`tracklake validate`, and the columns that the rule reads"
@@ -107,6 +128,8 @@ def collect_metrics(connection: Connection, names: Collection[str]) -> list[Row]
         names: metrics that are needed; those of rules and the verdict are queried only for these.
     """
     rows = query(connection, "gate_metrics")
+    if any(name.startswith("drive") for name in names):
+        _add_drives(connection, rows)
     has_verdict = "verdict" in names
     if not has_verdict and not any("." in name for name in names):
         return rows
@@ -124,6 +147,35 @@ def collect_metrics(connection: Connection, names: Collection[str]) -> list[Row]
             row = by_key[scope, verdict["dataset"], verdict["subset"]]
             row["verdict"] = None if row["error_share"] is None else verdict["verdict"]
     return rows
+
+
+def _add_drives(connection: Connection, rows: list[Row]) -> None:
+    """Add a row per drive, and what the lake's drives have together to its row, where it is known of all of them."""
+    collected = collect_drives(connection)
+    facts = collected["drives"] if collected else []
+    drives = [
+        {
+            **{"scope": "drive", "dataset": "v2v", "recording": each["recording"], "subset": each["drive"]},
+            **{"drive": each["drive"], "origin": each["origin"], "entries": each["messages"] + each["vehicle_ticks"]},
+            "drive_message_loss_share": each["lost_share"],
+            "drive_latency_s": each["latency_median_s"],
+            "drive_findings": each["findings"],
+            "drive_errors": each["errors"],
+            "drive_position_error_m": each["error_median_m"],
+        }
+        for each in facts
+    ]
+    together: dict[str, Callable[[list[Any]], Any]] = {
+        "drive_latency_s": max, "drive_findings": sum, "drive_errors": sum, "drive_position_error_m": max
+    }  # fmt: skip
+    (lake,) = (row for row in rows if row["scope"] == "lake")
+    for name, summarise in together.items():
+        values = [row[name] for row in drives]
+        lake[name] = summarise(values) if values and None not in values else None
+    sent = sum(each["lost"] + each["messages"] for each in facts)
+    lake["drive_message_loss_share"] = sum(each["lost"] for each in facts) / sent if sent else None
+    lake["drives"] = len(drives)
+    rows += drives
 
 
 def _judge(connection: Connection, rules: Sequence[Any]) -> Sequence[Any]:

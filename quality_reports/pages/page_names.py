@@ -1,4 +1,4 @@
-"""File names of the subsets' pages."""
+"""File names of the pages of subsets and drives."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,8 @@ from tracklake.schemas.hashing import hash_text
 
 FOLDER = "subsets"
 """Folder of the subsets' pages, beside the overview."""
+DRIVES_FOLDER = "drives"
+"""Folder of the drives' pages."""
 LONGEST_NAME = 80
 """Longest file name before its suffix, in characters."""
 

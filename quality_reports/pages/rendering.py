@@ -48,7 +48,12 @@ def make_environment() -> jinja2.Environment:
 
 def describe_origins(quality: Quality) -> str | None:
     """Describe what of the lake is synthetic; None where nothing is."""
-    return describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]})
+    drives = {row["drive"]: row["origin"] for row in quality["drives"]["drives"]} if "drives" in quality else {}
+    texts = [
+        describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]}),
+        describe_synthetic(drives, noun="drive", maker="instrument"),
+    ]
+    return " ".join(text for text in texts if text) or None
 
 
 def label_sums(row: Mapping[str, Any]) -> dict[str, Any]:

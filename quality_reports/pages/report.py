@@ -8,16 +8,17 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from tracklake.quality_reports.drives import collect_drives, describe_drive
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
 from tracklake.quality_reports.pages.assessments import tabulate_assessments
 from tracklake.quality_reports.pages.files import FILES_PAGE, REJECTS_PAGE, render_files
-from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
+from tracklake.quality_reports.pages.page_names import DRIVES_FOLDER, FOLDER, name_pages
 from tracklake.quality_reports.pages.rendering import describe_origins, flatten, make_environment
 from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, render_splits
 from tracklake.quality_reports.plots import charts
 from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.verdicts import draw_verdicts
-from tracklake.quality_reports.rules.registry import RULES, Rule
+from tracklake.quality_reports.rules.registry import DRIVE_RULES, RULES, Rule, describe
 from tracklake.quality_reports.summaries import Connection, collect
 from tracklake.quality_reports.verdicts import LIMITS, rank_rules, rank_verdicts
 from tracklake.schemas.quality import Provenance, Quality
@@ -62,12 +63,14 @@ def build_report(
         provenance: facts that the report shows; see `quality_reports.summaries.collect`.
         rules: rules that validation used.
         scores: results of evaluation, as `schemas.quality.ModelScores`.
-        pages: file names of the existing subsets' pages, by (dataset, subset); None: every subset has one.
+        pages: file names of the existing pages of subsets and drives, by (dataset, subset); None: all have one.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     quality = collect(connection, provenance, rules=rules, scores=scores)
+    if (drives := collect_drives(connection)) is not None:
+        quality["drives"] = drives
     others = {**render_files(quality), SPLITS_PAGE: render_splits(quality)}
     shown = {name: page for name, page in others.items() if page is not None}
     return Report(html=render(quality, pages), quality=quality, others=shown)
@@ -75,13 +78,20 @@ def build_report(
 
 def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
     """Render the page; everything but our own style sheet and plots is escaped."""
-    pages = name_pages(quality["subsets"]) if pages is None else pages
-    addresses = {key: f"{FOLDER}/{quote(name)}" for key, name in pages.items()}
+    drives = quality.get("drives")
+    in_drives = [("v2v", row["drive"]) for row in drives["drives"]] if drives else []
+    if pages is None:
+        pages = name_pages(quality["subsets"]) | name_pages(
+            [{"dataset": own[0], "subset": own[1]} for own in in_drives]
+        )
+    addresses = {key: f"{DRIVES_FOLDER if key in in_drives else FOLDER}/{quote(name)}" for key, name in pages.items()}
     return (
         make_environment()
         .get_template("report.html.j2")
         .render(
-            **{**quality, "rules": rank_rules(quality["rules"])},
+            **{**quality, "rules": rank_rules(quality["rules"]), "drives": drives},
+            has_tracks=bool(quality["subsets"]) or not drives,
+            describe_drive=describe_drive,
             banner=describe_origins(quality),
             recorded=not quality["subsets"] or any(row["origin"] == "recorded" for row in quality["subsets"]),
             drawings=_draw_plots(quality, addresses),
@@ -112,7 +122,8 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
 
 def _list_references(quality: Quality) -> list[Reference]:
     """List the references of what the page shows: of its rules, of its flows and of published figures."""
-    return find_references(" ".join([HAMALAINEN.name, EDIE.name, *(rule["source"] for rule in quality["rules"])]))
+    sources = [rule["source"] for rule in (*quality["rules"], *(describe(DRIVE_RULES) if "drives" in quality else ()))]
+    return find_references(" ".join([HAMALAINEN.name, EDIE.name, *sources]))
 
 
 def _omit_files(provenance: Provenance) -> dict[str, object]:

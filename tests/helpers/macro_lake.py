@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import polars as pl
-from drive_lake import make_drive
+from known_drive import make_drive
 from small_lake import put
 
 from tracklake.pipeline.lake import open_for_writing

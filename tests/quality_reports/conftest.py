@@ -7,6 +7,7 @@ import duckdb
 import polars as pl
 import pytest
 import vl_convert
+from known_drive import make_drive
 
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.quality_reports.pages.report import Report, build_report
@@ -260,6 +261,12 @@ def small_lake() -> dict[str, list[dict]]:
             for line in range(2, 15)
         ],
     }
+
+
+@pytest.fixture(scope="module")
+def small_drive() -> dict[str, list[dict]]:
+    """The drive of helpers/known_drive.py."""
+    return {table.name: frame.to_dicts() for table, frame in make_drive().items()}
 
 
 @pytest.fixture(scope="module")

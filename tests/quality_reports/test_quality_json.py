@@ -104,6 +104,8 @@ def test_every_documented_key_is_in_the_document(found):
     empty = always_empty(found)
     missing = []
     for key in documented():
+        if key.startswith("drives."):  # the sample has none: test_drive_page.py compares them
+            continue
         # Keys inside a list or mapping that is empty everywhere cannot be checked.
         holders = [key[: match.start()] for match in re.finditer(r"\[\]|\.\*", key)]
         holder_is_empty = any(pattern(holder).fullmatch(path) for holder in holders for path in empty)

@@ -51,7 +51,8 @@ def test_metrics_are_those_of_the_tables(lake, rows):
 def test_every_metric_has_values_in_its_scopes(rows):
     for metric in METRICS:
         found = {row["scope"] for row in rows if row.get(metric.name) is not None}
-        assert found & {*metric.scopes} or metric.name.endswith(".worst"), metric.name
+        of_drives = metric.name.startswith("drive")  # the sample has none: test_drives.py
+        assert found & {*metric.scopes} or of_drives or metric.name.endswith(".worst"), metric.name
         assert [scope for scope in SCOPES if scope in metric.scopes] == list(metric.scopes), "from the smallest on"
 
 

@@ -1,7 +1,7 @@
-"""The table macros of drives: numbers derived by hand from the drive of helpers/drive_lake.py."""
+"""The table macros of drives: numbers derived by hand from the drive of helpers/known_drive.py."""
 
 import pytest
-from drive_lake import make_drive, put_drive
+from known_drive import make_drive, put_drive
 
 from tracklake.pipeline.lake import connect
 

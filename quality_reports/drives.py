@@ -1,0 +1,139 @@
+"""Numbers of the report about drives: SQL over the lake's views, and distances and errors of messages' positions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import polars as pl
+
+from tracklake.quality_reports.rules.along_messages import place_messages
+from tracklake.quality_reports.rules.registry import DRIVE_RULES
+from tracklake.quality_reports.summaries import Connection, Row, plain_row, query, query_frame
+from tracklake.schemas.quality_drives import DriveErrors, DriveFacts, DriveLoss, DriveRule, Drives, DriveStation
+
+BIN_M = 25.0
+"""Width of bins of distance from the ego, in m."""
+ERRORS = ("message_error", "error", "smoothed_error")
+"""Errors against the truth: of the last message alone, of the fused position, and of the smoothed one."""
+
+
+@dataclass(frozen=True)
+class DriveRows:
+    """Rows of one drive.
+
+    Args:
+        messages: rows of drive_messages.sql.
+        ticks: rows of drive_ticks.sql, with message_error_m.
+        distances: distance_m and lost_before of other vehicles' messages when they arrived; null where unknown.
+    """
+
+    messages: pl.DataFrame
+    ticks: pl.DataFrame
+    distances: pl.DataFrame
+
+
+def read_drive(connection: Connection, drive: str) -> DriveRows:
+    """Read what plots and distances of a drive are made of."""
+    asked = {"drive": drive}
+    messages, states, ticks = (
+        query_frame(connection, f"drive_{name}", asked) for name in ("messages", "states", "ticks")
+    )
+    placed = place_messages(ticks, messages, states)
+    across = [pl.col(f"message_{axis}_m") - pl.col(f"true_{axis}_m") for axis in "xy"]
+    ticks = placed.with_columns(message_error_m=(across[0] ** 2 + across[1] ** 2).sqrt())
+    others = messages.filter(~pl.col("own"))
+    arrival = pl.coalesce("received_s", "time_s")
+    arrivals = others.select("vehicle_id", "lost_before", tick=(arrival * 10 - 1e-6).ceil().cast(pl.Int32))
+    at = place_messages(arrivals, others, states)
+    distance = (pl.col("message_x_m") ** 2 + pl.col("message_y_m") ** 2).sqrt()
+    return DriveRows(messages, ticks, at.select("lost_before", distance_m=distance))
+
+
+def collect_drives(connection: Connection) -> Drives | None:
+    """Gather the report's numbers about drives; None where the lake holds none."""
+    facts = query(connection, "drives")
+    if not facts:
+        return None
+    units = {rule.name: rule.unit for rule in DRIVE_RULES}
+    rules = [{**row, "unit": units.get(row["rule"], "")} for row in query(connection, "drive_rules")]
+    collected: dict[str, list[Row]] = {"drives": [], "losses": [], "errors": []}
+    for row in facts:
+        rows = read_drive(connection, row["drive"])
+        collected["drives"].append({**row, **sum_up_errors(rows.ticks)})
+        collected["losses"] += [{"drive": row["drive"], **each} for each in bin_losses(rows.distances)]
+        collected["errors"] += [{"drive": row["drive"], **each} for each in bin_errors(rows.ticks)]
+    return {
+        "drives": cast("list[DriveFacts]", collected["drives"]),
+        "stations": cast("list[DriveStation]", query(connection, "drive_stations")),
+        "rules": cast("list[DriveRule]", rules),
+        "losses": cast("list[DriveLoss]", collected["losses"]),
+        "errors": cast("list[DriveErrors]", collected["errors"]),
+    }
+
+
+def select_drive(drives: Drives, drive: str) -> dict[str, Sequence[Row]]:
+    """Select the rows of one drive."""
+    return {
+        name: [row for row in rows if row["drive"] == drive]
+        for name, rows in cast("dict[str, list[Row]]", drives).items()
+    }
+
+
+def describe_drive(facts: Mapping[str, Any]) -> str:
+    """Return in a line what a drive holds and how good it is."""
+    percent = "" if facts["lost_share"] is None else f", {100 * facts['lost_share']:.1f} % lost"
+    parts = [f"{_count(facts['stations'], 'station')}, {_count(facts['messages'], 'message')}{percent}"]
+    if facts["latency_median_s"] is not None:
+        parts.append(f"median latency {1000 * facts['latency_median_s']:.0f} ms")
+    if facts["scans"]:
+        parts.append(_count(facts["scans"], "LiDAR scan"))
+    if facts["error_median_m"] is not None:
+        parts.append(f"median position error {facts['error_median_m']:.2f} m against truth")
+    return ", ".join(parts)
+
+
+def _count(number: int, noun: str) -> str:
+    """Return a number with its noun."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def sum_up_errors(ticks: pl.DataFrame) -> Row:
+    """Return the errors of a drive's positions against the truth; nulls where there is none."""
+    known = ticks.filter(pl.col("true_x_m").is_not_null())
+    medians = [pl.col(f"{name}_m").median().alias(f"{name}_median_m") for name in ERRORS]
+    summed = known.select(*medians, error_p95_m=pl.col("error_m").quantile(0.95, "linear")).row(0, named=True)
+    return plain_row({"true_ticks": known.height, **summed})
+
+
+def bin_errors(ticks: pl.DataFrame) -> list[Row]:
+    """Return the errors against the truth by true distance, in bins of BIN_M."""
+    known = ticks.filter(pl.col("true_x_m").is_not_null()).with_columns(
+        distance_m=(pl.col("true_x_m") ** 2 + pl.col("true_y_m") ** 2).sqrt()
+    )
+    figures = [
+        expression
+        for name in ERRORS
+        for expression in (
+            pl.col(f"{name}_m").median().alias(f"{name}_median_m"),
+            pl.col(f"{name}_m").quantile(0.95, "linear").alias(f"{name}_p95_m"),
+        )
+    ]
+    return _bin(known, pl.len().alias("ticks"), *figures)
+
+
+def bin_losses(distances: pl.DataFrame) -> list[Row]:
+    """Return kept and lost messages by the distance of their sender, in bins of BIN_M."""
+    lost = pl.col("lost_before").sum()
+    return _bin(
+        distances.filter(pl.col("distance_m").is_not_null()),
+        messages=pl.len(),
+        lost=lost,
+        lost_share=lost / (lost + pl.len()),
+    )
+
+
+def _bin(rows: pl.DataFrame, *figures: pl.Expr, **named: pl.Expr) -> list[Row]:
+    """Return figures by bin of distance_m."""
+    start = (pl.col("distance_m") / BIN_M).floor() * BIN_M
+    binned = rows.group_by(from_m=start).agg(*figures, **named).sort("from_m")
+    return [plain_row(row) for row in binned.with_columns(until_m=pl.col("from_m") + BIN_M).iter_rows(named=True)]
