@@ -17,6 +17,11 @@ EXTRAS = {
 """Modules that each extra installs, by the extra's name in pyproject.toml."""
 
 
+def find_missing(extra: str) -> list[str]:
+    """Return the modules of an extra that are not installed."""
+    return [name for name in EXTRAS[extra] if find_spec(name) is None]
+
+
 def require_extras(what: str, *extras: str) -> None:
     """Refuse work whose packages are not installed.
 
@@ -27,8 +32,7 @@ def require_extras(what: str, *extras: str) -> None:
     Raises:
         MissingExtraError: naming what is missing and the command that installs it.
     """
-    missing = {extra: [name for name in EXTRAS[extra] if find_spec(name) is None] for extra in extras}
-    missing = {extra: names for extra, names in missing.items() if names}
+    missing = {extra: names for extra in extras if (names := find_missing(extra))}
     if missing:
         packages = ", ".join(name for names in missing.values() for name in names)
         raise MissingExtraError(

@@ -8,7 +8,9 @@ from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.lake import LakeError, LakeMissingError, load
 from tracklake.pipeline.stages.stage import INGEST
 from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SampleSummary, write_sample
+from tracklake.pipeline.synthetic.scenarios import DRIVES
 from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.extras import find_missing
 
 SAMPLE = "sample"
 """Name of the generated sample's folder, beside the lake."""
@@ -47,6 +49,9 @@ def write_generated(
     """Write the generated sample into a folder."""
     for name in formats or ():
         require_choice("--format", name, ALL_FORMATS)
+    if not formats and find_missing("onboard"):
+        formats = [name for name in DEFAULT_FORMATS if name != DRIVES]
+        terminal.print_line("without drives, which need the extra [onboard]", style="dim")
     with explain_file_errors(out):
         return write_sample(
             out,

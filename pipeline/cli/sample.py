@@ -15,7 +15,7 @@ from tracklake.pipeline.lake import refuse_lake
 def sample(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
     format: Annotated[
-        list[str] | None, typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata; repeatable.")
+        list[str] | None, typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives; repeatable.")
     ] = None,
     minutes: MinutesOption = None,
     seed: SeedOption = None,

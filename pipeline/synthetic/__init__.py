@@ -81,8 +81,7 @@ def _require_replaceable(out: Path) -> None:
         return
     if not out.is_dir():
         raise UsageError(f"{out} is a file; expected a missing or empty folder. Name another one with --out.")
-    present = {path.name for path in out.iterdir()}
-    if not present:
+    if not any(out.iterdir()):
         return
     advice = "Name another folder with --out, or empty this one."
     truth = out / TRUTH_FILE
@@ -94,6 +93,8 @@ def _require_replaceable(out: Path) -> None:
         raise UsageError(f"{truth} cannot be read, so {out} is not known to be a sample. {advice}") from error
     if table.schema != pl.Schema(TRUTH_SCHEMA):
         raise UsageError(f"{truth} is not that of a sample of this version. {advice}")
-    foreign = sorted(present - set(table["file"].drop_nulls()) - {TRUTH_FILE, README_FILE})
+    known = set(table["file"].drop_nulls()) | {TRUTH_FILE, README_FILE}
+    present = {file.relative_to(out).as_posix() for file in out.rglob("*") if not file.is_dir()}
+    foreign = sorted(present - known)
     if foreign:
         raise UsageError(f"{out} holds a sample, but also {foreign[0]}, which would be lost. {advice}")

@@ -10,9 +10,10 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
-from tracklake.pipeline.synthetic import defects, highd, ngsim, truth
+from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, truth
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.scenarios import (
+    DRIVES,
     FREEWAY,
     HIGHD,
     NGSIM_CSV,
@@ -40,6 +41,7 @@ noise and known defects were added. `tracklake sample` wrote them (seed {seed}, 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
 - `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
+- `drive-1`, `drive-2`: what two cars of recording 02 would have logged as instrumented vehicles, each with `truth.csv`.
 - `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
 """
 
@@ -76,26 +78,42 @@ def build_sample(
         )
         if kind in formats
     ]
-    jobs = _list_jobs(recordings, groups, minutes)
+    driven = DRIVES in formats
+    jobs = _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
     progress(f"simulating {len(jobs)} carriageways")
     clean = _simulate_all(home, jobs, seed, progress)
     found = truth.Found()
     rows: list[dict[str, object]] = []
     for scenario in recordings:
         progress(f"writing highD recording {scenario.recording}")
-        pair = [job for job in jobs if job.dataset == "highd" and job.recording == scenario.recording]
-        rows += _write_highd(folder, scenario, pair, clean, seed)
+        rows += _write_highd(folder, scenario, _list_pair(jobs, scenario.recording), clean, seed)
         truth.read_highd(folder, scenario.recording, found)
     for kind, file, scenarios in groups:
         progress(f"writing {file}")
         rows += _write_ngsim(folder, kind, file, scenarios, [job for job in jobs if job.file == file], clean, seed)
         names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
         truth.read_ngsim(folder / file, names, found)
+    for drive in drives.SCENARIOS if driven else ():
+        progress(f"writing {drive.folder}")
+        pair = _list_pair(jobs, drives.RECORDING)
+        tracks = _number_vehicles(pair, clean)
+        rows += drives.write_drive(folder, drive, tracks[drive.subset], pair[0].road.rate_hz, seed)
     progress("writing the truth")
     truth.build_truth(rows + truth.list_counts(found)).write_parquet(folder / TRUTH_FILE)
     (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes), encoding="utf-8")
     lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
-    return lines, len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
+    count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
+    return lines, count + driven * len(drives.SCENARIOS)
+
+
+def _find_driven() -> tuple[HighdScenario, ...]:
+    """Return the recording whose vehicles are instrumented."""
+    return tuple(scenario for scenario in HIGHD if scenario.recording == drives.RECORDING)
+
+
+def _list_pair(jobs: list[_Job], recording: str) -> list[_Job]:
+    """Return both carriageways of a recording in highD's format."""
+    return [job for job in jobs if job.dataset == "highd" and job.recording == recording]
 
 
 def _list_jobs(
@@ -103,12 +121,13 @@ def _list_jobs(
 ) -> list[_Job]:
     jobs = []
     for place, scenario in enumerate(HIGHD):
+        if scenario not in recordings:
+            continue
         frames = max(1, round(scenario.share * minutes * 60 * scenario.road.rate_hz))
         for side, traffic in (("upper", scenario.upper), ("lower", scenario.lower)):
             name, index = scenario.recording, 2 * place + (side == "lower")
             file = f"{name}_tracks.csv"
             jobs.append(_Job("highd", name, f"{name}-{side}", file, index, scenario.road, traffic, frames))
-    jobs = jobs if recordings else []
     order = {each.start_time: 100 + i for i, each in enumerate(NGSIM_TEXT + NGSIM_SOCRATA + NGSIM_CSV)}
     for _, file, scenarios in groups:
         for each in scenarios:
@@ -198,10 +217,8 @@ def _list_line_defects(
     ]  # fmt: skip
 
 
-def _write_highd(
-    folder: Path, scenario: HighdScenario, pair: list[_Job], clean: dict[str, pl.DataFrame], seed: int
-) -> list[dict[str, object]]:
-    # Ids count over both carriageways, in order of the first frame.
+def _number_vehicles(pair: list[_Job], clean: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+    """Return tracks by subset under the ids of highD's files, which count over both carriageways by first frame."""
     both = [clean[job.subset].with_columns(side=pl.lit(i)) for i, job in enumerate(pair)]
     numbered = (
         pl.concat(both)
@@ -210,17 +227,23 @@ def _write_highd(
         .sort("frame", "side", "vehicle")
         .with_columns(number=pl.int_range(1, pl.len() + 1, dtype=pl.Int32))
     )
+    return {
+        job.subset: clean[job.subset]
+        .join(numbered.filter(pl.col("side") == side).select("vehicle", "number"), on="vehicle", maintain_order="left")
+        .with_columns(vehicle=pl.col("number"))
+        .drop("number")
+        .sort("vehicle", "frame")
+        for side, job in enumerate(pair)
+    }
+
+
+def _write_highd(
+    folder: Path, scenario: HighdScenario, pair: list[_Job], clean: dict[str, pl.DataFrame], seed: int
+) -> list[dict[str, object]]:
     both_damaged, rows = [], []
-    for side, job in enumerate(pair):
-        ids = numbered.filter(pl.col("side") == side).select("vehicle", "number")
-        tracks = (
-            clean[job.subset]
-            .join(ids, on="vehicle", maintain_order="left")
-            .with_columns(vehicle=pl.col("number"))
-            .drop("number")
-            .sort("vehicle", "frame")
-        )
-        damaged, declared = _damage_tracks(tracks, job, seed)
+    tracks = _number_vehicles(pair, clean)
+    for job in pair:
+        damaged, declared = _damage_tracks(tracks[job.subset], job, seed)
         both_damaged.append(damaged)
         rows += declared
     files = highd.build_recording(scenario, *both_damaged, frames=pair[0].frames)

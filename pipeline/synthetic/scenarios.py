@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass, field
 
-FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata")
+DRIVES = "drives"
+"""Format of instrumented vehicles: a folder of logs each."""
+FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES)
 """Raw formats that the generator writes."""
-DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata")
+DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata", DRIVES)
 """Formats of a sample, unless set."""
 LEAST_MINUTES = 0.1
 MOST_MINUTES = 15.0

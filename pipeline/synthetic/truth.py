@@ -34,7 +34,8 @@ TRUTH_SCHEMA = {
 its true x_m at the first, from the window's entrance along the direction of travel (noise apart).
 `rule`: entries and vehicles of a subset that break a rule (`name`), as counted from the files; value is the number of
 runs of consecutive frames. `rows`: lines of a file that are `read` (the header apart), `kept`, `malformed`,
-`duplicate`. Null where a column does not apply."""
+`duplicate`. `drive`: a file of the drive in folder `recording`, of vehicle `vehicle_id` in
+`subset`, which takes value seconds. Null where a column does not apply."""
 
 METRES_PER_FOOT = 0.3048
 NGSIM_CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}

@@ -45,6 +45,7 @@ class DriveSummary:
     ego_id: int
     seconds: float
     messages: int
+    truth_rows: int
     heard: int
     """Vehicles whose messages were received."""
     vehicles: int
@@ -106,6 +107,7 @@ def instrument_drive(
         ego_id,
         float(sensed.motion.time_s[-1] - sensed.motion.time_s[0]),
         sensed.messages.height,
+        sensed.truth.height,
         sensed.messages.filter(~pl.col("own"))["sender"].n_unique(),
         sensed.truth["truth_id"].n_unique(),
         len(sensed.scans),

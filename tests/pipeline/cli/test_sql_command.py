@@ -174,7 +174,7 @@ def test_a_wrong_name_gets_duckdbs_guess_and_what_there_is(command, lake):
     assert (done.code, done.out) == (1, "")
     assert 'Did you mean "track' in done.err
     assert "\nTables: tracks, vehicles, " in done.err
-    assert "\nMacros: flow_density(subset, seconds), " in done.err
+    assert " flow_density(subset, seconds), " in done.err
 
 
 def test_parquet_is_not_poured_on_a_terminal(command, lake):

@@ -31,9 +31,9 @@ def test_an_archive_gives_the_lake_of_its_files_and_is_not_read_again(command, s
             columns = ", ".join(f'"{name}"' for name in table.dtypes if name != "file")
             query = f"SELECT {columns} FROM {table.name} ORDER BY {order}"
             assert zipped.sql(query).pl().equals(plain.sql(query).pl()), table.name
-        hashes = "SELECT sha256, rows_read, rows_kept FROM ingest_log ORDER BY ALL"
+        hashes = "SELECT sha256, rows_read, rows_kept FROM ingest_log WHERE dataset <> 'v2v' ORDER BY ALL"
         assert zipped.sql(hashes).fetchall() == plain.sql(hashes).fetchall()
-        files = "SELECT DISTINCT file FROM ingest_log ORDER BY ALL"
+        files = "SELECT DISTINCT file FROM ingest_log WHERE dataset <> 'v2v' ORDER BY ALL"
         assert [file for (file,) in zipped.sql(files).fetchall()] == [
             f"download.zip/sample/data/{file}" for (file,) in plain.sql(files).fetchall()
         ]

@@ -42,7 +42,7 @@ def highd_tracks(out, recording):
 def test_summary_names_every_file(written):
     out, summary = written
     assert sorted(path.name for path in out.iterdir()) == [path.name for path in summary.files]
-    assert summary.recordings == 4 + 1 + 2 + 1
+    assert summary.recordings == 4 + 1 + 2 + 1 + 2  # highD, NGSIM in three formats, drives
     lines = sum(path.read_bytes().count(b"\n") for path in summary.files if path.suffix in (".csv", ".txt"))
     metadata = sum(path.read_bytes().count(b"\n") for path in summary.files if path.name.endswith("Meta.csv"))
     headers = 4 + 1 + 1  # the text has none
@@ -265,7 +265,7 @@ def test_traffic_is_lively(written):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"formats": ("highD",)}, "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, got highD"),
+        ({"formats": ("highD",)}, "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, got highD"),
         ({"formats": ()}, "got none"),
         ({"minutes": 0.0}, "minutes: expected 0.1 to 15, got 0.0"),
         ({"minutes": float("nan")}, "minutes: expected"),
