@@ -243,6 +243,12 @@ def _explain_emptiness(recording: str, canonical: Canonical, lacking: str) -> st
         for reason, rows, file, line, text in reasons.head(REASONS_SHOWN).rows()
     ]
     more = [f"{reasons['rows'][REASONS_SHOWN:].sum():,} for other reasons"] if len(reasons) > REASONS_SHOWN else []
+    if not shown:
+        read = "; ".join(canonical.notes or canonical.log["file"])
+        return (
+            f"recording {recording}: {lacking}. Expected rows that can be used, got none ({read}). Give all files of "
+            "the recording."
+        )
     return (
         f"recording {recording}: {lacking}. Expected rows that can be used, got dropped ones only: "
         f"{', '.join([*shown, *more])}. Restore the original files, or repair these lines."

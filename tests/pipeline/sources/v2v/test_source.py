@@ -231,6 +231,12 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"truth\.csv is the truth of one drive, .* 2 receivers"):
         ingest.build(tmp_path / "lake", job)
+    for name in ("a", "b"):
+        (tmp_path / "source" / "trip" / f"{name}.csv").unlink()
+    put("trip/truth.csv", "# tracklake drive truth\n", header, *rows)
+    (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
+    with pytest.raises(SourceError, match=r"got none \(trip/truth\.csv\)\. Give all files of the recording"):
+        ingest.build(tmp_path / "lake", job)
 
 
 def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, command, plain_flows):
@@ -260,7 +266,7 @@ def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, com
     assert command.here("check", *lake).code == 0
     assert command.here("ingest", tmp_path / "source" / "notes", *lake).code == 1
     put("one/other/a.csv", write_line(gentime_us=7))
-    assert command.here("run", tmp_path / "source" / "one", *lake).code == 0
+    assert command.here("ingest", tmp_path / "source" / "one", *lake).code == 0
     (tmp_path / "source" / "one" / "trip" / "a.csv").unlink()
-    pruned = command.here("run", tmp_path / "source" / "one", *lake, "--prune")
+    pruned = command.here("ingest", tmp_path / "source" / "one", *lake, "--prune")
     assert "recording trip: no longer in SOURCE, and removed from the lake (3 messages)" in pruned.out
