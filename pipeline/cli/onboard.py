@@ -118,6 +118,7 @@ def evaluate(
             "scores": rows,
             "published": beside,
             "maneuvers": [asdict(row) for row in score_forest(forest, parts.eval)] if forest else [],
+            "examples": forest.examples if forest else 0,
             "correlations": [asdict(row) for row in forest.coefficients] if forest else [],
             "confusion": cells,
             "learning_curve": [asdict(row) for row in learn_curve(parts, 0)] if learning_curve and forest else [],

@@ -93,9 +93,10 @@ def show_forest(terminal: Terminal, record: Row, *, with_confusion: bool) -> Non
         names = [f"of {name} %" for name in record["maneuvers"][0]["recall"]]
         headings = ["", "n", "right %", *names, "always the commonest %"]
         print_table(terminal, headings, rows, title="maneuver by the forest's majority", fold=True)
+        title = f"correlation with the maneuver, the strongest ({record['examples']:,} examples of the training part)"
         strongest = record["correlations"][:SHOWN_FEATURES]
         rows = [[row["feature"], *(f"{row[name]:.2f}" for name in ("keep", "left", "right"))] for row in strongest]
-        print_table(terminal, ["", "keep", "left", "right"], rows, title="correlation with the maneuver, the strongest")
+        print_table(terminal, ["", "keep", "left", "right"], rows, title=title)
     if record["learning_curve"]:
         rows = [
             [f"{row['drawn']:,}", _format_percent(row["train_accuracy"]), f"{row['train_n']:,}",
@@ -106,7 +107,7 @@ def show_forest(terminal: Terminal, record: Row, *, with_confusion: bool) -> Non
         print_table(terminal, headings, rows, title="learning curve, examples drawn")
     for model, cells in record["confusion"].items() if with_confusion else ():
         names = [f"{lane} {row}" for lane in ("left", "own", "right") for row in ("behind", "middle", "ahead")]
-        rows = [[name, *map(str, counts)] for name, counts in zip([*names, "outside"], cells, strict=True)]
+        rows = [[name, *map(str, counts)] for name, counts in zip([*names, "outside"], cells[-1], strict=True)]
         title = f"true cell (rows) against that of {model} at {V2V.scored_s[-1]:g} s, samples"
         print_table(terminal, ["", *names, "outside"], rows, title=title, fold=True)
 

@@ -113,18 +113,14 @@ def bootstrap_mean(values: Floats, trajectory: Integers) -> tuple[Floats, Floats
     return low, high
 
 
-def count_confusion(model: Forecaster, samples: Samples, seconds: float = V2V.scored_s[-1]) -> Integers:
-    """Count samples by true and predicted cell, numbered from 0 to 8 as in `cells`, 9 outside: (10, 10)."""
-    at = V2V.scored_s.index(seconds)
-    cells = [
-        number_cells(codes[:, at, 0], codes[:, at, 1]).astype(np.int64)
-        for codes in (
-            find_cells(samples, place_m)
-            for place_m in (samples.place_m, predict_places(model.name, model.predict, samples))
-        )
-    ]
-    true, own = (np.where(codes < 0, 9, codes) for codes in cells)
-    return np.bincount(10 * true + own, minlength=100).reshape(10, 10)
+def count_confusion(model: Forecaster, samples: Samples) -> Integers:
+    """Count samples by scored tick, true and predicted cell, from 0 to 8 as in `cells`, 9 outside: (T, 10, 10)."""
+    places = (samples.place_m, predict_places(model.name, model.predict, samples))
+    codes = [number_cells(own[..., 0], own[..., 1]) for own in (find_cells(samples, place_m) for place_m in places)]
+    true, own = (np.where(code < 0, 9, code.astype(np.int64)) for code in codes)
+    counts: Integers = np.zeros((len(AT), 10, 10), dtype=np.int64)
+    np.add.at(counts, (np.arange(len(AT)), true, own), 1)
+    return counts
 
 
 def score_forest(forest: ManeuverForest, samples: Samples) -> list[ManeuverScore]:

@@ -70,7 +70,7 @@ def test_intervals_draw_trajectories_and_not_samples():
 def test_the_truth_is_always_in_its_cell_unless_outside(parts):
     perfect = Forecaster("truth", lambda samples: samples.place_m, np.ones((20, 2)))
     last = score_model(perfect, parts.eval)[3]
-    confusion = count_confusion(perfect, parts.eval)
+    confusion = count_confusion(perfect, parts.eval)[3]
     assert (confusion == np.diag(np.diag(confusion))).all()
     assert confusion.sum() == last.n
     assert last.cell == pytest.approx(1 - confusion[9, 9] / last.n)
