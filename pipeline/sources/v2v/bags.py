@@ -29,6 +29,8 @@ from tracklake.schemas.arrays import Floats, Integers
 
 MAX_GAP_US = 500_000
 """Greatest distance in us from a fix to the nearest heading or speed that is interpolated to its moment."""
+MAX_DRIVE_US = 86_400_000_000
+"""Time in us from the middle message of a bag at which others are no part of its drive: a day."""
 HEADING_TYPES = ("std_msgs/msg/Float64", "geometry_msgs/msg/QuaternionStamped", "sensor_msgs/msg/Imu")
 """Types that state a heading, the first preferred where a bag has several."""
 SERIES = {"speed": "speed_mps", "heading": "heading_deg", "accel": "accel_mps2", "yaw_rate": "yaw_rate_degps"}
@@ -141,6 +143,7 @@ def read_bag(files: Sequence[RawFile]) -> BagContents:
     """
     collected = _Collection()
     rows_read = [_collect(index, file, collected) for index, file in enumerate(files)]
+    _drop_far(collected)
     names = ", ".join(file.name for file in files[:3])
     chosen = {kind: _choose_topic(kind, collected) for kind in SINGLE}
     transforms = [
@@ -207,6 +210,31 @@ def _collect(index: int, file: RawFile, collected: _Collection) -> int:
                 collected.unstamped[record.topic] += not item.stamped
                 collected.latest_us[record.topic] = item.utc_us
     return line
+
+
+def _drop_far(collected: _Collection) -> None:
+    """Reject messages a day or more from the others: one wrong time would stretch the drive over years."""
+    moments = [own.item.utc_us for found in collected.found.values() for own in found]
+    if not moments or max(moments) - min(moments) < MAX_DRIVE_US:
+        return
+    middle_us = int(np.median(moments))
+
+    def is_far(own: _Found | None) -> bool:
+        return own is not None and abs(own.item.utc_us - middle_us) >= MAX_DRIVE_US
+
+    for kind, topic in list(collected.found):
+        found = collected.found[kind, topic]
+        far = [own for own in found if is_far(own)]
+        known = {(file, line) for file, line, _, _ in collected.rejects}
+        for own in far:
+            if (own.file, own.line) not in known:
+                collected.reject_found(own, "a day or more from the other messages of the bag")
+        collected.found[kind, topic] = [own for own in found if not is_far(own)]
+        if not collected.found[kind, topic]:
+            del collected.found[kind, topic]
+    collected.clouds = {
+        place: [None if is_far(cloud) else cloud for cloud in clouds] for place, clouds in collected.clouds.items()
+    }
 
 
 def _choose_topic(kind: str, collected: _Collection) -> tuple[str, list[_Found]]:

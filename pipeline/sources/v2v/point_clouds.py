@@ -64,11 +64,11 @@ class Scans:
 
     def describe_removed(self) -> tuple[str, ...]:
         """Tell which returns the last iteration left out, and why, in a note or none."""
-        own = self.removed
         if not len(self):
             return ()
+        own, topic = self.removed, f"{self.files[0].name}: {self.topic}"
         return (
-            f"{self.topic}: LiDAR returns left out: {own.ground:,} of the road, {own.out_of_reach:,} beyond "
+            f"{topic}: LiDAR returns left out: {own.ground:,} of the road, {own.out_of_reach:,} beyond "
             f"{MAX_RANGE_M:g} m or above {MAX_HEIGHT_M:g} m, {own.no_return:,} points without a return",
         )
 

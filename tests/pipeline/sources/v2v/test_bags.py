@@ -168,6 +168,24 @@ def test_the_time_of_the_bag_counts_where_a_stamp_is_no_utc_time(tmp_path: Path)
     )
 
 
+def test_one_wrong_time_does_not_stretch_a_drive(tmp_path: Path) -> None:
+    """The bag's time is a day late, too: a recorder's clock that was set while it recorded."""
+    day_us = 86_400_000_000
+    bag = read_messages(
+        tmp_path,
+        ("/tf_static", TF, 0, make_transforms(make_transform("base_link", "lidar", (0.0, 0.0, 2.0)))),
+        ("/fix", FIX, 0, make_fix()),
+        ("/points", CLOUD, 0, make_cloud("lidar")),
+        ("/fix", FIX, day_us, make_fix(START_US + day_us)),
+        ("/points", CLOUD, day_us, make_cloud("lidar", header=MAKE.header(START_US + day_us, "lidar"))),
+    )
+    assert bag.ego["utc_us"].to_list() == [START_US]
+    assert [scan.utc_us for scan in bag.scans] == [START_US]
+    assert bag.rejects["line", "reason"].sort("line").rows() == [
+        (line, "a day or more from the other messages of the bag") for line in (4, 5)
+    ]
+
+
 def test_heading_is_interpolated_over_north_to_the_moment_of_a_fix(tmp_path: Path) -> None:
     """91 and 89 degrees from east are 359 and 1 from north; halfway is north. Beyond half a second it is unknown."""
     bag = read_messages(
