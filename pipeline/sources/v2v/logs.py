@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import polars as pl
 
 from tracklake.pipeline.sources.accounting import FILE, account_rows
-from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA
-from tracklake.pipeline.sources.source import Part, RawFile
+from tracklake.pipeline.sources.csv import LINE, REJECT_SCHEMA, measure_unpacked
+from tracklake.pipeline.sources.source import Part, RawFile, SourceError
 from tracklake.pipeline.sources.v2v.bags import BagContents, read_bag
 from tracklake.pipeline.sources.v2v.bsmp1 import read_bsmp1
 from tracklake.pipeline.sources.v2v.messages import MESSAGE_SCHEMA, SENDER_SCHEMA, RawMessages
@@ -22,6 +22,8 @@ READERS: Mapping[str, Callable[[RawFile], RawMessages]] = {
     HEX: read_hex,
 }
 """Readers of message logs, by dialect."""
+MAX_TEXT_BYTES = 1 << 30
+"""Most text of one drive's messages, about 11 million lines of BsmP1; reading them takes ten times as much memory."""
 FILED_SCHEMA = {FILE: pl.Int64(), **REJECT_SCHEMA}
 """Columns of rejected lines and messages, with the number of their file."""
 
@@ -61,6 +63,7 @@ def read_logs(parts: Sequence[Part]) -> Logs:
     """
     bags = [index for index, part in enumerate(parts) if part.file.dialect in BAGS]
     bag = read_bag([parts[index].file for index in bags]) if bags else None
+    _refuse_excess([part.file for index, part in enumerate(parts) if index not in bags])
     read: dict[int, RawMessages | Truth] = {
         index: read_truth(part.file) if part.file.dialect == TRUTH else READERS[part.file.dialect](part.file)
         for index, part in enumerate(parts)
@@ -91,6 +94,18 @@ def read_logs(parts: Sequence[Part]) -> Logs:
         (*(note for raw in logs.values() for note in raw.notes), *(bag.notes if bag is not None else ())),
         bool(truths) or any(raw.synthetic for raw in logs.values()) or (bag is not None and bag.synthetic),
     )
+
+
+def _refuse_excess(files: Sequence[RawFile]) -> None:
+    """Refuse logs that would not fit into the memory of usual computers."""
+    size = sum(map(measure_unpacked, files))
+    if size > MAX_TEXT_BYTES:
+        largest = max(files, key=measure_unpacked)
+        raise SourceError(
+            f"{largest.name}: with the logs beside it {size / 1e9:,.1f} GB of messages. Expected at most "
+            f"{MAX_TEXT_BYTES / 1e9:,.1f} GB for one drive, which are read at once. Split the log by receiver or hour, "
+            "each into a folder of its own; of BsmP1, `awk -F, '$1 == 12' LOG` prints what device 12 logged."
+        )
 
 
 def _decode_messages(texts: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:

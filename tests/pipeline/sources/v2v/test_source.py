@@ -13,6 +13,7 @@ from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.lake import open_for_writing
 from tracklake.pipeline.sources import SourceError
+from tracklake.pipeline.sources.v2v import logs
 
 PLACE = "40.0,-83.0,200"
 EPOCH_US = 1_072_915_200_000_000
@@ -115,6 +116,15 @@ def test_logs_of_which_nothing_is_usable_are_refused(tmp_path, put):
     with pytest.raises(
         SourceError, match=r"recording trip: no message, position or scan is usable.* first trip/a\.csv, line 1"
     ):
+        ingest.build(tmp_path / "lake", job)
+
+
+def test_more_messages_than_fit_into_the_memory_are_refused(tmp_path, put, monkeypatch):
+    monkeypatch.setattr(logs, "MAX_TEXT_BYTES", 50)
+    put("trip/a.csv", write_line())
+    put("trip/b.csv", write_line())
+    (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
+    with pytest.raises(SourceError, match=r"trip/a\.csv: with the logs beside it .* GB of messages.*Split the log"):
         ingest.build(tmp_path / "lake", job)
 
 
@@ -249,7 +259,8 @@ def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, com
     lake = ("--lake", tmp_path / "lake")
     done = command.here("run", tmp_path / "source" / "one" / "trip", *lake, "--dataset", "v2v")
     assert done.code == 0, done.err
-    assert "drives  1 drives: 1 senders, 3 messages\nrows    3 read, 0 rejected\nreport" in done.out
+    assert "drives  1 drives: 1 senders, 3 messages\n" in done.out
+    assert "rows    3 read, 0 rejected\nreport" in done.out
     assert 'sql "FROM drives"' in done.out
     again = command.here("run", tmp_path / "source" / "one" / "trip", *lake)
     assert "nothing to do" in again.out
