@@ -112,6 +112,8 @@ class Settings(BaseModel):
     tensor_positions: Literal["float32", "int16-decimetres", "int16-centimetres"] = Field(
         "float32", description="how tensors store positions; int16 halves them and rounds along the road"
     )
+    onboard_lidar: bool = Field(True, description="drives: LiDAR is used to track the vehicles around the ego")
+    onboard_camera: bool = Field(True, description="drives: camera boxes are used to track the vehicles around the ego")
     split_seed: int = Field(0, ge=0, description="seed of the splits' searches and draws")
     split_block_s: float = Field(120.0, ge=10, description="time-blocks: length of a block, s")
     split_purge_s: float = Field(
@@ -157,10 +159,8 @@ class Settings(BaseModel):
     @classmethod
     def _check_protocol(cls, name: str) -> str:
         if name in DRIVE_PROTOCOLS:
-            known = ", ".join(PROTOCOLS)
-            raise ValueError(
-                f"{name} is for drives, and `tracklake onboard` uses it by itself; expected one of {known}"
-            )
+            drives = f"{name} is for drives, and `tracklake onboard` uses it by itself"
+            raise ValueError(f"{drives}; expected one of {', '.join(PROTOCOLS)}")
         if name not in PROTOCOLS:
             raise ValueError(f"no protocol is called {name}; {suggest_name(name, PROTOCOLS)}")
         return name

@@ -191,7 +191,9 @@ def put_scene(root, scene, changes=None):
     )
     with open_for_writing(root) as writer:
         files = {}
-        for table, frame in {DRIVES: drives, BSM: bsm, EGO_STATES: states}.items():
+        tables = {DRIVES: drives, BSM: bsm, EGO_STATES: states}
+        for table in tables | (changes or {}):
+            frame = tables.get(table)
             changed = (changes or {}).get(table, lambda rows: rows)(frame)
             full = changed.with_columns(**place_of(place)).select(list(table.dtypes))
             files[table.name] = write_table(root, table, full, place, "0" * 16, where="trip")

@@ -1,30 +1,31 @@
 """Assignment of vehicles that send messages to vehicles that LiDAR sees, where it is not obvious.
 
-Messages may be off by more than a lane, so a cluster beside the place that a message names can be another vehicle's. A
-station whose place is uncertain is therefore held back from LiDAR while others are near: its neighbors become tracks of
-LiDAR alone, and stations and tracks are compared as a whole (track-to-track association; Bar-Shalom, Li and
+Messages may be off by more than a lane, so a cluster at the place that they name can be another vehicle's, and their
+own vehicle may be hidden. Clusters are therefore not assigned to stations whose place is uncertain: they become
+tracks of LiDAR alone, and stations and tracks are compared as a whole (track-to-track association; Bar-Shalom, Li and
 Kirubarajan 2001). All messages are off by the error of the ego's own position alike: the assignment is sought together
 with that common shift, and made only where the next best one is clearly worse.
 """
 
 import numpy as np
 
-from tracklake.pipeline.transforms.onboard.kalman import OFFSET, POSITION
+from tracklake.pipeline.transforms.onboard.kalman import OFFSET, POSITION, VELOCITY
 from tracklake.pipeline.transforms.onboard.tracks import TENTATIVE, Tracks
 from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.perception import FIRST_LIDAR_ID
 
 LOOSE_M2 = 1.0
 """Sum of the variances of x and y from which on a station's place is uncertain, in m2."""
-NEAR, SAME = 13.8, 18.5
-"""Squared Mahalanobis distances that two places can have (1 in 1,000), and two places with velocities."""
-CLEAR = 4.0
+NEAR, UNSEEN = 13.8, 9.0
+"""Squared Mahalanobis distances: of two places (1 in 1,000), and of a place and velocity that is as likely as that the
+station is hidden and the track is of a vehicle that sends nothing, at 1 vehicle per 175 m2 of which half are hidden."""
+CLEAR = 3.0
 """Squared Mahalanobis distance by which the next best assignment must be worse."""
 MOST_SHIFTS = 60
 """Common shifts that are tried at most."""
 STRIKES = 10
 """Messages in a row that contradict LiDAR before the two are taken for different vehicles."""
-FARTHEST_OFFSET = 4.5
+FARTHEST_OFFSET = 3.7
 """Offset of messages, in standard deviations, that is not believed."""
 
 
@@ -38,18 +39,20 @@ def is_loose(tracks: Tracks) -> Flags:
     return is_station(tracks) & (tracks.covariance[:, 0, 0] + tracks.covariance[:, 1, 1] > LOOSE_M2)
 
 
-def find_held(tracks: Tracks, tick: int) -> Flags:
-    """Tell which stations LiDAR may not be assigned to at a tick: uncertain ones near other vehicles."""
-    loose = is_loose(tracks)
-    held = loose & (tracks.held_until >= tick)
-    rows = np.flatnonzero(loose)
-    if rows.size and len(loose) > 1:
-        away = tracks.state[rows, None, POSITION] - tracks.state[None, :, POSITION]
-        total = tracks.covariance[rows, None, POSITION, POSITION] + tracks.covariance[None, :, POSITION, POSITION]
-        near = _square(away, total) < NEAR
-        near[np.arange(rows.size), rows] = False
-        held[rows] |= near.any(1)
-    return held
+def guess_velocities(tracks: Tracks, place_m: Floats, usual_mps: Floats) -> Floats:
+    """Return first velocities of LiDAR tracks at (N, 2) places: of the nearest uncertain station, or the usual one.
+
+    A station that drives against the ego's direction is thus found by LiDAR as well.
+    """
+    guess = np.tile(usual_mps, (len(place_m), 1))
+    rows = np.flatnonzero(is_loose(tracks))
+    if rows.size and len(place_m):
+        away = place_m[:, None] - tracks.state[None, rows, POSITION]
+        distance = _square(away, np.broadcast_to(tracks.covariance[rows, POSITION, POSITION], (*away.shape, 2)))
+        nearest = distance.argmin(1)
+        near = distance.min(1) < NEAR
+        guess[near] = tracks.state[rows[nearest[near]], VELOCITY]
+    return guess
 
 
 def match_stations(tracks: Tracks, heard: Flags) -> Integers:
@@ -115,7 +118,7 @@ def _try_shifts(away: Floats, total: Floats, known_m: Floats, rest_m2: float) ->
 
     Returns:
         (K, S) LiDAR track of each station, -1 for none, and the (K,) costs: squared Mahalanobis distances, those of the
-        shifts included; a station without a track costs SAME.
+        shifts included; a station without a track costs UNSEEN.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -126,13 +129,13 @@ def _try_shifts(away: Floats, total: Floats, known_m: Floats, rest_m2: float) ->
     shifts, cost = shifts[chosen], prior[chosen]
     moved = np.broadcast_to(away, (len(shifts), *away.shape)).copy()
     moved[..., :2] += shifts[:, None, None]
-    distance = np.minimum(_square(moved, np.broadcast_to(total, (len(shifts), *total.shape))), SAME)
+    distance = np.minimum(_square(moved, np.broadcast_to(total, (len(shifts), *total.shape))), UNSEEN)
     pairs = np.full((len(shifts), stations), -1)
     for number, square in enumerate(distance):
         rows, columns = linear_sum_assignment(square)
-        good = square[rows, columns] < SAME
+        good = square[rows, columns] < UNSEEN
         pairs[number, columns[good]] = rows[good]
-        cost[number] += square[rows[good], columns[good]].sum() + SAME * (stations - good.sum())
+        cost[number] += square[rows[good], columns[good]].sum() + UNSEEN * (stations - good.sum())
     return pairs, cost
 
 

@@ -24,7 +24,7 @@ from tracklake.pipeline.transforms.onboard.kalman import (
 )
 from tracklake.pipeline.transforms.onboard.matching import (
     find_contradicted,
-    find_held,
+    guess_velocities,
     is_loose,
     match_stations,
     merge_stations,
@@ -68,8 +68,8 @@ TICKS_PER_MERGE_CHECK, MERGE_CHECKS = 3, 3
 """Ticks from one comparison of stations and LiDAR tracks to the next, and how often in a row they must match."""
 FIRST_TENTATIVE_ID = 1_000_000_000
 """Least id by which tracks that are not confirmed are shown to LiDAR."""
-HOLDING_TICKS = 10
-"""Ticks for which an uncertain station is kept from LiDAR after several clusters were at its place."""
+LIDAR_REACH_M = 130.0
+"""Distance up to which vehicles are searched in LiDAR scans, in m."""
 MAX_SENSOR_AGE_S = 0.2
 """Age at the tick up to which a scan or an image is used, in s."""
 
@@ -199,8 +199,9 @@ class Tracker:
         """Correct tracks by the LiDAR's clusters, and start those of clusters that are no known vehicle's."""
         assert self._sensors.measure is not None
         tracks, back_s = self._tracks, tick / TICK_RATE_HZ - scan[0]
+        range_m = np.hypot(*(tracks.state[:, POSITION] - self._ego.odometry_m[tick]).T)
         ego_m, yaw = self._find_pose(tick, back_s)
-        asked = np.flatnonzero(~find_held(tracks, tick))
+        asked = np.flatnonzero(~is_loose(tracks) & (range_m < LIDAR_REACH_M))
         expected = self._expect(asked, ego_m, yaw, back_s)
         found = self._sensors.measure(np.asarray(scan[1], dtype=np.float64), expected)
         self.clusters.append((tick, found.clusters))
@@ -210,16 +211,14 @@ class Tracker:
         covariance_m2 = turn_covariance(measured.covariance_m2, yaw)
         known = np.flatnonzero(measured.row >= 0)
         rows = asked[measured.row[known]]
-        unsure = is_loose(tracks)[rows] & (np.asarray(found.association["candidates"])[known] > 1)
-        tracks.held_until[rows[unsure]] = tick + HOLDING_TICKS
-        known, rows = known[~unsure], rows[~unsure]
         update_by_places(tracks, rows, place_m[known] + tracks.state[rows, VELOCITY] * back_s, covariance_m2[known])
         self._note_sizes(rows, measured, known, found.clusters)
         tracks.seen[rows], tracks.side[rows] = tick, measured.side[known]
         tracks.hits[rows] += 1
         log.note_clusters(tracks.chain[rows], {name: values[known] for name, values in found.association.items()})
         new = np.flatnonzero(measured.row < 0)
-        velocity = self._ego.speed_mps[tick] * np.array([np.cos(yaw), np.sin(yaw)])
+        usual = self._ego.speed_mps[tick] * np.array([np.cos(yaw), np.sin(yaw)])
+        velocity = guess_velocities(tracks, place_m[new], usual)
         state, covariance = start_from_lidar(place_m[new] + velocity * back_s, covariance_m2[new], velocity, yaw)
         offset_m = np.sqrt(covariance[:, 6, 6])
         born = make_tracks(self._number(len(new)), np.full(len(new), TENTATIVE), state, covariance, offset_m)

@@ -59,7 +59,6 @@ class Tracks:
         scans: (V,) LiDAR scans since its birth, and the hits among them.
         side: (V,) index of SIDES that LiDAR saw last; -1 none.
         rival: (V,) station that a LiDAR track is taken for, and how often in a row.
-        held_until: (V,) tick until which a station is kept from LiDAR.
         strikes: (V,) messages in a row that contradict the state.
     """
 
@@ -80,7 +79,6 @@ class Tracks:
     rival: Integers
     rivalry: Integers
     side: Integers
-    held_until: Integers
     strikes: Integers
 
     def take(self, rows: Integers | Flags) -> "Tracks":
@@ -115,7 +113,6 @@ def make_tracks(chain: Integers, vehicle_id: Integers, state: Floats, covariance
         rival=never.copy(),
         rivalry=np.zeros(count, dtype=np.int64),
         side=never.copy(),
-        held_until=never.copy(),
         strikes=np.zeros(count, dtype=np.int64),
     )
 
@@ -175,7 +172,7 @@ def start_from_lidar(
 ) -> tuple[Floats, Floats]:
     """Return first states and covariances of vehicles that LiDAR sees for the first time, at `place_m` (N, 2).
 
-    They are taken to drive about as the ego does, with `velocity_mps` (2,).
+    They are taken to drive with about `velocity_mps`, (N, 2).
     """
     count = len(place_m)
     state, covariance = np.zeros((count, STATES)), np.zeros((count, STATES, STATES))

