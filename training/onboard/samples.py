@@ -125,7 +125,7 @@ def build_samples(
     begin = np.maximum(now - history + 1, 0)
     track = rows["code"].fill_null(-1).to_numpy()[now]
     at, lasts = _find_futures(futures, track, rows["tick"].to_numpy()[now], future)
-    lacks = np.stack([key[begin] != key[now] - history + 1, track < 0, ~lasts])
+    lacks = np.stack([(key[begin] != key[now] - history + 1) | (now < history - 1), track < 0, ~lasts])
     counts = np.bincount(lacks.argmax(axis=0)[lacks.any(axis=0)], minlength=len(LEFT_OUT))
     kept = ~(lacks[:1] if without_future else lacks).any(axis=0)
     now, at, lasts = now[kept], at[kept], lasts[kept]
@@ -236,7 +236,7 @@ def _find_futures(futures: pl.DataFrame, code: Integers, tick: Integers, ahead: 
     wanted = (code.astype(np.int64) << 32) + tick
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     last = np.minimum(at + ahead, len(keys) - 1)
-    return at, (keys[at] == wanted) & (keys[last] == wanted + ahead)
+    return at, (keys[at] == wanted) & (keys[last] == wanted + ahead) & (last == at + ahead)
 
 
 def _label_maneuvers(futures: pl.DataFrame, now: Integers, then: Integers) -> Bytes:

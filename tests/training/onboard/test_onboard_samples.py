@@ -52,6 +52,13 @@ def test_no_rows_and_one_row_make_no_samples():
         assert len(build_samples(surrounding[:rows], truth[:rows], drives).samples) == 0
 
 
+def test_a_gap_at_a_tables_end_is_not_bridged():
+    surrounding, truth, drives = make_drive([{}], ticks=41)
+    for lost in (2, 19):  # rows at the first end: tick 1 is 19 before tick 20, with a gap between them
+        assert len(build_samples(surrounding[1:].filter(pl.col("tick") != lost), truth, drives).samples) == 0
+    assert len(build_samples(surrounding, truth.filter(pl.col("tick") != 30), drives).samples) == 0
+
+
 @settings(max_examples=20)
 @given(st.data())
 def test_samples_are_those_of_a_loop_whatever_the_gaps_and_the_order(data):
