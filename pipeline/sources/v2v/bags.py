@@ -1,7 +1,7 @@
 """ROS bags: what an instrumented vehicle's receiver, inertial sensor, LiDAR, camera and radio logged."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -37,6 +37,8 @@ SERIES = {"speed": "speed_mps", "heading": "heading_deg", "accel": "accel_mps2",
 """Columns of the ego's states that have topics of their own, by kind of item."""
 SINGLE = ("fix", "boxes", "camera", "scan", *SERIES)
 """Kinds of items that are read of one topic only."""
+REPEATED = "the moment of another message of its topic"
+"""Reason to reject a message where one of its topic has the same moment, as in two copies of a bag."""
 OPTICAL = "optical"
 """Part of the name of a camera's frame whose z axis, not x, looks ahead (REP-103)."""
 MAX_CAMERA_TURN_DEG = 10.0
@@ -255,25 +257,34 @@ def _arrange_scans(
     transforms: Iterable[tuple[str, str, Floats]],
     collected: _Collection,
 ) -> Scans:
-    """Find the LiDAR's place, and reject scans in a frame whose place is unknown."""
+    """Find the LiDAR's place; reject scans in a frame whose place is unknown, and those of a moment that has one."""
     topic, found = chosen
     if not found:
         return Scans()
     frame = found[0].item.values[0]
     mount = find_mount(frame, transforms)
-    moments = []
+    moments: list[list[int | None]] = []
+    seen: set[int] = set()
     for index in range(len(files)):
-        clouds = collected.clouds.get((index, topic), [])
-        own: list[int | None] = []
-        for cloud in clouds:
-            usable = cloud is not None and mount is not None and cloud.item.values[0] == frame
-            own.append(cloud.item.utc_us if usable and cloud is not None else None)
-            if cloud is not None and not usable:
-                where = f"frame {cloud.item.values[0]!r}"
-                reason = f"{where}: no static transform (/tf_static) leads from it to base_link"
-                collected.reject_found(cloud, reason if mount is None else f"{where} instead of {frame!r}")
-        moments.append(own)
+        moments.append([])
+        for cloud in collected.clouds.get((index, topic), []):
+            reason = "" if cloud is None else _find_obstacle(cloud, frame, mount, seen)
+            moments[-1].append(None if cloud is None or reason else cloud.item.utc_us)
+            if cloud is not None and reason:
+                collected.reject_found(cloud, reason)
+            elif cloud is not None:
+                seen.add(cloud.item.utc_us)
     return Scans(files, moments, topic, mount)
+
+
+def _find_obstacle(cloud: _Found, frame: str, mount: Mount | None, seen: Collection[int]) -> str:
+    """Return why a scan cannot be used, or nothing; `seen` are the moments of those before it."""
+    where = f"frame {cloud.item.values[0]!r}"
+    if mount is None:
+        return f"{where}: no static transform (/tf_static) leads from it to base_link"
+    if cloud.item.values[0] != frame:
+        return f"{where} instead of {frame!r}"
+    return REPEATED if cloud.item.utc_us in seen else ""
 
 
 def _drop_repeated(found: Sequence[_Found], collected: _Collection) -> list[_Found]:
@@ -281,7 +292,7 @@ def _drop_repeated(found: Sequence[_Found], collected: _Collection) -> list[_Fou
     kept: list[_Found] = []
     for own in sorted(found, key=lambda each: (each.item.utc_us, each.file, each.line)):
         if kept and own.item.utc_us == kept[-1].item.utc_us:
-            collected.reject_found(own, "the moment of another message of its topic")
+            collected.reject_found(own, REPEATED)
         else:
             kept.append(own)
     return kept

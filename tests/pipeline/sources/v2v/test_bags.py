@@ -329,3 +329,12 @@ def test_boxes_of_older_layouts_are_read(tmp_path: Path) -> None:
         (0, 40.0, 35.0, 20.0, 10.0, 0.75, "car"),
         (1, 40.0, 35.0, 20.0, 10.0, 0.5, "truck"),
     ]
+
+
+def test_a_second_copy_of_a_bag_adds_nothing(tmp_path: Path) -> None:
+    """The same drive as ROS recorded it and as it was converted: each scan, fix and image counts once."""
+    once = list_files(write_small_bag(tmp_path / "a.bag", 1))
+    bag = read_bag([*once, *list_files(write_small_bag(tmp_path / "b", 2))])
+    assert ([scan.scan for scan in bag.scans], bag.ego.height, len(bag.images_us)) == ([0, 1], 3, 2)
+    again = bag.rejects.filter(pl.col("reason") == "the moment of another message of its topic")
+    assert (again["file_index"].to_list(), again.height) == ([1] * 7, bag.rejects.height)
