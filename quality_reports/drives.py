@@ -2,19 +2,44 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypedDict, cast
 
 import polars as pl
 
 from tracklake.quality_reports.rules.along_messages import place_messages
 from tracklake.quality_reports.rules.registry import DRIVE_RULES
 from tracklake.quality_reports.summaries import Connection, Row, plain_row, query, query_frame
-from tracklake.schemas.quality_drives import DriveErrors, DriveFacts, DriveLoss, DriveRule, Drives, DriveStation
+from tracklake.schemas.quality_drives import (
+    DriveErrors,
+    DriveFacts,
+    DriveLoss,
+    DriveRule,
+    Drives,
+    DriveScore,
+    DriveStation,
+    DriveWarnings,
+)
 
+MAX_AGE_S = 5.0
+"""Oldest message that is compared with the truth, in s: tracks end 3 s after the last one."""
 BIN_M = 25.0
 """Width of bins of distance from the ego, in m."""
 ERRORS = ("message_error", "error", "smoothed_error")
 """Errors against the truth: of the last message alone, of the fused position, and of the smoothed one."""
+
+
+OF_ONE_DRIVE = ("drives", "stations", "rules", "losses", "errors")
+"""Lists of figures that each belong to one drive."""
+SCORED = ("model", "seconds", "n", "mae_m", "mae_m_low", "mae_m_high", "rmse_m")
+WARNED = ("model", "n", "true", "hits", "missed", "false", "warnings_per_hour", "median_time_s")
+"""Figures of a run at one horizon, and of its warnings, that the report shows."""
+
+
+class ScoreLists(TypedDict):
+    """Scores and warnings of runs on drives, as quality.json has them."""
+
+    scores: list[DriveScore]
+    warnings: list[DriveWarnings]
 
 
 @dataclass(frozen=True)
@@ -38,7 +63,7 @@ def read_drive(connection: Connection, drive: str) -> DriveRows:
     messages, states, ticks = (
         query_frame(connection, f"drive_{name}", asked) for name in ("messages", "states", "ticks")
     )
-    placed = place_messages(ticks, messages, states)
+    placed = place_messages(ticks, messages, states, max_age_s=MAX_AGE_S)
     across = [pl.col(f"message_{axis}_m") - pl.col(f"true_{axis}_m") for axis in "xy"]
     ticks = placed.with_columns(message_error_m=(across[0] ** 2 + across[1] ** 2).sqrt())
     others = messages.filter(~pl.col("own"))
@@ -49,8 +74,16 @@ def read_drive(connection: Connection, drive: str) -> DriveRows:
     return DriveRows(messages, ticks, at.select("lost_before", distance_m=distance))
 
 
-def collect_drives(connection: Connection) -> Drives | None:
-    """Gather the report's numbers about drives; None where the lake holds none."""
+def collect_drives(
+    connection: Connection, scores: Sequence[Mapping[str, Any]] = (), published: Sequence[Mapping[str, Any]] = ()
+) -> Drives | None:
+    """Gather the report's numbers about drives; None where the lake holds none.
+
+    Args:
+        connection: connection to a lake.
+        scores: runs on drives: model, rows of one horizon each, warnings.
+        published: rows of published figures, shown beside scores.
+    """
     facts = query(connection, "drives")
     if not facts:
         return None
@@ -68,15 +101,30 @@ def collect_drives(connection: Connection) -> Drives | None:
         "rules": cast("list[DriveRule]", rules),
         "losses": cast("list[DriveLoss]", collected["losses"]),
         "errors": cast("list[DriveErrors]", collected["errors"]),
+        **list_scores(scores, published),
     }
 
 
-def select_drive(drives: Drives, drive: str) -> dict[str, Sequence[Row]]:
-    """Select the rows of one drive."""
+def list_scores(scores: Sequence[Mapping[str, Any]], published: Sequence[Mapping[str, Any]]) -> ScoreLists:
+    """List the scores of runs on drives by horizon, the published ones beside them, and the warnings of the runs."""
+    rows = [("measured", row) for score in scores for row in score["rows"]]
+    rows += [("published", row) for row in published] if rows else []
+    renamed = {"cell": "cell_share", "cell_with_forest": "cell_with_forest_share"}
+    listed = [
+        {"origin": origin, **{name: row[name] for name in SCORED}, **{new: row[old] for old, new in renamed.items()}}
+        for origin, row in rows
+    ]
+    warned = [{name: score["warnings"][name] for name in WARNED} for score in scores]
     return {
-        name: [row for row in rows if row["drive"] == drive]
-        for name, rows in cast("dict[str, list[Row]]", drives).items()
+        "scores": cast("list[DriveScore]", list(map(plain_row, listed))),
+        "warnings": cast("list[DriveWarnings]", list(map(plain_row, warned))),
     }
+
+
+def select_drive(drives: Drives, drive: str) -> dict[str, list[Row]]:
+    """Select the rows of one drive."""
+    rows = cast("dict[str, list[Row]]", drives)
+    return {name: [row for row in rows[name] if row["drive"] == drive] for name in OF_ONE_DRIVE}
 
 
 def describe_drive(facts: Mapping[str, Any]) -> str:

@@ -107,6 +107,34 @@ class DriveErrors(TypedDict):
     smoothed_error_p95_m: Annotated[float, "the same, exceeded at 5 % of the ticks"]
 
 
+class DriveScore(TypedDict):
+    """Errors of a model's predictions of the vehicles around the ego at one horizon, over all drives."""
+
+    model: Annotated[str, "name of the run, or of the published model"]
+    origin: Annotated[str, "measured here, or published: on the authors' own recordings"]
+    seconds: Annotated[float, "horizon", "s"]
+    n: Annotated[int, "predictions behind it; 0: published, not stated"]
+    mae_m: Annotated[float | None, "mean distance of the predicted position from the true one"]
+    mae_m_low: Annotated[float | None, "lower end of its 95 % interval, by drawing trajectories", "m"]
+    mae_m_high: Annotated[float | None, "upper end of it", "m"]
+    rmse_m: Annotated[float | None, "root mean square of that distance"]
+    cell_share: Annotated[float | None, "share of the positions in the predicted one of nine cells"]
+    cell_with_forest_share: Annotated[float | None, "the same where a forest gives the column of cells"]
+
+
+class DriveWarnings(TypedDict):
+    """Collision warnings of a model against the truth, over all drives."""
+
+    model: Annotated[str, "name of the run"]
+    n: Annotated[int, "predictions: one vehicle at one moment"]
+    true: Annotated[int, "predictions whose cells overlap the ego's in truth"]
+    hits: Annotated[int, "those that were warned of"]
+    missed: Annotated[int, "those that were not"]
+    false: Annotated[int, "warnings without an overlap in truth"]
+    warnings_per_hour: Annotated[float | None, "runs of warnings, by the time that vehicles were near", "1/h"]
+    median_time_s: Annotated[float | None, "predicted time to the overlap, median over warnings"]
+
+
 class Drives(TypedDict):
     """Drives of instrumented vehicles."""
 
@@ -115,3 +143,5 @@ class Drives(TypedDict):
     rules: list[DriveRule]
     losses: list[DriveLoss]
     errors: list[DriveErrors]
+    scores: list[DriveScore]
+    warnings: list[DriveWarnings]

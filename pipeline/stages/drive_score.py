@@ -80,6 +80,11 @@ STAGE = Stage(
 )
 
 
+def finished_drive_runs(root: Path) -> list[Path]:
+    """Return metrics.json of every run on drives, sorted by name; unfinished ones are hidden and left out."""
+    return sorted((root / MODELS / FOLDER).glob("[!.]*/metrics.json"))
+
+
 def collect_drive_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) -> list[dict[str, Any]]:
     """Return the scores of runs on the lake's drives, by model: {model, part, rows: [...], warnings: {...}}.
 
@@ -88,7 +93,7 @@ def collect_drive_scores(root: Path, manifest: Manifest, skip: Callable[[str], N
     """
     commit = manifest.commits.get(NAME)
     scores = []
-    for path in sorted((root / MODELS / FOLDER).glob("[!.]*/metrics.json")) if commit is not None else ():
+    for path in finished_drive_runs(root) if commit is not None else ():
         try:
             evaluation = read_json(path)["evaluation"]
             rows = [row for row in evaluation["scores"] if row["stratum"] == "all"]

@@ -2,6 +2,7 @@
 
 import platform
 import shlex
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tracklake.pipeline.lake import LakeError, Manifest, connect, scan
 from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
+from tracklake.pipeline.stages.drive_score import collect_drive_scores, finished_drive_runs
 from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_report_file
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import collect_scores, finished_runs
@@ -36,7 +38,9 @@ SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 def _find_inputs(root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
     """Return everything in the lake, the subsets' pages and the models' runs among it, as the report's inputs."""
     commits = {key: commit.fingerprint for key, commit in manifest.commits.items() if commit.stage != "report"}
-    runs = {path.parent.name: hash_chunks([path.read_bytes()], 16) for path in finished_runs(root)}
+    paths = {path.parent.name: path for path in finished_runs(root)}
+    paths |= {f"onboard/{path.parent.name}": path for path in finished_drive_runs(root)}
+    runs = {name: hash_chunks([path.read_bytes()], 16) for name, path in paths.items()}
     return {"": {"commits": commits, "runs": runs, **_find_thresholds(manifest, settings)}}
 
 
@@ -101,7 +105,15 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     with connect(root) as connection:
         notes: list[str] = []
         scores = collect_scores(root, manifest, notes.append)
-        report = build_report(connection, provenance, scores=scores, pages=find_pages(root, made))
+        drive_scores = collect_drive_scores(root, manifest, notes.append)
+        report = build_report(
+            connection,
+            provenance,
+            scores=scores,
+            drive_scores=drive_scores,
+            published_drive_scores=_list_published() if drive_scores else (),
+            pages=find_pages(root, made),
+        )
     files = [write_report_file(root, PAGE, report.html), write_report_file(root, DOCUMENT, report.json)]
     files += [write_report_file(root, name, content) for name, content in report.others.items()]
     for name in {*OTHER_PAGES} - report.others.keys():
@@ -113,6 +125,13 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     for folder in (root / REPORTS, *folders):
         remove_unfinished(folder)
     return StageResult(files={REPORTS: files}, notes=notes)
+
+
+def _list_published() -> list[dict[str, Any]]:
+    """List the published scores of models on drives."""
+    from tracklake.training.onboard.scores import list_published
+
+    return [asdict(row) for row in list_published()]
 
 
 def read_quality(root: Path) -> dict[str, Any]:

@@ -54,6 +54,8 @@ def build_report(
     *,
     rules: Sequence[Rule] = RULES,
     scores: Sequence[Mapping[str, Any]] | None = None,
+    drive_scores: Sequence[Mapping[str, Any]] = (),
+    published_drive_scores: Sequence[Mapping[str, Any]] = (),
     pages: Mapping[tuple[str, str], str] | None = None,
 ) -> Report:
     """Query the lake's views and render the report.
@@ -63,13 +65,15 @@ def build_report(
         provenance: facts that the report shows; see `quality_reports.summaries.collect`.
         rules: rules that validation used.
         scores: results of evaluation, as `schemas.quality.ModelScores`.
+        drive_scores: results of runs on drives: model, rows by horizon, warnings.
+        published_drive_scores: published figures beside them, by model and horizon.
         pages: file names of the existing pages of subsets and drives, by (dataset, subset); None: all have one.
 
     Raises:
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     quality = collect(connection, provenance, rules=rules, scores=scores)
-    if (drives := collect_drives(connection)) is not None:
+    if (drives := collect_drives(connection, drive_scores, published_drive_scores)) is not None:
         quality["drives"] = drives
     others = {**render_files(quality), SPLITS_PAGE: render_splits(quality)}
     shown = {name: page for name, page in others.items() if page is not None}

@@ -100,17 +100,20 @@ def _measure_jumps() -> pl.Expr:
     return excess.clip(lower_bound=0).round(3)
 
 
-def place_messages(ticks: pl.DataFrame, messages: pl.DataFrame, ego_states: pl.DataFrame) -> pl.DataFrame:
+def place_messages(
+    ticks: pl.DataFrame, messages: pl.DataFrame, ego_states: pl.DataFrame, *, max_age_s: float = MAX_AGE_S
+) -> pl.DataFrame:
     """Add message_x_m and message_y_m: where a vehicle's last message alone puts it at a tick, in the ego's frame.
 
     Messages that had arrived by the tick and the ego's last state are carried forward with their speed and heading,
-    where they have both; null where one of them is older than MAX_AGE_S or the ego's heading is unknown. The rows keep
-    their order.
+    where they have both; null where the message is older than max_age_s, the state than MAX_AGE_S, or the ego's heading
+    unknown. The rows keep their order.
 
     Args:
         ticks: vehicle_id and tick, sorted by them.
         messages: rows of `bsm` of the drive.
         ego_states: rows of `ego_states` of the drive, sorted by time_s.
+        max_age_s: oldest message, in s.
     """
     arrived = messages.select(
         *("vehicle_id", "lat_deg", "lon_deg", "heading_deg", "speed_mps", "time_s"),
@@ -132,7 +135,7 @@ def place_messages(ticks: pl.DataFrame, messages: pl.DataFrame, ego_states: pl.D
     ahead, right = turn_to_heading(
         (east + sent_east - own_east, north + sent_north - own_north), pl.col("heading_deg_ego")
     )
-    fresh = pl.col("now_s") - pl.col("time_s") <= MAX_AGE_S + 1e-5  # of a float's last digits
+    fresh = pl.col("now_s") - pl.col("time_s") <= max_age_s + 1e-5  # of a float's last digits
     placed = joined.select(message_x_m=pl.when(fresh).then(ahead), message_y_m=pl.when(fresh).then(right))
     return pl.concat([ticks, placed], how="horizontal")
 

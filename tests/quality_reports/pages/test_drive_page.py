@@ -1,6 +1,7 @@
 """Pages of drives, and the overview of a lake with drives: what they say, well formed, safe against hostile names."""
 
 import re
+from dataclasses import asdict
 
 import pytest
 from page_elements import HOSTILE, parse, spoil_texts
@@ -10,6 +11,8 @@ from tracklake.quality_reports.pages.drives import render_drive
 from tracklake.quality_reports.pages.report import build_report
 from tracklake.schemas.quality import Quality
 from tracklake.schemas.quality_markdown import write_quality_page
+from tracklake.training.onboard.collisions import WarningScore
+from tracklake.training.onboard.scores import OnboardScore, list_published
 
 LINE = "2 stations, 110 messages, 8.3 % lost"
 
@@ -80,9 +83,33 @@ def test_drives_stand_beside_carriageways_and_change_nothing_of_them(open_lake, 
     assert 'id="verdicts"' in both.html
 
 
+def make_scores(model: str) -> dict:
+    """The scores of a run as its metrics hold them."""
+    rows = [asdict(OnboardScore(model, "all", seconds, 7, 2, mae_m=seconds, cell=0.75)) for seconds in (0.5, 1.0)]
+    warned = WarningScore(model, 7, 2, 3, 2, 1, 1, 2, 2, 12.5, 1.2, None)
+    return {"model": model, "part": "eval", "rows": rows, "warnings": asdict(warned)}
+
+
+def test_published_scores_stand_beside_measured_ones_and_are_marked(open_lake, small_drive):
+    published = [asdict(row) for row in list_published()]
+    lake = open_lake(**small_drive)
+    report = build_report(lake, {}, drive_scores=[make_scores("ctrv")], published_drive_scores=published)
+    found = [(row["model"], row["origin"], row["seconds"]) for row in report.quality["drives"]["scores"]]
+    assert found[:2] == [("ctrv", "measured", 0.5), ("ctrv", "measured", 1.0)]
+    assert {origin for _, origin, _ in found[2:]} == {"published"}
+    rows = re.findall(
+        r'<tr class="(excluded)?"><th scope="row">[\w+ -]+</th><td>(measured|published)</td>', report.html
+    )
+    assert rows[0] == ("", "measured")
+    assert set(rows[1:]) == {("excluded", "published")}
+    without = build_report(lake, {}, published_drive_scores=published)
+    assert without.quality["drives"]["scores"] == []
+    assert "own recordings, which are not in this lake" not in without.html
+
+
 def test_every_key_of_the_figures_is_documented(open_lake, small_drive):
     page = write_quality_page()
-    drives = build_report(open_lake(**small_drive), {}).quality["drives"]
+    drives = build_report(open_lake(**small_drive), {}, drive_scores=[make_scores("ctrv")]).quality["drives"]
     for name, rows in drives.items():
         assert rows
         documented = set(re.findall(rf"`drives\.{name}\[\]\.(\w+)", page))
