@@ -29,9 +29,9 @@ from tracklake.schemas.text import make_visible
 
 TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
-LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".bag", ".db3", ".mcap", ".zstd", ".yaml")
-"""Endings of an instrumented vehicle's logs."""
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
+LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".db3", ".zstd", ".yaml")
+"""Endings of an instrumented vehicle's logs that other files have, too."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", ".bag", ".mcap", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""
 PROSE = (".txt", ".dat", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
 """Endings that other files share: an unrecognised file with one is skipped and named, not refused."""

@@ -103,11 +103,25 @@ def test_what_is_no_log_of_a_drive_is_skipped_or_named(tmp_path, put):
     put("trip/a.csv", write_line())
     put("trip/notes.json", '{"name": "my drive"}')
     put("trip/other.csv", "a,b,c\n1,2,3\n")
+    put("trip/copy.bag")
     found = find(tmp_path)
     assert found.skipped == ("trip/notes.json",)
-    (refusal,) = found.refusals
-    assert "trip/other.csv, line 1: not a known trajectory file" in refusal
-    assert "BsmP1" in refusal
+    empty, unknown = found.refusals
+    assert "trip/copy.bag: empty file" in empty
+    assert "trip/other.csv, line 1: not a known trajectory file" in unknown
+    assert "BsmP1" in unknown
+
+
+def test_a_name_of_the_users_is_for_one_drive(tmp_path, put):
+    put("trip/a.csv", write_line())
+    given = {"digest": Digests(tmp_path / "lake"), "recording": "monday"}
+    assert [unit.recording for _, unit in discover(tmp_path / "source", **given).units] == ["monday"]
+    put("other/a.csv", write_line())
+    found = discover(tmp_path / "source", **given)
+    assert found.units == ()
+    assert found.refusals == (
+        "--recording monday: names one drive, and SOURCE holds 2: other, trip. Give the folder of one of them.",
+    )
 
 
 def test_logs_of_which_nothing_is_usable_are_refused(tmp_path, put):
