@@ -92,7 +92,9 @@ def open_bag(file: RawFile) -> Iterator[OpenBag]:
         with _explain_damage(file, magic, 0):
             reader = _make_reader(path, magic, budget)
             reader.open()
-        stack.callback(reader.close)
+            stack.callback(reader.close)
+            if magic == MCAP_MAGIC:  # many entries of its index may lead to one chunk
+                budget.spend(sum(chunk.uncompressed_size for chunk in reader.chunks))
         connections = [own for own in reader.connections if getattr(own.ext, "serialization_format", "cdr") == "cdr"]
         counts: dict[tuple[str, str], int] = {}
         for own in reader.connections:
@@ -112,7 +114,7 @@ def _make_reader(path: Path, magic: bytes, budget: _Budget) -> _Reader:
 
     if magic == SQLITE_MAGIC:
         _refuse_programs(path)
-        return storage_sqlite3.Sqlite3Reader(Path(quote(str(path))))  # the path becomes part of a URI
+        return storage_sqlite3.Sqlite3Reader(Path(_quote_path(path)))  # the path becomes part of a URI
     if magic == MCAP_MAGIC:
         # The library unpacks a chunk whatever its size; these bound it, and refuse the same chunks otherwise.
         storage_mcap.DECOMPRESSORS.update(dict.fromkeys(("lz4", "zstd"), _unpack_mcap))
@@ -148,7 +150,7 @@ def _read(
             if item is None:
                 return
             connection, bag_ns, raw = item
-            if raw[:4] == ZSTD_MAGIC:  # no message begins so: that of ROS 2 begins with its encoding
+            if magic != ROS1_MAGIC and raw[:4] == ZSTD_MAGIC:  # no message of ROS 2 begins so
                 raw = unpack_data(raw)
             budget.spend(len(raw))
         yield Record(connection.topic, connection.msgtype, bag_ns // 1000, raw)
@@ -213,7 +215,7 @@ def _unpack(file: RawFile, stack: ExitStack) -> Path:
 
 def _refuse_programs(path: Path) -> None:
     """Refuse a database that computes its rows: reading them can take any time and memory."""
-    database = sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)
+    database = sqlite3.connect(f"file:{_quote_path(path)}?immutable=1", uri=True)
     try:
         database.execute("PRAGMA trusted_schema = OFF")
         names = database.execute("SELECT type, name, sql FROM sqlite_master").fetchall()
@@ -225,6 +227,10 @@ def _refuse_programs(path: Path) -> None:
                 raise ValueError(f"its {kind} {name} is computed, which no recorder makes")
     finally:
         database.close()
+
+
+def _quote_path(path: Path) -> str:
+    return quote(path.as_posix(), safe="/:")
 
 
 def _quote_name(name: str) -> str:

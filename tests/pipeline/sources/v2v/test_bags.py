@@ -32,7 +32,10 @@ MAKE = MessageMaker(make_store(1), 1)
 )
 def test_what_was_written_is_read(tmp_path: Path, version: Literal[1, 2], options: dict[str, Any]) -> None:
     """Axes, angles and units come back as those of the tables, whatever the format."""
-    files = list_files(write_small_bag(tmp_path / ("a.bag" if version == 1 else "a"), version, **options))
+    folder = tmp_path / "50 % ?mode=rw#"  # no part of it is one of a URI
+    folder.mkdir()
+    name = "a.bag" if version == 1 else "a"
+    files = list_files(write_small_bag(tmp_path / name, version, **options).rename(folder / name))
     bag = read_bag(files)
 
     assert_frame_equal(bag.ego.select(EGO.columns), EGO, check_dtypes=False, rel_tol=1e-6)
