@@ -121,7 +121,7 @@ def cluster_returns(scan: Scan, chosen: Integers) -> Integers:
     cell = np.rint(_scale(scan, chosen) / CELL).astype(np.int64)
     _, first, of_cell = np.unique((cell + 2**19) @ 2 ** np.array([40, 20, 0]), return_index=True, return_inverse=True)
     with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
-        _, label = dbscan(cell[first] * CELL, eps=1.0, min_samples=1, algorithm="brute")
+        _, label = dbscan(cell[first] * CELL, eps=1.0, min_samples=1, algorithm="ball_tree")  # no threads that wait
     label = label[of_cell]
     nearest = np.full(label.max() + 1, np.inf)
     np.minimum.at(nearest, label, scan.range_m[chosen])
