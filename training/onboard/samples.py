@@ -113,8 +113,9 @@ def build_samples(
     """Build the samples of any number of drives from `surrounding`, `surrounding_truth` and `drives`.
 
     Vehicles of drives with a truth need a true vehicle: the one of the same `vehicle_id` or, for one that only LiDAR
-    saw, the one that was nearest most often, within GATE_M. Where `without_future` is set, other vehicles are samples,
-    too: their places are NaN, their `vehicle` is empty, and their `track` -1 where no true vehicle is theirs.
+    saw, the one that was nearest most often, at ticks where that is within GATE_M. Where `without_future` is set, other
+    vehicles are samples, too: their places are NaN, their `vehicle` is empty, and their `track` is -1 where no true
+    vehicle is theirs.
     """
     history, future = protocol.history_ticks, protocol.horizon_ticks
     futures = _list_futures(surrounding, truth)
@@ -174,6 +175,11 @@ def describe_truth(truth: pl.DataFrame) -> pl.DataFrame:
     )
 
 
+_DISTANCE_M = (
+    (pl.col("rel_x_m") - pl.col("rel_x_m_true")) ** 2 + (pl.col("rel_y_m") - pl.col("rel_y_m_true")) ** 2
+).sqrt()
+
+
 def _list_futures(surrounding: pl.DataFrame, truth: pl.DataFrame) -> pl.DataFrame:
     """List places, speeds and lanes by drive, track and tick, sorted: true ones where a drive has a truth."""
     true = truth.select(
@@ -200,10 +206,13 @@ def _list_futures(surrounding: pl.DataFrame, truth: pl.DataFrame) -> pl.DataFram
 
 def _add_tracks(surrounding: pl.DataFrame, truth: pl.DataFrame, futures: pl.DataFrame) -> pl.DataFrame:
     """Add to each row the track of its future and that track's number, `code`; null where there is none."""
-    links = match_truth(surrounding, truth)
-    rows = surrounding.join(links, on=TRACK, how="left")
+    places = truth.select("subset", "truth_id", "tick", "rel_x_m", "rel_y_m")
+    rows = surrounding.join(match_truth(surrounding, truth), on=TRACK, how="left")
+    rows = rows.join(places, on=("subset", "truth_id", "tick"), how="left", suffix="_true")
+    strays = (pl.col("vehicle_id") >= FIRST_LIDAR_ID) & (_DISTANCE_M >= GATE_M)
     has_truth = pl.col("subset").is_in(truth["subset"].unique().implode())
-    rows = rows.with_columns(pl.when(has_truth).then("truth_id").otherwise("vehicle_id").cast(pl.Int64).alias("track"))
+    own = pl.when(has_truth & ~strays.fill_null(value=False)).then("truth_id").when(~has_truth).then("vehicle_id")
+    rows = rows.with_columns(own.cast(pl.Int64).alias("track"))
     return rows.join(futures.select("subset", "track", "code").unique(), on=("subset", "track"), how="left")
 
 
@@ -217,9 +226,8 @@ def match_truth(surrounding: pl.DataFrame, truth: pl.DataFrame) -> pl.DataFrame:
     pairs = unsent.select(*TRACK, "tick", "rel_x_m", "rel_y_m", strip=strip).join(
         true.explode("strip"), on=("subset", "tick", "strip"), suffix="_true"
     )
-    away = [pl.col(name) - pl.col(f"{name}_true") for name in ("rel_x_m", "rel_y_m")]
     near = (
-        pairs.with_columns((away[0] ** 2 + away[1] ** 2).sqrt().alias("distance_m"))
+        pairs.with_columns(_DISTANCE_M.alias("distance_m"))
         .filter(pl.col("distance_m") < GATE_M)
         .sort("distance_m", "truth_id")
         .unique([*TRACK, "tick"], keep="first", maintain_order=True)

@@ -117,6 +117,16 @@ def test_vehicles_that_only_lidar_saw_are_matched_by_place():
     assert left_out["no true vehicle"] > 0
 
 
+def test_a_vehicle_that_only_lidar_saw_is_no_true_one_where_it_has_strayed():
+    surrounding, truth, drives = make_drive([{}], ticks=80, ids=[FIRST_LIDAR_ID])
+    strayed = surrounding.with_columns(pl.col("rel_x_m") + 3.1 * (pl.col("tick") >= 50))
+    samples, left_out = build_samples(strayed, truth, drives)
+    assert samples.tick.tolist() == [20, 25, 30, 35, 40, 45]
+    assert left_out["no true vehicle"] == 6
+    sends, truth, drives = make_drive([{}], ticks=80, ids=[1])  # its messages name it, wherever they place it
+    assert len(build_samples(sends.with_columns(pl.col("rel_x_m") + 9), truth, drives).samples) == 8
+
+
 def test_slowing_is_judged_at_the_horizon():
     samples = build_samples(*make_drive([{"accel": -0.5}, {"accel": 0.5}, {}], ticks=41)).samples
     assert samples.slowing.tolist() == [True, False, False]
