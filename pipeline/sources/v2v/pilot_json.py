@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import duckdb
 import polars as pl
@@ -44,13 +45,12 @@ CORE_DATA = {
     "size": dict.fromkeys(("width", "length"), "VARCHAR"),
 }
 """Keys of the core data in both dialects; every value is read as text."""
-MESSAGE = {"BasicSafetyMessage": {"coreData": CORE_DATA}}
+MESSAGE = {"BasicSafetyMessage": {"coreData": "JSON"}}
+"""Where a message frame has its core data."""
 METADATA = ("bsmSource", "recordType", "recordGeneratedAt", "odeReceivedAt", "logFileName", "originIp", "asn1")
 STRUCTURE = {
     "metadata": {**dict.fromkeys(METADATA, "VARCHAR"), "receivedMessageDetails": {"rxSource": "VARCHAR"}},
-    "payload": {
-        "data": {"coreData": CORE_DATA, "value": MESSAGE, "MessageFrame": {"value": MESSAGE}, "bytes": "VARCHAR"}
-    },
+    "payload": {"data": {"coreData": "JSON", "value": MESSAGE, "MessageFrame": {"value": MESSAGE}, "bytes": "VARCHAR"}},
 }
 """Keys of a record that are read, in each of the places where a pilot has its core data."""
 QUANTITIES: Mapping[str, tuple[str, str, float]] = {
@@ -77,12 +77,13 @@ UNKNOWN_WORDS = ("", "unavailable", *NULL_WORDS)
 """Texts in lower case that stand for a number that is not known."""
 PARSING_THREADS = 2
 """Chunks of lines that are parsed at once."""
+SERIAL: dict[str, str | bool | int | float | list[str]] = {"threads": 1}
+"""Settings of DuckDB, which parses the JSON: a chunk in one thread."""
 
 
 def _write_query(*, checked: bool) -> str:
     """Write the statement that turns lines of JSON into columns of text; unchecked, it fails where one is no JSON."""
-    structure = json.dumps(STRUCTURE)
-    record = f"json_transform(text, '{structure}')"
+    record = f"json_transform(text, '{json.dumps(STRUCTURE)}')"
     cells = dict.fromkeys([key for decoded, raw, _ in QUANTITIES.values() for key in (decoded, raw)])
     core = [f'core.{cell} AS "{cell}"' for cell in (*cells, "msgCnt", "id", "secMark", "transmission")]
     return f"""
@@ -91,15 +92,16 @@ def _write_query(*, checked: bool) -> str:
         parts AS (SELECT line, record IS NULL AS unread, record.metadata AS meta, record.payload.data.bytes AS bytes,
                          coalesce(record.payload.data.coreData,
                                   record.payload.data.value.BasicSafetyMessage.coreData,
-                                  record.payload.data.MessageFrame.value.BasicSafetyMessage.coreData) AS core
-                  FROM records)
+                                  record.payload.data.MessageFrame.value.BasicSafetyMessage.coreData) AS found
+                  FROM records),
+        messages AS (SELECT *, json_transform(found, '{json.dumps(CORE_DATA)}') AS core FROM parts)
         SELECT line, unread, core IS NULL AS no_core, coalesce(bytes, meta.asn1) AS hex,
                coalesce(nullif(meta.recordGeneratedAt, ''), meta.odeReceivedAt) AS time,
                meta.logFileName AS log_name, meta.originIp AS origin,
                coalesce(upper(meta.receivedMessageDetails.rxSource) = 'RSU', false) AS roadside,
                coalesce(upper(meta.bsmSource) = 'EV', false) OR coalesce(meta.recordType = 'bsmTx', false) AS sent,
                {", ".join(core)}
-        FROM parts"""
+        FROM messages"""
 
 
 UNCHECKED, CHECKED = _write_query(checked=False), _write_query(checked=True)
@@ -117,7 +119,8 @@ def read_pilot_json(file: RawFile) -> RawMessages:
     Raises:
         SourceError: a compressed file is damaged.
     """
-    chunks = list(map_lines(file, _read_chunk, threads=PARSING_THREADS))
+    with duckdb.connect(config=SERIAL) as connection:
+        chunks = list(map_lines(file, partial(_read_chunk, connection), threads=PARSING_THREADS))
     return collect_messages(
         file,
         [frame for frame, _ in chunks],
@@ -127,11 +130,13 @@ def read_pilot_json(file: RawFile) -> RawMessages:
     )
 
 
-def _read_chunk(number: int, data: bytes, first_line: int) -> tuple[pl.DataFrame, Lines]:
+def _read_chunk(
+    connection: duckdb.DuckDBPyConnection, number: int, data: bytes, first_line: int
+) -> tuple[pl.DataFrame, Lines]:
     if number == 0 and _is_spread(data):
         data = data.replace(b"\r", b" ").replace(b"\n", b" ")
     lines = screen_lines(data, first_line)
-    kept, refused = _convert_records(lines.usable)
+    kept, refused = _convert_records(connection, lines.usable)
     return kept, replace(lines, rejects=pl.concat([lines.rejects, refused]))
 
 
@@ -142,16 +147,17 @@ def decode_texts(texts: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
         messages in MESSAGE_SCHEMA, and `line`, `reason`, `text` of the texts that are none.
     """
     is_json = pl.col("text").str.strip_chars_start().str.starts_with("{")
-    parts = [_convert_records(texts.filter(is_json)), convert_hex_lines(texts.filter(~is_json))]
+    with duckdb.connect(config=SERIAL) as connection:
+        parts = [_convert_records(connection, texts.filter(is_json)), convert_hex_lines(texts.filter(~is_json))]
     kept, impossible, _ = split_impossible(
         pl.concat([frame for frame, _ in parts], how="diagonal").sort(LINE), lambda _numbers: texts.select(LINE, "text")
     )
     return kept, pl.concat([*(rejects for _, rejects in parts), impossible]).sort(LINE)
 
 
-def _convert_records(lines: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _convert_records(connection: duckdb.DuckDBPyConnection, lines: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Convert lines of JSON (`line`, `text`) to messages, and to the rejects of the others."""
-    rows = _parse_lines(lines)
+    rows = _parse_lines(connection, lines)
     messages = pl.concat([_convert_core(rows), _convert_hex(rows)], how="diagonal")
     other = rows.filter(pl.col("no_core") & pl.col("hex").is_null()).select(
         LINE, reason=pl.when("unread").then(pl.lit("no JSON object")).otherwise(pl.lit("no basic safety message"))
@@ -167,14 +173,14 @@ def _is_spread(data: bytes) -> bool:
     return bool(rest) and not first.rstrip().endswith(b"}") and not rest.lstrip().startswith(b"{")
 
 
-def _parse_lines(lines: pl.DataFrame) -> pl.DataFrame:
+def _parse_lines(connection: duckdb.DuckDBPyConnection, lines: pl.DataFrame) -> pl.DataFrame:
     """Parse lines of JSON to columns of text; `unread` marks those that are no JSON."""
-    with duckdb.connect(config={"threads": 1}) as connection:
-        connection.register("lines", lines.to_arrow())
+    with connection.cursor() as cursor:
+        cursor.register("lines", lines.to_arrow())
         try:
-            table = connection.execute(UNCHECKED).to_arrow_table()
+            table = cursor.execute(UNCHECKED).to_arrow_table()
         except duckdb.InvalidInputException:
-            table = connection.execute(CHECKED).to_arrow_table()
+            table = cursor.execute(CHECKED).to_arrow_table()
     return pl.DataFrame(pl.from_arrow(table))
 
 
