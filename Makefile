@@ -3,6 +3,7 @@
 # make test-lowest  the core's tests with the lowest versions that pyproject.toml admits
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
+# make onboard-study   what an on-board view costs: docs/onboard-view.md (a quarter of an hour)
 # make study   every model under every protocol, three seeds: docs/results.md (hours)
 # make docs    pages derived from the code
 # make clean   removes the environment and caches, never data
@@ -14,7 +15,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 ARGS ?=
 
-.PHONY: install run test test-lowest lint bench study docs clean
+.PHONY: install run test test-lowest lint bench study onboard-study docs clean
 
 install: $(INSTALLED)
 
@@ -62,6 +63,9 @@ bench: install
 
 study: install
 	$(BIN)/python benchmarks/study.py $(ARGS)
+
+onboard-study: install
+	$(BIN)/python benchmarks/study_onboard.py $(ARGS)
 
 docs: install
 	$(BIN)/python -m tracklake.schemas.markdown > docs/tables.md
