@@ -1,18 +1,17 @@
 """Which returns of a LiDAR scan belong to which vehicle, and where that vehicle therefore is.
 
-Clusters are assigned first to vehicles that send messages, then to those that only LiDAR saw before; what remains are
-new vehicles, or no vehicles. Each assignment is gated and the most likely as a whole (the Hungarian method). A vehicle
-then takes all returns within its box, from whatever cluster; what its clusters hold beyond is clustered again and
-offered to the others. So a cluster of two vehicles is parted, and a vehicle in two clusters is joined.
+The assignment of clusters to expected vehicles is gated, and the most likely as a whole (the Hungarian method). A
+vehicle then takes all returns within its box, from whatever cluster; what its clusters hold beyond is clustered again
+and offered to the others. So a cluster of two vehicles is parted, and a vehicle in two clusters is joined. What remains
+are new vehicles, or no vehicles.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.pipeline.transforms.onboard.boxes import Boxes, Returns, locate_boxes
+from tracklake.pipeline.transforms.onboard.boxes import Boxes, Returns, locate_boxes, make_no_boxes, pick_boxes
 from tracklake.pipeline.transforms.onboard.clusters import (
     HIDING_M,
     Scan,
@@ -95,11 +94,8 @@ def measure_by_lidar(
         np.full(vehicles, -1),
         np.zeros(vehicles, np.int64),
     )
-    sends = predicted.vehicle_id < FIRST_LIDAR_ID
-    for stage in (np.flatnonzero(sends), np.flatnonzero(~sends)):
-        _choose(scan, shifted, stage, choice)
-    found = np.flatnonzero(np.bincount(choice.vehicle + 1, minlength=vehicles + 1)[1:])
-    boxes = _locate_chosen(scan, shifted, found, choice.vehicle)
+    _choose(scan, shifted, choice)
+    found, boxes, gate = _locate_chosen(scan, shifted, choice)
     group, new, new_boxes = _find_new(scan, choice, boxes, shifted.heading_rad[found])
     cluster = np.concatenate([np.arange(found.size), new + found.size])
     offset = boxes.centre_m - shifted.centre_m[found]
@@ -116,8 +112,6 @@ def measure_by_lidar(
     label = np.where(choice.vehicle >= 0, number[choice.vehicle] if vehicles else -1, group + found.size)
     count = int(label.max() + 1) if label.size else 0
     unknown = np.full(new.size, np.nan)
-    spread = shifted.covariance_m2[found] + boxes.covariance_m2
-    gate = _square(offset, spread)
     return LidarMeasurement(
         measured,
         describe_clusters(points, label[joined], count),
@@ -131,22 +125,27 @@ def measure_by_lidar(
     )
 
 
-def _choose(scan: Scan, predicted: Predicted, stage: Integers, choice: _Choice) -> None:
-    """Assign clusters to the vehicles of one stage until none wants one; write `choice`."""
+def _choose(scan: Scan, predicted: Predicted, choice: _Choice) -> None:
+    """Assign clusters to vehicles until none wants one; write `choice`."""
     for turn in range(ROUNDS):
-        waiting = stage[choice.main[stage] < 0]
+        waiting = np.flatnonzero(choice.main < 0)
         vehicle, segment, mean, boxes = _measure_pairs(scan, predicted, waiting, choice)
         if not vehicle.size:
             return
         row, column, gated = _assign(scan, predicted, vehicle, segment, mean, boxes)
         if turn == 0:
-            choice.candidates[stage] = np.bincount(vehicle[gated], minlength=choice.main.size)[stage]
+            choice.candidates = np.bincount(vehicle[gated], minlength=choice.main.size)
         if not row.size:
             return
-        choice.main[row] = column
         chosen = np.flatnonzero(gated)
         pair = chosen[_find_pairs(vehicle[chosen], segment[chosen], row, column)]
-        parted = _absorb(scan, choice, row, _pick(boxes, pair), predicted.heading_rad[row])
+        # A small cluster within the box of another vehicle with a larger one is a part of that vehicle.
+        returns = np.bincount(choice.segment[choice.vehicle < 0])[column]
+        inside = _measure_depth(mean[pair], pick_boxes(boxes, pair), predicted.heading_rad[row]) <= 0
+        own = ~(inside & (returns > returns[:, None])).any(1)
+        row, column, pair = row[own], column[own], pair[own]
+        choice.main[row] = column
+        parted = _absorb(scan, choice, row, pick_boxes(boxes, pair), predicted.heading_rad[row])
         if not parted:
             return
 
@@ -159,7 +158,7 @@ def _measure_pairs(
     Returns:
         (R,) vehicles and clusters, the means of these, and where each vehicle would be.
     """
-    nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), _no_boxes()
+    nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), make_no_boxes()
     free = np.flatnonzero(choice.vehicle < 0)
     if not (free.size and waiting.size):
         return nothing
@@ -302,16 +301,24 @@ def _measure_depth(place: Floats, boxes: Boxes, heading: Floats, margin_m: float
     return result
 
 
-def _locate_chosen(scan: Scan, predicted: Predicted, found: Integers, vehicle: Integers) -> Boxes:
-    """Measure the vehicles with returns by all that they have."""
-    if not found.size:
-        return _no_boxes()
-    taken = np.flatnonzero(vehicle >= 0)
-    order = taken[np.argsort(vehicle[taken], kind="stable")]
-    owner = np.searchsorted(found, vehicle[order])
-    count = np.bincount(owner)
+def _locate_chosen(scan: Scan, predicted: Predicted, choice: _Choice) -> tuple[Integers, Boxes, Floats]:
+    """Measure the vehicles by all returns that they took, and take these from vehicles that they put out of the gate.
+
+    Returns:
+        The measured vehicles, where they are, and squared Mahalanobis distances from where they were expected.
+    """
+    taken = np.flatnonzero(choice.vehicle >= 0)
+    if not taken.size:
+        return np.empty(0, np.int64), make_no_boxes(), np.empty(0)
+    order = taken[np.argsort(choice.vehicle[taken], kind="stable")]
+    found, owner, count = np.unique(choice.vehicle[order], return_inverse=True, return_counts=True)
     hidden = _find_hidden(scan, order, np.cumsum(count) - count, count)
-    return _locate(scan, order, owner, hidden, predicted, found, whole=True)
+    boxes = _locate(scan, order, owner, hidden, predicted, found, whole=True)
+    spread = predicted.covariance_m2[found] + boxes.covariance_m2
+    square = _square(boxes.centre_m - predicted.centre_m[found], spread)
+    stays = np.flatnonzero(square <= GATE)
+    choice.vehicle[~np.isin(choice.vehicle, found[stays])] = -1
+    return found[stays], pick_boxes(boxes, stays), square[stays]
 
 
 def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tuple[Integers, Integers, Boxes]:
@@ -326,7 +333,7 @@ def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tup
     group = np.zeros(choice.vehicle.size, np.int64)
     free = np.flatnonzero(choice.vehicle < 0)
     if not free.size:
-        return group, np.empty(0, np.int64), _no_boxes()
+        return group, np.empty(0, np.int64), make_no_boxes()
     owner = cluster_returns(scan, free)
     boxes, mean = _locate_new(scan, free, owner, whole=False)
     straight = np.zeros(len(mean))
@@ -343,7 +350,7 @@ def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tup
         vehicle &= (_measure_depth(mean, known, heading, NEAR_BOX_M) > 0).all(1)
     group[free] = owner
     new = np.flatnonzero(vehicle)
-    return group, new, _pick(boxes, new)
+    return group, new, pick_boxes(boxes, new)
 
 
 def _locate_new(scan: Scan, free: Integers, owner: Integers, whole: bool) -> tuple[Boxes, Floats]:
@@ -373,7 +380,7 @@ def _is_vehicle(boxes: Boxes, mean: Floats, returns: Integers) -> Flags:
     barrier = (long > LONGEST_M) | ((long > LONG_M) & (boxes.height_m < LONG_HEIGHT_M))
     fits = ~barrier & (wide <= WIDEST_M) & (np.maximum(long, wide) >= NARROWEST_M)
     if barrier.any():
-        line = _pick(boxes, np.flatnonzero(barrier))
+        line = pick_boxes(boxes, np.flatnonzero(barrier))
         line.size_m[:, 0] += 2 * BARRIER_GAP_M
         fits &= (_measure_depth(mean, line, np.zeros(line.side.size), 0.0) > 0).all(1)
     return np.asarray(fits & (returns >= LEAST_RETURNS) & (np.abs(mean[:, 1]) <= ROADSIDE_M))
@@ -384,15 +391,3 @@ def _square(offset: Floats, covariance: Floats) -> Floats:
     solved = np.linalg.solve(covariance, offset[..., None])[..., 0]
     result: Floats = (offset * solved).sum(-1)
     return result
-
-
-def _pick(boxes: Boxes, rows: Integers) -> Boxes:
-    """Return some of the boxes."""
-    fields: Mapping[str, npt.NDArray[np.generic]] = vars(boxes)
-    return Boxes(**{name: values[rows] for name, values in fields.items()})  # type: ignore[arg-type]  # all are arrays
-
-
-def _no_boxes() -> Boxes:
-    """Return boxes of no vehicles."""
-    pair = np.empty((0, 2))
-    return Boxes(pair, np.empty((0, 2, 2)), pair, pair, pair, np.empty(0), np.empty(0), np.empty(0, np.int64))

@@ -12,10 +12,12 @@ Per axis, the centre follows from both edges and the size by generalised least s
 both edges are seen, and counts where one is.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 
 from tracklake.schemas.arrays import Flags, Floats, Integers
 
@@ -274,3 +276,15 @@ def _combine(
     surprise = excess[:, 1] ** 2 / total[:, 1]
     # A cluster of two vehicles is wider than one: that alone does not exclude it.
     return centre, variance, best, best_sd, np.where(excess[:, 1] > 0, np.minimum(surprise, WIDER), surprise)
+
+
+def pick_boxes(boxes: Boxes, rows: Integers) -> Boxes:
+    """Return some of the boxes."""
+    fields: Mapping[str, npt.NDArray[np.generic]] = vars(boxes)
+    return Boxes(**{name: values[rows] for name, values in fields.items()})  # type: ignore[arg-type]  # all are arrays
+
+
+def make_no_boxes() -> Boxes:
+    """Return boxes of no vehicles."""
+    pair = np.empty((0, 2))
+    return Boxes(pair, np.empty((0, 2, 2)), pair, pair, pair, np.empty(0), np.empty(0), np.empty(0, np.int64))

@@ -75,7 +75,8 @@ def match_stations(tracks: Tracks, heard: Flags) -> Integers:
     away, total = away[near.any(1)][:, near.any(0)], total[near.any(1)][:, near.any(0)]
     common_m2 = float(np.median(tracks.offset_m[stations]) ** 2) / 2
     known_m, rest_m2 = _find_common_shift(tracks, common_m2)
-    total[..., [0, 1], [0, 1]] -= np.minimum(common_m2, 0.5 * tracks.offset_m[stations] ** 2)[None, :, None]
+    own_m2 = tracks.covariance[stations][:, [0, 1], [0, 1]]  # less than the shift's where LiDAR saw the station before
+    total[..., [0, 1], [0, 1]] -= np.minimum(common_m2, 0.4 * own_m2)[None]
     pairs, cost = _try_shifts(away, total, known_m, rest_m2)
     best = int(np.argmin(cost))
     rivals = np.where(pairs == pairs[best], np.inf, cost[:, None]).min(0)  # the best that has another partner, (S,)
