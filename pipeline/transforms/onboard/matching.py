@@ -143,7 +143,7 @@ def _try_shifts(away: Floats, total: Floats, known_m: Floats, rest_m2: float) ->
 def find_contradicted(tracks: Tracks) -> Flags:
     """Tell which stations were assigned another vehicle's clusters: their messages contradict what LiDAR sees."""
     far = np.hypot(*tracks.state[:, OFFSET].T) > FARTHEST_OFFSET * tracks.offset_m
-    contradicted: Flags = is_station(tracks) & ~is_loose(tracks) & (far | (tracks.strikes >= STRIKES))
+    contradicted: Flags = is_station(tracks) & (far | (~is_loose(tracks) & (tracks.strikes >= STRIKES)))
     return contradicted
 
 

@@ -6,7 +6,7 @@ of them. Positions are in the ego's frame of odometry inside, and in the ego's f
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -247,8 +247,10 @@ class Tracker:
             return
         inside = slice(first[image], first[image + 1])
         ego_m, yaw = self._find_pose(tick, moment_s - times[image])
-        expected = self._expect(np.arange(len(self._tracks.chain)), ego_m, yaw, moment_s - times[image])
+        asked = np.flatnonzero(~is_loose(self._tracks) & (self._tracks.vehicle_id != TENTATIVE))
+        expected = self._expect(asked, ego_m, yaw, moment_s - times[image])
         found = self._sensors.match_boxes(boxes[inside], self._sensors.camera, expected)
+        found = replace(found, row=np.where(found.row >= 0, np.append(asked, -1)[found.row], -1))
         rows, used = update_by_camera(self._tracks, found, self._sensors.camera, ego_m, yaw)
         log.note_boxes(self._tracks.chain[rows], numbers[inside][used])
 
