@@ -20,13 +20,7 @@ from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Model, Predictor, Reads, find_model, require_torch
 from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.checkpoint import (
-    CHECKPOINT_FILE,
-    claim_folder,
-    read_checkpoint,
-    restore,
-    save_checkpoint,
-)
+from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, claim_folder, read_checkpoint, restore, save_checkpoint
 from tracklake.training.runs.config import Plan, TrainConfig, make_plan
 from tracklake.training.runs.progress import COLUMNS, Row, TrainingState, open_log
 from tracklake.training.runs.run_folder import describe_run, refuse_other_run, save_run

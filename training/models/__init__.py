@@ -117,11 +117,8 @@ def _check_parameter(what: str, value: object, kind: type) -> None:
         raise UsageError(f"{what}: expected {kind.__name__} from 0 to {MAX_PARAMETER:,}, got {str(value)[:60]}")
 
 
-DEO, BAR_SHALOM, SCHUBERT = (
-    references.DEO.name,
-    f"{references.BAR_SHALOM.name}, section 6.2.2",
-    references.SCHUBERT.name,
-)
+BAR_SHALOM = f"{references.BAR_SHALOM.name}, section 6.2.2"
+DEO, SCHUBERT = references.DEO.name, references.SCHUBERT.name
 KIM, CHOI = references.KIM.name, references.CHOI.name
 """Publications of the models, by name."""
 
