@@ -1,4 +1,4 @@
-"""Which returns of a LiDAR scan belong to which vehicle, and where that vehicle therefore is.
+"""Assignment of LiDAR returns to vehicles, and the positions of these that follow from it.
 
 The assignment of clusters to expected vehicles is gated, and the most likely as a whole (the Hungarian method). A
 vehicle then takes all returns within its box, from whatever cluster; what its clusters hold beyond is clustered again
@@ -268,7 +268,7 @@ def _find_pairs(vehicle: Integers, segment: Integers, row: Integers, column: Int
 
 
 def _absorb(scan: Scan, choice: _Choice, row: Integers, boxes: Boxes, heading: Floats) -> bool:
-    """Give vehicles the free returns within their boxes, and cluster anew what their clusters hold beyond.
+    """Give vehicles the free returns within their boxes, and cluster again what their clusters hold beyond.
 
     Returns:
         Whether such returns remain.

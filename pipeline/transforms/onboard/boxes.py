@@ -157,7 +157,7 @@ def _assume_size(given: Floats, known: Flags, top: Floats, extent: Floats) -> tu
 
 @dataclass(frozen=True)
 class _Faces:
-    """Which returns lie on the face across (rear or front) and on that along the vehicle (left or right)."""
+    """Returns on the face across a vehicle (rear or front) and on that along it (left or right)."""
 
     across_seen: Flags
     """(K,) whether the scanner is behind or ahead of the box."""

@@ -1,4 +1,4 @@
-"""Which camera box shows which predicted vehicle, and the bearing and rough range that the box gives.
+"""Assignment of camera boxes to predicted vehicles, and the bearing and rough range that a box gives.
 
 Predicted vehicles are projected as boxes that stand on flat ground, by a pinhole that looks along the ego's axis.
 """
