@@ -62,7 +62,7 @@ STATIONS = Table(
         "invalid": column(pl.Int64, "messages dropped for an impossible position or time", ge=0),
         "lost": column(
             pl.Int64,
-            "messages missing by the counter, which runs from 0 to 127, and by the elapsed time where it wraps",
+            "messages missing by the counter, which runs from 0 to 127; a silence of more than 12.8 s counts none",
             ge=0,
         ),
         "clock_steps": column(pl.Int64, "times the sender's clock jumped against the receiver's", ge=0),

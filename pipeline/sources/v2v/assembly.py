@@ -171,15 +171,15 @@ def _number_vehicles(kept: pl.DataFrame) -> tuple[pl.DataFrame, int]:
 def _count_lost() -> pl.Expr:
     """Return the messages missing before each one, of messages sorted by vehicle and time.
 
-    The counter tells how many, modulo 128, and the elapsed time at 10 Hz how often it wrapped. A temporary id begins
-    with any number; a counter that never moves tells nothing.
+    The counter tells how many. After a silence in which it went round, 12.8 s, nothing does: the vehicle may have been
+    out of reach or parked, for hours. A temporary id begins with any number; a counter that never moves tells nothing.
     """
     count = pl.col("message_count").cast(pl.Int32)
     steps = (count.diff() + COUNTS) % COUNTS
     sent = pl.col("utc_us").diff() * (RATE_HZ / 1e6)
     wraps = ((sent - steps) / COUNTS).round().cast(pl.Int32)
     moves = (count.max() > count.min()).fill_null(value=False)
-    lost = pl.when(moves).then((steps + COUNTS * wraps - 1).clip(0))
+    lost = pl.when(moves & (sent <= COUNTS)).then((steps + COUNTS * wraps - 1).clip(0))
     return lost.over("vehicle_id", "temporary_id").fill_null(0).cast(pl.Int32)
 
 

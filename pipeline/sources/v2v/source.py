@@ -21,7 +21,8 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     """Turn the logs of a folder into drives: one, or one per receiver where a log has the messages of several.
 
     Raises:
-        SourceError: a file cannot be read, no record states a time, or the truth of one drive lies beside several.
+        SourceError: a file cannot be read, no record states a time, the truth of one drive lies beside several, or
+            a drive has several truths.
         MissingExtraError: the library for bags is not installed.
     """
     logs = read_logs(parts)
@@ -31,6 +32,12 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         raise SourceError(
             f"recording {recording}: {truth} is the truth of one drive, and the logs beside it are of {len(names)} "
             f"receivers ({', '.join(names.values())}). Give each its own folder."
+        )
+    if len(logs.truths) > 1:
+        found = " and ".join(part.file.name for part in parts if part.file.dialect == TRUTH)
+        raise SourceError(
+            f"recording {recording}: {found} are truths of one drive. Expected one; remove the others, or give each "
+            "drive its own folder."
         )
     drives, notes, dropped = [], list(logs.notes), [pl.DataFrame(schema=DROPPED_SCHEMA)]
     files = [part.file for part in parts]

@@ -255,8 +255,13 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"truth\.csv is the truth of one drive, .* 2 receivers"):
         ingest.build(tmp_path / "lake", job)
-    for name in ("a", "b"):
-        (tmp_path / "source" / "trip" / f"{name}.csv").unlink()
+    (tmp_path / "source" / "trip" / "b.csv").unlink()
+    second = put("trip/truth2.csv", "# tracklake drive truth, start_us=1072915200100000\n", header, *rows)
+    (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
+    with pytest.raises(SourceError, match=r"truth\.csv and trip/truth2\.csv are truths of one drive"):
+        ingest.build(tmp_path / "lake", job)
+    for path in (second, second.with_name("a.csv")):
+        path.unlink()
     put("trip/truth.csv", "# tracklake drive truth\n", header, *rows)
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"got none \(trip/truth\.csv\)\. Give all files of the recording"):
