@@ -57,6 +57,7 @@ def date_messages(messages: pl.DataFrame) -> pl.DataFrame:
         sender's clock tells when a message was generated). `utc_us` is that moment, less the clock's steps against the
         receiver's, else the moment of reception; null where nothing tells.
     """
+    messages = _find_devices(messages)
     dated = messages.with_columns(
         find_generation_times(messages),
         *_name_senders(),
@@ -73,6 +74,16 @@ def date_messages(messages: pl.DataFrame) -> pl.DataFrame:
         .with_columns(pl.coalesce("moved_us", "utc_us").alias("utc_us"))
         .drop("moved_us", "row")
     )
+
+
+def _find_devices(messages: pl.DataFrame) -> pl.DataFrame:
+    """Find the devices of messages in a log without them by their temporary ids in another log, which has devices."""
+    if messages["sender"].null_count() in (0, messages.height):
+        return messages
+    known = messages.filter(~pl.col("own")).select("temporary_id", known="sender").drop_nulls().unique()
+    known = known.filter(known["temporary_id"].is_unique())
+    found = messages.join(known, on="temporary_id", how="left", maintain_order="left")
+    return found.with_columns(pl.coalesce("sender", "known").alias("sender")).drop("known")
 
 
 def _name_senders() -> tuple[pl.Expr, pl.Expr]:

@@ -133,6 +133,19 @@ def test_lost_messages_follow_from_the_counter_and_the_time(steps, first):
         assert lost == [0, *(step - 1 if step <= 128 else 0 for step in steps)]
 
 
+def test_a_vehicle_in_two_logs_of_which_one_names_devices_is_one():
+    named = [send(n, sender="28") for n in range(3)]
+    other = [send(n, temporary_id="0000000B", lat_deg=40.1 + n * NORTH_DEG_PER_M) for n in range(2)]
+    assembled = assemble(make_messages(*named, *(send(n) for n in range(4)), *other))
+    assert assembled.stations.select("temporary_ids", "messages", "duplicates").rows() == [
+        (["0000000A"], 4, 3),
+        (["0000000B"], 2, 0),
+    ]
+    # An id that two devices used tells neither: its message counts as a third vehicle's.
+    twice = make_messages(send(0, sender="28"), send(0, sender="29", lat_deg=40.1), send(5))
+    assert assemble(twice).stations.height == 3
+
+
 def test_messages_are_not_lost_while_a_vehicle_is_parked_or_out_of_range():
     # 20 messages of which one is missing, an hour without any, and 20 more: one lost, not 35,981.
     sent = [n for n in (*range(21), *range(36_020, 36_040)) if n != 7]
