@@ -85,8 +85,11 @@ def _read_fix(message: RosMessage, record: Record) -> list[Item]:
 
 def _read_imu(message: RosMessage, record: Record) -> list[Item]:
     found = []
-    if message.orientation_covariance[0] != UNKNOWN:
-        found.append(_make_item("heading", message, record, _find_heading(message.orientation)))
+    turn = message.orientation
+    # Drivers that know none leave (0, 0, 0, 0) in ROS 1 and (0, 0, 0, 1) in ROS 2, which would be east for ever.
+    is_given = any((turn.x, turn.y, turn.z))
+    if is_given and message.orientation_covariance[0] != UNKNOWN:
+        found.append(_make_item("heading", message, record, _find_heading(turn)))
     if message.angular_velocity_covariance[0] != UNKNOWN:
         yaw_rate_degps = -math.degrees(_check(message.angular_velocity.z))  # clockwise is positive
         found.append(_make_item("yaw_rate", message, record, yaw_rate_degps))

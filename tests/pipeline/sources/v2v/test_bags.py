@@ -203,6 +203,21 @@ def test_heading_is_interpolated_over_north_to_the_moment_of_a_fix(tmp_path: Pat
     assert second is None
 
 
+@pytest.mark.parametrize("w", [0.0, 1.0])
+def test_an_orientation_that_was_never_set_is_no_heading(tmp_path: Path, w: float) -> None:
+    """Imu of a driver without one: not a car that always heads east, and its turning is read all the same."""
+    turn = MAKE("geometry_msgs/Quaternion", x=0.0, y=0.0, z=0.0, w=w)
+    vectors = [MAKE("geometry_msgs/Vector3", x=0.0, y=0.0, z=z) for z in (0.1, 9.81)]
+    imu = MAKE(
+        "sensor_msgs/Imu", header=MAKE.header(START_US, "imu"), orientation=turn, orientation_covariance=np.zeros(9),
+        angular_velocity=vectors[0], angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=vectors[1], linear_acceleration_covariance=np.zeros(9),
+    )  # fmt: skip
+    bag = read_messages(tmp_path, ("/fix", FIX, 0, make_fix()), ("/imu", "sensor_msgs/Imu", 0, imu))
+    assert bag.ego.select("heading_deg", "yaw_rate_degps").rows() == [(None, pytest.approx(-5.7296, abs=1e-4))]
+    assert bag.rejects.is_empty()
+
+
 def test_topics_are_chosen_by_type_and_number_and_the_others_named(tmp_path: Path) -> None:
     """A heading in degrees is preferred to one of an orientation; other numbers and texts are not read."""
     number = MAKE("std_msgs/Float64", data=370.0)
