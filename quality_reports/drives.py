@@ -35,6 +35,10 @@ WARNED = ("model", "n", "true", "hits", "missed", "false", "warnings_per_hour", 
 """Figures of a run at one horizon, and of its warnings, that the report shows."""
 
 
+SENSED = {"scans": "LiDAR scan", "images": "camera image"}
+"""Nouns of what sensors logged, by figure."""
+
+
 class ScoreLists(TypedDict):
     """Scores and warnings of runs on drives, as quality.json has them."""
 
@@ -130,7 +134,7 @@ def select_drive(drives: Drives, drive: str) -> dict[str, list[Row]]:
 def describe_drive(facts: Mapping[str, Any]) -> str:
     """Return in a line what a drive holds and how good it is."""
     percent = "" if facts["lost_share"] is None else f", {100 * facts['lost_share']:.1f} % lost"
-    parts = [f"{_count(facts['stations'], 'station')}, {_count(facts['messages'], 'message')}{percent}"]
+    parts = [f"{describe_messages(facts)}{percent}"]
     if facts["latency_median_s"] is not None:
         parts.append(f"median latency {1000 * facts['latency_median_s']:.0f} ms")
     if facts["scans"]:
@@ -138,6 +142,21 @@ def describe_drive(facts: Mapping[str, Any]) -> str:
     if facts["error_median_m"] is not None:
         parts.append(f"median position error {facts['error_median_m']:.2f} m against truth")
     return ", ".join(parts)
+
+
+def describe_drives(drives: Sequence[Mapping[str, Any]]) -> str:
+    """Return in a line the number of drives, and what they hold together."""
+    total = {name: sum(row[name] for row in drives) for name in ("stations", "messages", "own_messages", *SENSED)}
+    sensed = [_count(total[name], noun) for name, noun in SENSED.items() if total[name]]
+    return ", ".join([f"{_count(len(drives), 'drive')}: {describe_messages(total)}", *sensed])
+
+
+def describe_messages(facts: Mapping[str, Any]) -> str:
+    """Return how many messages of how many other vehicles were logged; where there are none, those of the ego."""
+    if facts["messages"]:
+        return f"{_count(facts['stations'], 'station')}, {_count(facts['messages'], 'message')}"
+    own = f", {facts['own_messages']:,} of the ego" if facts["own_messages"] else ""
+    return f"no messages of other vehicles{own}"
 
 
 def _count(number: int, noun: str) -> str:

@@ -30,13 +30,3 @@ def print_drives(terminal: Terminal, drives: list[dict[str, Any]]) -> None:
         for row in drives
     ]
     print_table(terminal, ("drive", "origin", *SHOWN[4:], "s"), rows, right=(False, False, *[True] * 5), fold=True)
-
-
-def describe_drives(drives: list[dict[str, Any]]) -> str:
-    """Return the number of drives, and what they hold together, in a line."""
-    total = {name: sum(row[name] for row in drives) for name in SHOWN[4:]}
-    sensed = "".join(f", {total[name]:,} {what}" for name, what in _SENSED.items() if total[name])
-    return f"{len(drives):,} drives: {total['stations']:,} senders, {total['messages']:,} messages{sensed}"
-
-
-_SENSED = {"scans": "LiDAR scans", "images": "camera images"}

@@ -144,6 +144,7 @@ def _write_drives(
         facts = dict(zip(("dataset", "subset"), place, strict=True))
         tracks = _read(lake, "tracks", place, columns)
         vehicles = _read(lake, "vehicles", place, ("vehicle_id", "class", "length_m", "width_m"))
+        findings = _read(lake, "findings", place, ("vehicle_id", "rule", "severity", "first_frame", "last_frame"))
         usual = 0
         for vehicle in ids:
             folder = out / f"{place[1]}-{vehicle}"
@@ -153,9 +154,30 @@ def _write_drives(
                 f"{folder.name}: {drive.seconds:.1f} s, {drive.messages:,} messages, {drive.heard} of {drive.vehicles} "
                 f"vehicles heard, {drive.scans} LiDAR scans, {drive.images} images"
             )
+            doubtful = _describe_doubtful(tracks, findings, vehicle)
+            if doubtful:
+                terminal.print_problem(f"{folder.name}: {doubtful}", label="note")
             yield drive
         if usual:
             terminal.print_line(
                 f"{place[1]}: states no length or width of {usual} vehicles; usual ones of their class are taken",
                 style="dim",
             )
+
+
+def _describe_doubtful(tracks: pl.DataFrame, findings: pl.DataFrame, ego: int) -> str:
+    """Return which vehicles have errors, or speeds that contradict positions, while the ego drives; empty if none."""
+    frames = tracks.filter(pl.col("vehicle_id") == ego)["frame"]
+    meanwhile = (pl.col("last_frame") >= frames.min()) & (pl.col("first_frame") <= frames.max())
+    wrong = (pl.col("severity") == "error") | (pl.col("rule") == "speed_mismatch")
+    found = findings.filter(meanwhile, wrong)
+    if found.is_empty():
+        return ""
+    ids = found["vehicle_id"].unique()
+    rules = ", ".join(found["rule"].unique().sort())
+    who = "the ego has" if ego in ids else ""
+    others = len(ids) - (1 if who else 0)
+    if others:
+        who = f"{'the ego and ' if who else ''}{others} other vehicle{'s' if others > 1 else ''} "
+        who += "have" if len(ids) > 1 else "has"
+    return f"{who} findings in the recording meanwhile ({rules}): their truth may be wrong, and so errors against it"

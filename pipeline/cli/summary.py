@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal, find_command
-from tracklake.pipeline.cli.drives import describe_drives, list_drives
+from tracklake.pipeline.cli.drives import list_drives
 from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
-from tracklake.quality_reports.drives import describe_drive
+from tracklake.quality_reports.drives import describe_drive, describe_drives
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
@@ -64,7 +64,7 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     if drives and not head["subsets"]:
         lines = {"rows": lines["rows"]}  # the others are of recordings from above
     if drives:
-        lines = {"drives": describe_drives(drives), **_describe_each_drive(quality), **lines}
+        lines = {**_describe_drives(quality), **lines}
         origins = {row["subset"]: row["origin"] for row in drives}
         terminal.print_origin(describe_synthetic(origins, noun="drive", maker="instrument"))
     scores = [score for score in quality["model_scores"] if score["rows"]]
@@ -104,10 +104,12 @@ def _format_errors(rows: list[dict[str, Any]], figure: str) -> str:
     return f"{errors}  (n = {counts})" if known else "none"
 
 
-def _describe_each_drive(quality: dict[str, Any]) -> dict[str, str]:
-    """Return a line per drive of the report, and how many are left out."""
+def _describe_drives(quality: dict[str, Any]) -> dict[str, str]:
+    """Return a line for all drives of the report, one for each, and how many are left out."""
     drives = quality["drives"]["drives"] if "drives" in quality else []
-    lines = {f"  {row['drive']}": describe_drive(row) for row in drives[:MOST_DRIVES]}
+    lines = {"drives": describe_drives(drives)} | {
+        f"  {row['drive']}": describe_drive(row) for row in drives[:MOST_DRIVES]
+    }
     return lines | ({"  ...": f"and {len(drives) - MOST_DRIVES} more"} if len(drives) > MOST_DRIVES else {})
 
 

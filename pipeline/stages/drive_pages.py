@@ -48,7 +48,7 @@ STAGE = Stage(
     meaning="Draw the report's page of each drive.",
     scope="drive",
     after=(),  # a page shows what there is
-    version=1,
+    version=2,
     build=build,
     extra_inputs=_find_inputs,
 )

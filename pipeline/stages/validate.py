@@ -48,7 +48,7 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
 
 STAGE = Stage(
     name="validate",
-    meaning="Check every entry against the rules.",
+    meaning="Check every entry of recordings from above against the rules; `tracklake run` also checks drives.",
     scope="recording",
     after=(INGEST,),
     settings=(_describe_rules, "max_backward_share"),

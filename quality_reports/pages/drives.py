@@ -9,7 +9,7 @@ from tracklake.quality_reports.drives import collect_drives, describe_drive, rea
 from tracklake.quality_reports.pages.rendering import make_environment
 from tracklake.quality_reports.plots import drives as plots
 from tracklake.quality_reports.rules.registry import DRIVE_RULES, describe
-from tracklake.quality_reports.summaries import Connection, Row, query
+from tracklake.quality_reports.summaries import Connection, Row, query, query_frame
 from tracklake.quality_reports.verdicts import SEVERITIES
 from tracklake.schemas.origin import describe_synthetic
 
@@ -63,7 +63,8 @@ def _draw(connection: Connection, drive: str, figures: Mapping[str, Sequence[Row
     (size,) = query(connection, "drive_ego", {"drive": drive})
     size_m = size["length_m"] or USUAL_SIZE_M[0], size["width_m"] or USUAL_SIZE_M[1]
     vehicles = plots.list_vehicles(rows.messages, rows.ticks)
-    views = plots.draw_surroundings(rows.ticks, moments, size_m) if moments else []
+    truth = query_frame(connection, "drive_truth", {"drive": drive, "ticks": moments})
+    views = plots.draw_surroundings(rows.ticks, truth, moments, size_m) if moments else []
     drawn = {
         "legend": moments and plots.draw_sources(),
         "ways": rows.ticks.height and plots.draw_ways(rows.ticks),

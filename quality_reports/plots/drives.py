@@ -1,7 +1,7 @@
 """Plots of a drive: the ego's surroundings from above and over time, what measured them, losses and errors."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import polars as pl
 
@@ -83,18 +83,23 @@ def choose_moments(ticks: pl.DataFrame) -> list[int]:
     return sorted(chosen["tick"].to_list())
 
 
-def draw_surroundings(ticks: pl.DataFrame, moments: Sequence[int], ego_size_m: tuple[float, float]) -> list[str]:
+def draw_surroundings(
+    ticks: pl.DataFrame, truth: pl.DataFrame, moments: Sequence[int], ego_size_m: tuple[float, float]
+) -> list[str]:
     """Draw the vehicles around the ego from above at some ticks, true to scale, ahead to the right.
 
     A drawing is as wide as its page: a narrow page shows less road around the ego and not a smaller one.
 
     Args:
         ticks: rows of drive_ticks.sql.
+        truth: rows of drive_truth.sql.
         moments: ticks to draw.
         ego_size_m: length and width of the ego.
     """
     near = ticks.filter(*_IS_NEAR, pl.col("tick").is_in([*moments])).with_columns(kind=classify_sources())
-    beside = min(ASIDE_M, float(near.select(pl.col("rel_y_m").abs().max()).item()) + 4.5)
+    truth = truth.filter(*_IS_NEAR)
+    aside_m = pl.concat([near["rel_y_m"], truth["rel_y_m"]]).abs().max()
+    beside = min(ASIDE_M, cast("float", aside_m) + 4.5)
     height = 2 * beside * PX_PER_M
     reach = PX_PER_M * REACH_M
     metres = [(value, value * PX_PER_M) for value in range(TICK_M - int(REACH_M), int(REACH_M), TICK_M)]
@@ -102,12 +107,13 @@ def draw_surroundings(ticks: pl.DataFrame, moments: Sequence[int], ego_size_m: t
     axis = "".join(f'<text x="{x}" y="{height + 17:.1f}">{format_number(value)} m</text>' for value, x in metres)
     views = []
     for tick in moments:
-        own = near.filter(pl.col("tick") == tick).sort("vehicle_id")
+        own, true = (rows.filter(pl.col("tick") == tick) for rows in (near.sort("vehicle_id"), truth))
         views.append(
             f'<svg class="plan" role="img" aria-label="Vehicles around the ego from above" height="{height + 22:.1f}">'
             f'<svg height="{height:.1f}"><rect class="road" width="100%" height="{height:.1f}"/>'
             f'<svg x="50%" overflow="visible"><path class="dotted" d="M{-reach} {height / 2:.1f}H{reach}"/>'
-            f"{_draw_boxes(own, height / 2)}{_draw_ego(height / 2, ego_size_m)}</svg></svg>"
+            f"{_draw_boxes(own, height / 2)}{_draw_outlines(true, height / 2)}{_draw_ego(height / 2, ego_size_m)}"
+            "</svg></svg>"
             f'<svg x="50%" overflow="visible"><path class="tick" d="{marks}"/><g class="axis">{axis}</g></svg></svg>'
         )
     return views
@@ -127,26 +133,35 @@ def _draw_ego(middle: float, size_m: tuple[float, float]) -> str:
 
 
 def _draw_boxes(own: pl.DataFrame, middle: float) -> str:
-    """Return the boxes of one moment, turned by their headings, with true outlines and ids."""
+    """Return the boxes of one moment, turned by their headings, with ids."""
     colours = dict(KINDS)
     parts = []
     for row in own.iter_rows(named=True):  # a few boxes
-        long, wide = row["box_length_m"] * PX_PER_M, row["box_width_m"] * PX_PER_M
-        turned = [
-            f'<rect x="{across - long / 2:.1f}" y="{down - wide / 2:.1f}" width="{long:.1f}" height="{wide:.1f}" '
-            f'transform="rotate({row["rel_heading_deg"]:.1f} {across:.1f} {down:.1f})"'
-            for across, down in (
-                (row[f"{name}_x_m"] * PX_PER_M, middle + row[f"{name}_y_m"] * PX_PER_M)
-                for name in ("rel", "true")
-                if row[f"{name}_x_m"] is not None
-            )
-        ]
         filled = f'fill="{colours[row["kind"]]}" fill-opacity="0.8"'
-        parts.append(f"{turned[0]} {filled}><title>{_describe_vehicle(row)}</title></rect>")
-        parts += [f'{outline} fill="none" stroke="{INK}" stroke-dasharray="3 2"/>' for outline in turned[1:]]
-        at = f'x="{row["rel_x_m"] * PX_PER_M:.1f}" y="{middle + row["rel_y_m"] * PX_PER_M - wide / 2 - 4:.1f}"'
+        size_m = row["box_length_m"], row["box_width_m"]
+        parts.append(f"{_place_box(row, middle, size_m)} {filled}><title>{_describe_vehicle(row)}</title></rect>")
+        above = middle + (row["rel_y_m"] - size_m[1] / 2) * PX_PER_M - 4
+        at = f'x="{row["rel_x_m"] * PX_PER_M:.1f}" y="{above:.1f}"'
         parts.append(f'<g class="ids"><text {at}>{row["vehicle_id"]}</text></g>')
     return "".join(parts)
+
+
+def _draw_outlines(true: pl.DataFrame, middle: float) -> str:
+    """Return the true outlines of one moment, dashed."""
+    look = f'fill="none" stroke="{INK}" stroke-dasharray="3 2"/>'
+    return "".join(
+        f"{_place_box(row, middle, (row['length_m'], row['width_m']))} {look}" for row in true.iter_rows(named=True)
+    )
+
+
+def _place_box(row: Row, middle: float, size_m: tuple[float, float]) -> str:
+    """Return the begin of a rectangle of a size at a row's place, turned by its heading."""
+    long, wide = (extent * PX_PER_M for extent in size_m)
+    across, down = row["rel_x_m"] * PX_PER_M, middle + row["rel_y_m"] * PX_PER_M
+    return (
+        f'<rect x="{across - long / 2:.1f}" y="{down - wide / 2:.1f}" width="{long:.1f}" height="{wide:.1f}" '
+        f'transform="rotate({row["rel_heading_deg"]:.1f} {across:.1f} {down:.1f})"'
+    )
 
 
 def _describe_vehicle(row: Row) -> str:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tracklake.quality_reports.drives import collect_drives, describe_drive
+from tracklake.quality_reports.drives import collect_drives, describe_drive, describe_drives
 from tracklake.quality_reports.gates.gate import judge_gate, parse_gate
 from tracklake.quality_reports.gates.metrics import METRICS, collect_metrics
 
@@ -65,6 +65,16 @@ def test_a_drive_is_described_in_a_line(collected):
     bare = facts | {"stations": 1, "messages": 1, "scans": 0}
     bare |= dict.fromkeys(("lost_share", "latency_median_s", "error_median_m"))
     assert describe_drive(bare) == "1 station, 1 message"
+    alone = bare | {"stations": 0, "messages": 0, "own_messages": 60}
+    assert describe_drive(alone) == "no messages of other vehicles, 60 of the ego"
+    assert describe_drive(alone | {"own_messages": 0, "scans": 1}) == "no messages of other vehicles, 1 LiDAR scan"
+
+
+def test_all_drives_are_described_by_what_they_hold_together(collected):
+    (facts,) = collected["drives"]
+    facts = facts | {"images": 0}
+    assert describe_drives([facts]) == "1 drive: 2 stations, 110 messages, 50 LiDAR scans"
+    assert describe_drives([facts, facts]) == "2 drives: 4 stations, 220 messages, 100 LiDAR scans"
 
 
 def test_a_recorded_drive_of_messages_alone_has_no_errors(open_lake, small_drive):

@@ -45,6 +45,20 @@ def test_a_share_of_all_vehicles(command: Command, lake: Lake, tmp_path):
     assert all(each["seconds"] >= 4 for each in first)
 
 
+def test_doubtful_truth_is_named(command: Command, lake: Lake, tmp_path):
+    asked = (
+        "SELECT subset, vehicle_id FROM findings JOIN vehicles USING (dataset, subset, vehicle_id) "
+        "WHERE severity = 'error' AND vehicles.entries > 150 ORDER BY ALL LIMIT 1"
+    )
+    found = json.loads(command.here("sql", asked, "--lake", lake.root, "--json").out)[0]
+    ego = ("--ego", f"{found['subset']}:{found['vehicle_id']}")
+    done = command.here("instrument", *ego, "--lake", lake.root, "--out", tmp_path, "--format", "bsmp1")
+    assert done.code == 0, done.err
+    shown = " ".join(done.err.split())
+    assert f"note: {found['subset']}-{found['vehicle_id']}: the ego " in shown
+    assert "their truth may be wrong, and so errors against it" in shown
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -39,6 +39,16 @@ def test_the_page_shows_every_part_of_a_drive(page):
     )
 
 
+def test_true_outlines_include_vehicles_that_never_sent(open_lake, small_drive, page):
+    def count_outlines(html: str) -> int:
+        return html.count('stroke-dasharray="3 2"')
+
+    known = [row for row in small_drive["surrounding_truth"] if row["vehicle_id"] is not None]
+    assert len(known) < len(small_drive["surrounding_truth"])
+    fewer = render_drive(open_lake(**{**small_drive, "surrounding_truth": known}), "drive-1", {})
+    assert count_outlines(page) == count_outlines(fewer) + 5, "one vehicle never sends, at five moments"
+
+
 def test_a_drive_without_anything_around_it_says_so(open_lake, small_drive):
     bare = {name: small_drive[name] for name in ("drives", "stations")}
     bare["drives"] = [{**bare["drives"][0], "origin": "recorded"}]

@@ -278,7 +278,7 @@ def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, com
     lake = ("--lake", tmp_path / "lake")
     done = command.here("run", tmp_path / "source" / "one" / "trip", *lake, "--dataset", "v2v")
     assert done.code == 0, done.err
-    assert "drives  1 drives: 1 senders, 3 messages\n" in done.out
+    assert "drives  1 drive: no messages of other vehicles, 3 of the ego\n" in done.out
     assert "rows    3 read, 0 rejected\nreport" in done.out
     assert 'sql "FROM drives"' in done.out
     again = command.here("run", tmp_path / "source" / "one" / "trip", *lake)
