@@ -35,7 +35,7 @@ TICKS, LANE_M = 100, 3.6
 EGO, AHEAD = 0, 1
 """vehicle_id of the ego and of the vehicle ahead."""
 BANDS_M = ((0, 20), (20, 40), (40, 60), (60, 90))
-"""Distances by which errors are told, in m."""
+"""Bands of distance whose errors are given, in m."""
 SETTLED_TICK = 20
 """First tick of the errors: by then the tracks have begun."""
 
