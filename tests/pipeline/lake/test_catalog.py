@@ -31,6 +31,7 @@ from tracklake.schemas.errors import FileAccessError
 SQL_NAMES = {
     pl.String: "VARCHAR", pl.Boolean: "BOOLEAN", pl.Int8: "TINYINT", pl.Int16: "SMALLINT", pl.Int32: "INTEGER",
     pl.Int64: "BIGINT", pl.Float32: "FLOAT", pl.Float64: "DOUBLE", pl.Enum: "VARCHAR",
+    pl.Datetime: "TIMESTAMP",
 }  # fmt: skip
 JOINED = {
     "vehicles": {"eligible": "BOOLEAN", "starts_late": "BOOLEAN", "fully_tracked": "BOOLEAN", "early": "BOOLEAN"},
