@@ -38,6 +38,8 @@ BANDS_M = ((0, 20), (20, 40), (40, 60), (60, 90))
 """Bands of distance whose errors are given, in m."""
 SETTLED_TICK = 20
 """First tick of the errors: by then the tracks have begun."""
+LASTING_TICKS = 5
+"""Time for which a vehicle_id follows another vehicle until its identity counts as changed, in ticks: 0.5 s."""
 
 
 def drive_vehicles(random: np.random.Generator, rate_mps2: float, changes: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -154,15 +156,24 @@ def judge(surrounding: pl.DataFrame, config: InstrumentConfig, sensed: SensedDri
     )
 
 
-def count_swaps(judged: pl.DataFrame) -> tuple[int, int]:
-    """Return how often returns were assigned, and to a vehicle that they are not of.
+def count_swaps(judged: pl.DataFrame) -> tuple[int, int, int]:
+    """Return how often returns were assigned, how often to a vehicle that they are not of, and changes of identity.
 
-    A vehicle that sends nothing has the returns of another one where the one before was of another.
+    A vehicle that sends nothing has the returns of another one where the one before was of another. An identity
+    changes where a vehicle_id has returns of one vehicle, and then of another one for over LASTING_TICKS.
     """
     rows = judged.filter(pl.col("owner") >= 0)
     before = pl.col("owner").shift(1).over("vehicle_id").fill_null(pl.col("owner"))
     own = pl.when("sends").then("vehicle_id").otherwise(before)
-    return rows.height, rows.filter(pl.col("owner") != own).height
+    run = rows.with_columns(run=pl.col("owner").rle_id().over("vehicle_id")).group_by(
+        "vehicle_id", "run", maintain_order=True
+    )
+    lasting = run.agg(pl.first("owner", "sends"), ticks=pl.col("tick").last() - pl.col("tick").first()).filter(
+        pl.col("ticks") > LASTING_TICKS
+    )
+    first = pl.when("sends").then("vehicle_id").otherwise("owner")
+    changed = pl.col("owner") != pl.col("owner").shift(1).over("vehicle_id").fill_null(first)
+    return rows.height, rows.filter(pl.col("owner") != own).height, lasting.filter(changed).height
 
 
 def bound(values: list[float], random: np.random.Generator) -> str:
@@ -184,10 +195,11 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
         "messages, LiDAR, camera": base,
     }
     errors: dict[tuple[str, int], list[float]] = {}
-    yield "| the vehicle ahead | rows with LiDAR | swaps, without camera | swaps, with camera |"
-    yield "| --- | --- | --- | --- |"
+    heads = "the vehicle ahead", "rows with LiDAR", "swaps", "with camera", "identities changed", "with camera"
+    yield "| " + " | ".join(heads) + " |"
+    yield "| --- | --- | --- | --- | --- | --- |"
     for number, ((rate, change), name) in enumerate(SCENARIOS.items()):
-        counts = {variant: np.zeros(2, np.int64) for variant in variants}
+        counts = {variant: np.zeros(3, np.int64) for variant in variants}
         for seed in range(arguments.seeds):
             tracks, vehicles = drive_vehicles(np.random.default_rng([number, seed]), rate, change)
             facts = {"dataset": "highd", "subset": "scenario"}
@@ -202,7 +214,7 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
                     values = late.filter(pl.col("distance_m").is_between(low, high, closed="left"))["error_m"]
                     errors.setdefault((variant, band), []).append(float(values.median() or np.nan))  # type: ignore[arg-type]  # a number
         lidar, camera = (counts[variant] for variant in list(variants)[1:])
-        yield f"| {name} | {lidar[0]:,} | {lidar[1]:,} | {camera[1]:,} |"
+        yield f"| {name} | {lidar[0]:,} | {lidar[1]:,} | {camera[1]:,} | {lidar[2]:,} | {camera[2]:,} |"
     random = np.random.default_rng(0)
     yield (
         "\n| error in m | "

@@ -9,6 +9,7 @@ with that common shift, and made only where the next best one is clearly worse.
 
 import numpy as np
 
+from tracklake.pipeline.transforms.onboard.boxes import CAR_SIZE_M
 from tracklake.pipeline.transforms.onboard.kalman import OFFSET, POSITION, VELOCITY
 from tracklake.pipeline.transforms.onboard.tracks import TENTATIVE, Tracks
 from tracklake.schemas.arrays import Flags, Floats, Integers
@@ -63,6 +64,7 @@ def match_stations(tracks: Tracks, heard: Flags) -> Integers:
         heard: (V,) whether a message arrived lately.
     """
     lidar = np.flatnonzero(tracks.vehicle_id >= FIRST_LIDAR_ID)
+    lidar = lidar[~_find_doubles(tracks, lidar)]
     stations = np.flatnonzero(is_loose(tracks) & heard)
     none = np.empty((0, 2), dtype=np.int64)
     if not lidar.size or not stations.size:
@@ -82,6 +84,20 @@ def match_stations(tracks: Tracks, heard: Flags) -> Integers:
     rivals = np.where(pairs == pairs[best], np.inf, cost[:, None]).min(0)  # the best that has another partner, (S,)
     good = np.flatnonzero((pairs[best] >= 0) & (rivals - cost[best] >= CLEAR))
     return np.stack((lidar[pairs[best, good]], stations[good]), 1)
+
+
+def _find_doubles(tracks: Tracks, lidar: Integers) -> Flags:
+    """Tell which LiDAR tracks are where a car would overlap a station whose place is certain: returns of that station.
+
+    They are no other station's, which may be hidden.
+    """
+    certain = np.flatnonzero(is_station(tracks) & ~is_loose(tracks))
+    x_m, y_m = np.moveaxis(tracks.state[lidar, None, POSITION] - tracks.state[certain, POSITION], -1, 0)
+    cos, sin = np.cos(tracks.heading_rad[certain]), np.sin(tracks.heading_rad[certain])
+    length_m, width_m = ((tracks.size_m[certain, :2] + CAR_SIZE_M) / 2).T
+    over = (np.abs(x_m * cos + y_m * sin) < length_m) & (np.abs(y_m * cos - x_m * sin) < width_m)
+    doubles: Flags = over.any(1)
+    return doubles
 
 
 def _compare(tracks: Tracks, lidar: Integers, stations: Integers) -> tuple[Floats, Floats]:

@@ -7,8 +7,10 @@ from drive_scenes import compare, drive, measure_centres
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tracklake.pipeline.transforms.onboard.matching import match_stations
 from tracklake.pipeline.transforms.onboard.measurements import Camera, CameraMeasurement
 from tracklake.pipeline.transforms.onboard.surrounding import MAX_PREDICTION_S, Sensors, fuse_drive
+from tracklake.pipeline.transforms.onboard.tracks import make_tracks
 from tracklake.schemas import ASSOCIATION, LIDAR_CLUSTERS, SURROUNDING
 from tracklake.schemas.perception import FIRST_LIDAR_ID
 
@@ -121,6 +123,27 @@ def test_no_swaps_among_neighbors_that_drive_alike():
         rows = compare(scene, fuse(scene).tables[SURROUNDING]).filter(pl.col("tick") > 60)
         wrong += int((rows.group_by("vehicle_id").agg(pl.col("error_m").median())["error_m"] > 1.0).sum())
     assert wrong == 0
+
+
+@pytest.mark.parametrize(
+    ("place_m", "matches"),
+    [
+        ((-51, 3.8), False),  # upon station 1: its own returns, seen twice
+        ((-51, 2.1), False),  # 1.7 m beside it: cars of 1.8 and 1.85 m in width would overlap
+        ((-51, 1.9), True),  # 1.9 m beside it
+        ((-55.6, 3.8), True),  # 4.6 m behind it: cars of 4.5 and 4.6 m in length would not overlap
+    ],
+)
+def test_second_lidar_track_upon_a_station_is_no_hidden_neighbor(place_m, matches):
+    """Station 1 is certain; station 2, whose messages are off by metres, may be hidden behind it."""
+    state = np.zeros((3, 9))
+    state[:, :2], state[:, 2] = [(-51, 3.8), (-54, 2), place_m], 25
+    covariance = np.tile(np.diag([0.01] * 2 + [0.25] * 5 + [4.0] * 2), (3, 1, 1))
+    covariance[1, [0, 1], [0, 1]] = 4.0
+    tracks = make_tracks(np.arange(3), np.array([1, 2, FIRST_LIDAR_ID]), state, covariance, np.full(3, 2.0))
+    tracks.size_m[:2, :2] = 4.5, 1.8
+    found = match_stations(tracks, np.array([True, True, False]))
+    assert found.tolist() == ([[2, 1]] if matches else [])
 
 
 def test_lane_change_and_overtaking_keep_their_vehicles():
