@@ -1,8 +1,9 @@
 """What an on-board view costs: models fed by overhead tracks and by what an instrumented vehicle perceives.
 
-Two samples are generated: models are trained once, on overhead tracks of the first; vehicles of the second drive as
-egos, again and again: with 0 to 100 % of the vehicles connected, with and without LiDAR, with plain GPS and DGPS. The
-logs are read and fused by `tracklake ingest` and `tracklake fuse`, and the same futures predicted from both views.
+Samples are generated: models are trained once, on overhead tracks of the first; vehicles of the others drive as egos,
+again and again: with 0 to 100 % of the vehicles connected, with and without LiDAR, with plain GPS and DGPS. The logs
+are read and fused by `tracklake ingest` and `tracklake fuse`, and the same futures predicted from both views. One group
+of egos is spread over the recordings; around those of the other, warnings of collisions are due.
 What is finished in the study's folder is kept, so that an interrupted study goes on where it was.
 
     python benchmarks/study_onboard.py             writes docs/onboard-view.csv, .svg and .md
@@ -13,15 +14,16 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 import torch
-from study_onboard_page import write_page
+from study_onboard_page import DUE, SPREAD, write_page
 
 from tracklake.pipeline.lake.lake import Lake, open_lake
 from tracklake.pipeline.synthetic import write_sample
@@ -29,8 +31,9 @@ from tracklake.pipeline.synthetic.onboard.instrument import instrument_drive
 from tracklake.pipeline.synthetic.onboard.lidar import Lidar
 from tracklake.pipeline.synthetic.onboard.motion import find_drives
 from tracklake.pipeline.synthetic.onboard.sensing import InstrumentConfig, sense_drive
-from tracklake.schemas.arrays import Floats
+from tracklake.schemas.arrays import Floats, Singles
 from tracklake.schemas.protocols import V2V
+from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.onboard import networks
 from tracklake.training.onboard.collisions import NEVER, find_overlaps
 from tracklake.training.onboard.feeds import Feeds, pair_feeds, select_feeds
@@ -42,15 +45,32 @@ from tracklake.training.runs.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 PENETRATIONS = (0.0, 0.1, 0.3, 0.6, 1.0)
-LEARNED = ("stacked-lstm",)
+LEARNED = ("stacked-lstm", "lstm-encoder-decoder")
 NEAR_M = 100.0
 """Distance along the road, either way, within which vehicles are judged."""
-TRAINING_SAMPLES = 6000
-"""Most samples, of both parts, that models learn from and are measured on."""
+AROUND_TICKS = 40
+"""Ticks of the drive before the first and after the last moment at which a warning is due: history, future and 2 s."""
 LEAST_TICKS = 80
 """Shortest drive of an ego of the study, in ticks."""
 SUBSETS = ("01-lower", "01-upper", "02-lower", "02-upper")
 COLUMNS = ("vehicle_id", "frame", "time_s", "x_m", "y_m", "lane", "speed_mps", "accel_mps2")
+
+
+@dataclass(frozen=True)
+class Ego:
+    """A vehicle that is instrumented, and the part of its drive, in ticks of the recording."""
+
+    group: str
+    dataset: str
+    subset: str
+    vehicle_id: int
+    first_tick: int
+    last_tick: int
+
+    @property
+    def name(self) -> str:
+        """Name of the ego in the names of its drives."""
+        return f"{self.subset}-{self.vehicle_id}"
 
 
 @dataclass(frozen=True)
@@ -85,16 +105,25 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=ROOT / "study" / "onboard")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "onboard-view.csv")
     parser.add_argument("--egos", type=int, default=1, help="per subset")
+    parser.add_argument("--due", type=int, default=3, help="egos around which a warning is due")
     parser.add_argument("--epochs", type=int, default=6)
     options = parser.parse_args()
     began = time.monotonic()
-    train, evaluation = (make_lake(options.work, name, seed) for name, seed in (("train", 2), ("eval", 1)))
-    models = train_models(gather_truth(train, 6), options.epochs, options.work)
+    work = options.work
+    train, evaluation = (make_lake(work, name, ("highd",), seed) for name, seed in (("train", 2), ("eval", 1)))
+    lakes = {"highd": evaluation, "ngsim": make_lake(work, "congested", ("ngsim-text", "socrata"), 1)}
+    models, learned = train_models(gather_truth(train, 6), options.epochs, work)
     print(f"{time.monotonic() - began:6.0f} s  models trained", flush=True)
-    lake = make_drives(evaluation, options.work / f"drives-{options.egos}", options.egos)
+    found = search_lakes(lakes, work / "due.parquet")
+    egos = [*spread_egos(evaluation, options.egos), *choose_due(found, options.due)]
+    print(f"{time.monotonic() - began:6.0f} s  {', '.join(ego.name for ego in egos)} chosen", flush=True)
+    lake = make_drives(lakes, work / "drives", egos)
     print(f"{time.monotonic() - began:6.0f} s  {lake.table('drives').collect().height} drives fused", flush=True)
-    rows = [row for condition in CONDITIONS for row in score_condition(lake, condition, models)]
-    pl.DataFrame(rows).write_csv(options.out, float_precision=4)
+    about = {"training_samples": learned, "epochs": options.epochs}
+    about |= {f"searched_{name}": found[name].sum() for name in ("pairs", "due_pairs", "overlapping_pairs")}
+    about |= {"searched_egos": found.height}
+    rows = [{**row, **about} for row in score_egos(lake, egos, models)]
+    pl.DataFrame(rows, infer_schema_length=None).write_csv(options.out, float_precision=4)
     write_page(options.out)
     print(f"{time.monotonic() - began:6.0f} s  {options.out} and the page beside it written")
 
@@ -107,11 +136,11 @@ def run(*words: object) -> None:
         raise SystemExit(f"tracklake {' '.join(map(str, words))}: exit code {done.returncode}")
 
 
-def make_lake(work: Path, name: str, seed: int) -> Lake:
+def make_lake(work: Path, name: str, formats: tuple[str, ...], seed: int) -> Lake:
     """Generate a sample of overhead recordings and ingest it."""
     raw = work / f"{name}-raw"
     if not raw.exists():
-        write_sample(raw, formats=("highd",), minutes=0.5, seed=seed)
+        write_sample(raw, formats=formats, minutes=0.5, seed=seed)
     run("ingest", raw, "--lake", work / name)
     return open_lake(work / name)
 
@@ -123,28 +152,112 @@ def read_subset(lake: Lake, subset: str) -> tuple[pl.DataFrame, pl.DataFrame]:
     return tracks.select(COLUMNS), vehicles
 
 
-def choose_egos(tracks: pl.DataFrame, count: int) -> list[int]:
-    """Choose vehicles that were recorded long enough, evenly over their ids."""
-    drives = find_drives(tracks).filter(pl.col("last_tick") - pl.col("first_tick") >= LEAST_TICKS)
-    ids = drives["vehicle_id"].to_list()
-    return [ids[place] for place in np.linspace(0, len(ids) - 1, min(count + 2, len(ids))).astype(int)[1:-1]]
+def find_egos(tracks: pl.DataFrame) -> pl.DataFrame:
+    """Find vehicles that were recorded long enough: `vehicle_id`, `first_tick`, `last_tick`."""
+    return find_drives(tracks).filter(pl.col("last_tick") - pl.col("first_tick") >= LEAST_TICKS)
+
+
+def choose_evenly(drives: pl.DataFrame, count: int) -> pl.DataFrame:
+    """Choose vehicles evenly over their ids."""
+    rows = np.linspace(0, drives.height - 1, min(count + 2, drives.height)).astype(int)[1:-1]
+    chosen: pl.DataFrame = drives[rows.tolist()]
+    return chosen
+
+
+def spread_egos(lake: Lake, count: int) -> list[Ego]:
+    """Choose so many egos of each subset, evenly over their ids."""
+    return [
+        Ego(SPREAD, "highd", subset, *row)
+        for subset in SUBSETS
+        for row in choose_evenly(find_egos(read_subset(lake, subset)[0]), count).iter_rows()
+    ]
+
+
+def observe(
+    tracks: pl.DataFrame, vehicles: pl.DataFrame, facts: dict[str, str], egos: Sequence[int]
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return `surrounding_truth` and `drives` of egos of a subset, without instruments."""
+    truths, drives = [], []
+    for ego in egos:
+        sensed = sense_drive(tracks, vehicles, facts, ego, InstrumentConfig(lidar=None, camera=None))
+        length_m, width_m, _ = sensed.motion.size_m[sensed.motion.ego]
+        name = f"{facts['subset']}-{ego}"
+        drives.append({"subset": name, "ego_length_m": length_m, "ego_width_m": width_m})
+        place = {"dataset": pl.lit("v2v"), "subset": pl.lit(name)}
+        truths.append(sensed.truth.with_columns(**place, vehicle_id=pl.col("truth_id")))
+    return pl.concat(truths), pl.DataFrame(drives)
+
+
+def build_overhead(truth: pl.DataFrame, drives: pl.DataFrame) -> Samples:
+    """Build the samples of true vehicles near their egos."""
+    samples = build_samples(describe_truth(truth), truth, drives).samples
+    return samples.select(is_near(samples))
 
 
 def gather_truth(lake: Lake, count: int) -> Samples:
-    """Build the overhead samples around many egos of each subset, without instruments."""
-    truths, drives = [], []
+    """Build the overhead samples around many egos of each subset."""
+    observed = []
     for subset in SUBSETS:
         tracks, vehicles = read_subset(lake, subset)
-        for ego in choose_egos(tracks, count):
-            config = InstrumentConfig(lidar=None, camera=None)
-            sensed = sense_drive(tracks, vehicles, {"dataset": "highd", "subset": subset}, ego, config)
-            length_m, width_m, _ = sensed.motion.size_m[sensed.motion.ego]
-            drives.append({"subset": f"{subset}-{ego}", "ego_length_m": length_m, "ego_width_m": width_m})
-            place = {"dataset": pl.lit("v2v"), "subset": pl.lit(f"{subset}-{ego}")}
-            truths.append(sensed.truth.with_columns(**place, vehicle_id=pl.col("truth_id")))
-    truth = pl.concat(truths)
-    samples = build_samples(describe_truth(truth), truth, pl.DataFrame(drives)).samples
-    return samples.select(is_near(samples))
+        egos = choose_evenly(find_egos(tracks), count)["vehicle_id"].to_list()
+        observed.append(observe(tracks, vehicles, {"dataset": "highd", "subset": subset}, egos))
+    truths, drives = zip(*observed, strict=True)
+    return build_overhead(pl.concat(truths), pl.concat(drives))
+
+
+def search_lakes(lakes: dict[str, Lake], kept: Path) -> pl.DataFrame:
+    """Search all recordings for egos around which a warning is due; what was found before is read again."""
+    if not kept.exists():
+        found = []
+        for dataset, lake in lakes.items():
+            for subset in lake.table("subsets").select("subset").collect()["subset"].sort():
+                tracks, vehicles = read_subset(lake, subset)
+                found.append(search_subset(tracks, vehicles, {"dataset": dataset, "subset": subset}))
+        pl.concat(found).write_parquet(kept)
+    return pl.read_parquet(kept)
+
+
+def search_subset(tracks: pl.DataFrame, vehicles: pl.DataFrame, facts: dict[str, str]) -> pl.DataFrame:
+    """Count, for each ego, the vehicles near it, those with a warning due by the true futures, and their moments.
+
+    Vehicles whose body overlaps the ego's are errors of the recording: they are counted, and no reason to choose it.
+    """
+    drives = find_egos(tracks)
+    samples = build_overhead(*observe(tracks, vehicles, facts, drives["vehicle_id"].to_list()))
+    due = find_overlaps(samples, samples.place_m) > NEVER
+    gap_m = np.abs(samples.place_m[..., 0]) - (samples.size_m[:, :1] + samples.ego_size_m[:, :1]) / 2
+    touches = ((gap_m < 0) & (np.abs(samples.place_m[..., 1]) < NOMINAL_LANE_M / 2)).any(axis=1)
+    ego = pl.Series("vehicle_id", samples.subset).str.split("-").list.last().cast(drives["vehicle_id"].dtype)
+    moments = pl.DataFrame(
+        [ego, *map(pl.Series, ("track", "tick", "due", "touches"), (samples.track, samples.tick, due, touches))]
+    )
+    dues = pl.col("tick").filter("due")
+    pairs = moments.group_by("vehicle_id", "track").agg(
+        dues.len().alias("moments"), dues.min().alias("first"), dues.max().alias("last"), pl.col("touches").any()
+    )
+    is_due, sound = pl.col("moments") > 0, (pl.col("moments") > 0) & ~pl.col("touches")
+    counts = pairs.group_by("vehicle_id").agg(
+        pl.len().alias("pairs"),
+        is_due.sum().alias("due_pairs"),
+        (is_due & pl.col("touches")).sum().alias("overlapping_pairs"),
+        pl.col("moments").filter(sound).sum(),
+        pl.col("first").filter(sound).min(),
+        pl.col("last").filter(sound).max(),
+    )
+    about = (pl.lit(value).alias(name) for name, value in facts.items())
+    return drives.join(counts, on="vehicle_id").sort("vehicle_id").select(*about, pl.all())
+
+
+def choose_due(found: pl.DataFrame, count: int) -> list[Ego]:
+    """Choose the egos with the most moments at which a warning is due, and the part of their drive around these."""
+    order = ("moments", "dataset", "subset", "vehicle_id")
+    most = found.filter(pl.col("moments") > 0).sort(order, descending=[True, False, False, False]).head(count)
+    begin = pl.col("first_tick")
+    part = (
+        pl.max_horizontal(begin, begin + pl.col("first") - AROUND_TICKS),
+        pl.min_horizontal("last_tick", begin + pl.col("last") + AROUND_TICKS).alias("end"),
+    )
+    return [Ego(DUE, *row) for row in most.select("dataset", "subset", "vehicle_id", *part).iter_rows()]
 
 
 def is_near(samples: Samples) -> np.ndarray:
@@ -153,10 +266,9 @@ def is_near(samples: Samples) -> np.ndarray:
     return near
 
 
-def train_models(samples: Samples, epochs: int, work: Path) -> list[Forecaster]:
-    """Train every model once, on overhead samples alone; what was trained before is read again."""
-    drawn = np.random.default_rng(0).permutation(len(samples))[:TRAINING_SAMPLES]
-    parts = split_samples(samples.select(np.isin(np.arange(len(samples)), drawn)), seed=0)
+def train_models(samples: Samples, epochs: int, work: Path) -> tuple[list[Forecaster], int]:
+    """Train every model once, on so many overhead samples alone; what was trained before is read again."""
+    parts = split_samples(samples, seed=0)
     models = [make_forecaster("ctrv", predict_turns, parts.eval)]
     for name in LEARNED:
         kept = work / f"{name}-{epochs}-{parts.digest}.pt"
@@ -168,76 +280,107 @@ def train_models(samples: Samples, epochs: int, work: Path) -> list[Forecaster]:
             torch.save(network.state_dict(), kept)
         # The spread of errors is measured on vehicles that were not learned from.
         models.append(make_forecaster(name, lambda given, network=network: run_network(network, given), parts.eval))
-    return models
+    return models, len(parts.train)
 
 
-def make_drives(lake: Lake, work: Path, egos: int) -> Lake:
+def make_drives(lakes: dict[str, Lake], work: Path, egos: Sequence[Ego]) -> Lake:
     """Instrument the egos under every condition, and read and fuse their logs in a lake of their own."""
-    for subset in SUBSETS:
-        tracks, vehicles = read_subset(lake, subset)
-        for ego, condition in product(choose_egos(tracks, egos), CONDITIONS):
-            out = work / "raw" / f"{subset}-{ego}-{condition.name}"
+    for ego in egos:
+        tracks, vehicles = read_subset(lakes[ego.dataset], ego.subset)
+        tick = pl.col("time_s") * V2V.rate_hz
+        is_other = pl.col("vehicle_id") != ego.vehicle_id
+        tracks = tracks.filter(is_other | tick.is_between(ego.first_tick - 0.5, ego.last_tick + 0.5))
+        for condition in CONDITIONS:
+            out = work / "raw" / f"{ego.name}-{condition.name}"
             formats = ("hex", "rosbag2") if condition.lidar else ("hex",)
             if not out.exists():
-                facts = {"dataset": "highd", "subset": subset}
-                instrument_drive(tracks, vehicles, facts, ego, condition.config, out, formats)
+                facts = {"dataset": ego.dataset, "subset": ego.subset}
+                instrument_drive(tracks, vehicles, facts, ego.vehicle_id, condition.config, out, formats)
     run("ingest", work / "raw", "--lake", work / "lake")
     run("fuse", "--lake", work / "lake")
     return open_lake(work / "lake")
 
 
-def read_feeds(lake: Lake, condition: Condition) -> Feeds:
-    """Pair both views of a condition's drives, near the ego alone."""
-    ends = pl.col("subset").str.ends_with(condition.name)
+def read_feeds(lake: Lake, condition: Condition, egos: Sequence[Ego]) -> Feeds:
+    """Pair both views of the egos' drives under a condition, near the ego alone."""
+    own = pl.col("subset").is_in([f"{ego.name}-{condition.name}" for ego in egos])
     surrounding, truth, drives = (
-        lake.table(name).filter(ends).collect() for name in ("surrounding", "surrounding_truth", "drives")
+        lake.table(name).filter(own).collect() for name in ("surrounding", "surrounding_truth", "drives")
     )
     feeds = pair_feeds(surrounding, truth, drives)
     near = select_feeds(feeds, is_near(feeds.overhead))
     return near._replace(ghosts=feeds.ghosts.select(is_near(feeds.ghosts)))
 
 
-def score_condition(lake: Lake, condition: Condition, models: list[Forecaster]) -> Iterator[dict[str, object]]:
-    """Score all models on both views under one condition."""
-    feeds = read_feeds(lake, condition)
-    overhead, perceived = feeds.overhead, feeds.perceived
+def score_egos(lake: Lake, egos: Sequence[Ego], models: list[Forecaster]) -> Iterator[dict[str, object]]:
+    """Score all models on both views of each group of egos under each condition."""
+    seen: dict[tuple[str, bytes], Singles] = {}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for group, condition in product((SPREAD, DUE), CONDITIONS):
+            own = [ego for ego in egos if ego.group == group]
+            yield from ({"group": group, **row} for row in score_condition(lake, condition, own, models, seen))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def score_condition(
+    lake: Lake,
+    condition: Condition,
+    egos: Sequence[Ego],
+    models: list[Forecaster],
+    seen: dict[tuple[str, bytes], Singles],
+) -> Iterator[dict[str, object]]:
+    """Score all models on both views of egos under one condition; `seen` keeps predictions of the overhead view."""
+    feeds = read_feeds(lake, condition, egos)
+    overhead, perceived, ghosts = feeds.overhead, feeds.perceived, feeds.ghosts
+    strange = np.array([f"{drive}:{vehicle}" for drive, vehicle in zip(ghosts.subset, ghosts.vehicle_id, strict=True)])
     missed = np.ones(len(overhead))
     missed[feeds.shared] = 0.0
+    false = np.repeat((0.0, 1.0), (len(perceived), len(ghosts)))
     due = find_overlaps(overhead, overhead.place_m) > NEVER
     about = {"penetration": condition.penetration, "lidar": condition.lidar, "receiver": condition.receiver}
     about |= {"egos": len(np.unique(overhead.subset)), "vehicles": len(np.unique(overhead.vehicle))}
-    about |= {"samples": len(overhead), "missed_vehicles": int(missed.sum()), "false_vehicles": len(feeds.ghosts)}
-    about |= bound("missed_share", missed[:, None], overhead, squared=False)
+    about |= {"samples": len(overhead), "warnings_due": int(due.sum())}
+    about |= {"vehicles_due": len(np.unique(overhead.vehicle[due]))}
+    about |= bound("missed_share", missed, overhead.vehicle)
+    about |= bound("false_share", false, np.append(perceived.vehicle, strange))
     for model in models:
+        row = {**about, "model": model.name}
+        key = model.name, overhead.feature.tobytes()
+        if key not in seen:
+            seen[key] = predict_places(model.name, model.predict, overhead)
+        places = [seen[key], model.predict(perceived) if len(perceived) else perceived.place_m]
         warned = np.zeros(len(overhead), bool)
-        warned[feeds.shared] = warns(model, perceived)
-        figures = {"overhead": overhead.select(feeds.shared), "perceived": perceived}
-        row = {**about, "model": model.name, "warnings_due": int(due.sum())}
-        row |= {"overhead_missed_warnings": int((due & ~warns(model, overhead)).sum())}
-        row |= {"overhead_false_warnings": int((~due & warns(model, overhead)).sum())}
-        row |= {"perceived_missed_warnings": int((due & ~warned).sum())}
-        row |= {"perceived_false_warnings": int((~due & warned).sum() + warns(model, feeds.ghosts).sum())}
-        for feed, samples in figures.items():
-            measured = measure_samples(model, samples, predict_places(model.name, model.predict, samples))
-            row |= bound(f"{feed}_rmse_m", measured["rmse_m"][:, -1:], samples, squared=True)
-            row |= bound(f"{feed}_nll_nats", measured["nll_nats"][:, -1:], samples, squared=False)
+        warned[feeds.shared] = find_overlaps(perceived, places[1]) > NEVER
+        strange_warned = find_overlaps(ghosts, model.predict(ghosts)) > NEVER if len(ghosts) else np.zeros(0, bool)
+        for feed, own, wrong in (
+            ("overhead", find_overlaps(overhead, places[0]) > NEVER, strange_warned[:0]),
+            ("perceived", warned, strange_warned),
+        ):
+            row |= bound(f"{feed}_missed_warnings", (~own[due]).astype(np.float64), overhead.vehicle[due])
+            strangers = np.append(overhead.vehicle[~due], strange[: len(wrong)])
+            row |= bound(f"{feed}_false_warnings", np.append(own[~due], wrong).astype(np.float64), strangers)
+        shared = overhead.select(feeds.shared)
+        for feed, samples, place_m in (
+            ("overhead", shared, places[0][feeds.shared]),
+            ("perceived", perceived, places[1]),
+        ):
+            measured = measure_samples(model, samples, place_m)
+            row |= bound(f"{feed}_rmse_m", measured["rmse_m"][:, -1], samples.vehicle, squared=True)
+            row |= bound(f"{feed}_nll_nats", measured["nll_nats"][:, -1], samples.vehicle)
         yield {**row, "n": len(perceived), "seconds": V2V.scored_s[-1]}
 
 
-def warns(model: Forecaster, samples: Samples) -> np.ndarray:
-    """Find the samples that a model warns of."""
-    if not len(samples):
-        return np.zeros(0, bool)
-    return find_overlaps(samples, predict_places(model.name, model.predict, samples)) > NEVER
-
-
-def bound(name: str, values: Floats, samples: Samples, *, squared: bool) -> dict[str, float | None]:
-    """Return the mean of (B, 1) values with its 95 % interval over vehicles; the root of all three for squares."""
+def bound(
+    name: str, values: Floats, vehicles: npt.NDArray[np.str_], *, squared: bool = False
+) -> dict[str, float | None]:
+    """Return the mean of (B,) values with its 95 % interval over vehicles; the root of all three for squares."""
     names = (name, f"{name}_low", f"{name}_high")
     if not len(values):
         return dict.fromkeys(names)
-    vehicle = np.unique(samples.vehicle, return_inverse=True)[1]
-    low, high = bootstrap_mean(values, vehicle)
+    low, high = bootstrap_mean(values[:, None], np.unique(vehicles, return_inverse=True)[1])
     figures = (float(values.mean()), float(low[0]), float(high[0]))
     return dict(zip(names, (figure**0.5 if squared else figure for figure in figures), strict=True))
 
