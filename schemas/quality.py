@@ -294,6 +294,8 @@ class ShownSettings(TypedDict, total=False):
     split: Annotated[str, "split that tensors are made of"]
     splits: Annotated[list[str], "splits that are made"]
     tensor_positions: Annotated[str, "storage of positions in tensors: float32, or whole decimetres or centimetres"]
+    onboard_lidar: Annotated[bool, "true: LiDAR is used to track the vehicles around an ego"]
+    onboard_camera: Annotated[bool, "true: camera boxes are used to track the vehicles around an ego"]
     split_seed: Annotated[int, "seed of the splits' searches and draws"]
     split_block_s: Annotated[float, "time-blocks: length of a block"]
     split_purge_s: Annotated[float, "time-blocks: time between two blocks"]
