@@ -102,7 +102,7 @@ def digest_series(series: pl.Series) -> str:
     """The digest of dtype and values, nulls included."""
     head = f"{series.dtype} {len(series)}\n".encode()
     if not series.dtype.is_numeric():
-        return digest([head, json.dumps(series.to_list()).encode()])
+        return digest([head, json.dumps(series.to_list(), default=str).encode()])
     values = series.fill_null(0).to_numpy()
     return digest([head, digest_array(series.is_null().to_numpy()).encode(), digest_array(values).encode()])
 
@@ -114,8 +114,9 @@ def digest_json(value: object) -> str:
 
 def digest_files(source: Path) -> Digests:
     """The raw files."""
-    files = sorted(path for path in source.iterdir() if path.name not in NO_DATA)
-    return {"files": digest(part for path in files for part in (f"{path.name}\n".encode(), path.read_bytes()))}
+    files = sorted(path for path in source.rglob("*") if path.is_file() and path.name not in NO_DATA)
+    names = ((path, path.relative_to(source).as_posix()) for path in files)
+    return {"files": digest(part for path, name in names for part in (f"{name}\n".encode(), path.read_bytes()))}
 
 
 def digest_tables(root: Path) -> Digests:
