@@ -18,7 +18,7 @@ COMMANDS = {
     "run": "Run the whole pipeline: raw files to tables, checks, samples, split, tensors, first score and report.",
     "ingest": "Read raw files into tracks, vehicles and subsets (the format is detected).",
     "remove": "Take recordings out of the lake, with all that was made of them; raw files stay.",
-    "validate": "Check every entry of recordings from above against the rules; `run` also checks drives.",
+    "validate": "Check every entry of recordings from above against the rules; `tracklake run` also checks drives.",
     "repair": "Find late starts and estimate what is missing of them.",
     "samples": "Draw samples with maneuvers and neighbors.",
     "split": "Divide the subsets into train and eval.",
