@@ -21,6 +21,12 @@ from tracklake.schemas.perception import LIDAR_CLUSTERS as LIDAR_CLUSTERS
 from tracklake.schemas.perception import LIDAR_RETURNS as LIDAR_RETURNS
 from tracklake.schemas.perception import SURROUNDING as SURROUNDING
 from tracklake.schemas.perception import SURROUNDING_TRUTH as SURROUNDING_TRUTH
+from tracklake.schemas.reconstruction import RECONSTRUCTED as RECONSTRUCTED
+from tracklake.schemas.reconstruction import RECONSTRUCTED_FINDINGS as RECONSTRUCTED_FINDINGS
+from tracklake.schemas.reconstruction import RECONSTRUCTED_SUBSET_SCORES as RECONSTRUCTED_SUBSET_SCORES
+from tracklake.schemas.reconstruction import RECONSTRUCTION_QUALITY as RECONSTRUCTION_QUALITY
+from tracklake.schemas.reconstruction import RECONSTRUCTION_SKIPS as RECONSTRUCTION_SKIPS
+from tracklake.schemas.reconstruction import UNKEPT_BOUNDS as UNKEPT_BOUNDS
 from tracklake.schemas.samples import NEIGHBORS as NEIGHBORS
 from tracklake.schemas.samples import SAMPLE_COUNTS as SAMPLE_COUNTS
 from tracklake.schemas.samples import SAMPLE_DROPS as SAMPLE_DROPS
@@ -38,6 +44,11 @@ from tracklake.schemas.start_assessments import START_ASSESSMENTS as START_ASSES
 from tracklake.schemas.subsets import SUBSET_STATUS as SUBSET_STATUS
 from tracklake.schemas.subsets import SUBSETS as SUBSETS
 from tracklake.schemas.tracks import TRACKS as TRACKS
+from tracklake.schemas.traffic import CAR_FOLLOWING as CAR_FOLLOWING
+from tracklake.schemas.traffic import EDIE as EDIE
+from tracklake.schemas.traffic import LANE_CHANGE_EVENTS as LANE_CHANGE_EVENTS
+from tracklake.schemas.traffic import SAFETY as SAFETY
+from tracklake.schemas.traffic import VIRTUAL_DETECTORS as VIRTUAL_DETECTORS
 from tracklake.schemas.vehicles import VEHICLE_STARTS as VEHICLE_STARTS
 from tracklake.schemas.vehicles import VEHICLES as VEHICLES
 
@@ -59,6 +70,17 @@ TABLES: tuple[Table, ...] = (
     START_CUTOFFS,
     MISSING_STARTS,
     START_ASSESSMENTS,
+    RECONSTRUCTED,
+    RECONSTRUCTION_QUALITY,
+    RECONSTRUCTION_SKIPS,
+    UNKEPT_BOUNDS,
+    RECONSTRUCTED_FINDINGS,
+    RECONSTRUCTED_SUBSET_SCORES,
+    CAR_FOLLOWING,
+    LANE_CHANGE_EVENTS,
+    SAFETY,
+    VIRTUAL_DETECTORS,
+    EDIE,
     SAMPLES,
     SAMPLE_DROPS,
     SAMPLE_COUNTS,

@@ -1,0 +1,1 @@
+"""Reconstruction: physically possible tracks near the recorded ones; noise, smoothing, bounds, causal filter."""

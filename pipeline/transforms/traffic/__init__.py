@@ -1,0 +1,1 @@
+"""Derived tables for traffic research: car following, lane changes, safety, detectors, Edie's figures."""
