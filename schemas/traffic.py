@@ -114,10 +114,13 @@ VIRTUAL_DETECTORS = Table(
         "vehicles": column(pl.Int32, "fronts that crossed", ge=0),
         "flow_vph": column(pl.Float64, "vehicles / seconds", unit="veh/h", ge=0),
         "time_mean_speed_mps": column(
-            pl.Float64, "arithmetic mean of the crossing speeds; null where nobody crossed", unit="m/s", nullable=True
+            pl.Float64,
+            "arithmetic mean of the crossing speeds; null where no vehicle crossed",
+            unit="m/s",
+            nullable=True,
         ),
         "space_mean_speed_mps": column(
-            pl.Float64, "harmonic mean of the crossing speeds; null where nobody crossed", unit="m/s", nullable=True
+            pl.Float64, "harmonic mean of the crossing speeds; null where no vehicle crossed", unit="m/s", nullable=True
         ),
         "occupancy": column(
             pl.Float64,
