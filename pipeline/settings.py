@@ -86,6 +86,7 @@ class Settings(BaseModel):
     max_backward_share: float = Field(
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"
     )
+    car_following_min_s: float = Field(2.0, ge=0, description="car_following: shortest episode, s")
     on_ramp_lanes: dict[str, list[Annotated[int, Field(ge=1)]]] = Field(
         default_factory=dict, description="lanes that are on-ramps by site, where the source does not state them"
     )
@@ -116,9 +117,7 @@ class Settings(BaseModel):
     onboard_camera: bool = Field(True, description="drives: camera boxes are used to track the vehicles around the ego")
     split_seed: int = Field(0, ge=0, description="seed of the splits' searches and draws")
     split_block_s: float = Field(120.0, ge=10, description="time-blocks: length of a block, s")
-    split_purge_s: float = Field(
-        8.0, ge=0, description="time-blocks: time between two blocks, s; at least history and future"
-    )
+    split_purge_s: float = Field(8.0, ge=0, description="time-blocks: s between blocks, at least history and future")
     drop_cut_samples: bool = Field(
         False, description="time-blocks: samples of val and eval with a neighbor that is cut off are left out"
     )

@@ -48,6 +48,7 @@ from tracklake.schemas.traffic import CAR_FOLLOWING as CAR_FOLLOWING
 from tracklake.schemas.traffic import EDIE as EDIE
 from tracklake.schemas.traffic import LANE_CHANGE_EVENTS as LANE_CHANGE_EVENTS
 from tracklake.schemas.traffic import SAFETY as SAFETY
+from tracklake.schemas.traffic import TRAFFIC_SKIPS as TRAFFIC_SKIPS
 from tracklake.schemas.traffic import VIRTUAL_DETECTORS as VIRTUAL_DETECTORS
 from tracklake.schemas.vehicles import VEHICLE_STARTS as VEHICLE_STARTS
 from tracklake.schemas.vehicles import VEHICLES as VEHICLES
@@ -81,6 +82,7 @@ TABLES: tuple[Table, ...] = (
     SAFETY,
     VIRTUAL_DETECTORS,
     EDIE,
+    TRAFFIC_SKIPS,
     SAMPLES,
     SAMPLE_DROPS,
     SAMPLE_COUNTS,

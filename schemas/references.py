@@ -139,10 +139,28 @@ GRAVES = Reference(
     "outputs as bivariate normal densities",
     url="https://arxiv.org/abs/1308.0850",
 )
+TREIBER_2013 = Reference(
+    "Treiber and Kesting (2013)",
+    "Treiber, M., Kesting, A. (2013). Microscopic Calibration and Validation of Car-Following Models: A Systematic "
+    "Approach. Procedia - Social and Behavioral Sciences 80, 922-939.",
+    "driving regimes of car following",
+    doi="10.1016/j.sbspro.2013.05.050",
+)
+SHARMA = Reference(
+    "Sharma, Zheng and Bhaskar (2018)",
+    "Sharma, A., Zheng, Z., Bhaskar, A. (2018). A pattern recognition algorithm for assessing trajectory completeness. "
+    "Transportation Research Part C 96, 432-457.",
+    "driving regimes of car following",
+)
+VOGEL = Reference(
+    "Vogel (2002)",
+    "Vogel, K. (2002). What characterizes a free vehicle in an urban area? Transportation Research Part F 5(1), 15-29.",
+    "the time headway beyond which a vehicle is free",
+)
 
 REFERENCES = (
     *(HAMALAINEN, NGSIM, KRAJEWSKI, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
-    GRAVES,
+    *(GRAVES, TREIBER_2013, SHARMA, VOGEL),
 )
 """All references, the one whose method tracklake builds on first."""
 

@@ -4,14 +4,13 @@ import polars as pl
 
 from tracklake.schemas.columns import PLACE, Table, column
 
-BEGINNINGS = ("recording", "cut_in", "lane_change", "leader_left", "appeared")
-"""How an episode of car following begins: it was under way when first seen; a vehicle cut in and became the leader; the
-follower changed its lane; the leader before left the lane; leader or follower appeared on the road in view."""
-ENDS = ("recording", "cut_in", "lane_change", "leader_left", "vanished")
-"""How an episode of car following ends: it was under way when last seen; another vehicle cut in between; the follower
-changed its lane; the leader left the lane (cut-out); leader or follower ended on the road in view."""
-REGIMES = ("standing", "free", "following", "approaching", "falling_back", "braking", "accelerating")
-"""Regimes of car following, of one entry each."""
+BOUNDARIES = ("view", "lane_change", "cut_in", "leader_left", "renamed")
+"""How an episode of car following begins or ends, the first that applies: one of the two tracks begins, ends or has a
+gap there, so that the episode may go on unseen; the follower changes its lane; a vehicle cuts in and is the new leader;
+the leader leaves the lane, or the view (cut-out); the source names another leader, none, or no lane, without any of
+these."""
+REGIMES = ("standing", "free_acceleration", "cruising", "accelerating", "following", "decelerating")
+"""Driving regimes, of one entry each; docs/DESIGN.md defines them (Treiber and Kesting 2013; Sharma et al. 2018)."""
 MEASURES = ("ttc_s", "drac_mps2", "time_headway_s", "pet_s")
 """Surrogate measures of safety: time to collision, deceleration rate to avoid a crash, time headway, post-encroachment
 time."""
@@ -29,17 +28,25 @@ CAR_FOLLOWING = Table(
         "last_frame": column(pl.Int32, "last entry of the episode"),
         "entries": column(pl.Int32, "entries in the episode", ge=1),
         "seconds": column(pl.Float64, "from the first to the last entry", unit="s", ge=0),
-        "begins_by": column(pl.String, "how the episode begins", isin=BEGINNINGS),
-        "ends_by": column(pl.String, "how the episode ends", isin=ENDS),
+        "begins_by": column(pl.String, "how the episode begins (docs/DESIGN.md)", isin=BOUNDARIES),
+        "ends_by": column(pl.String, "how the episode ends", isin=BOUNDARIES),
         "cut_in": column(pl.Boolean, "it begins or ends by a vehicle that cuts in"),
         "cut_out": column(pl.Boolean, "it ends by the leader's leaving the lane, or begins by that of the one before"),
         **{
-            f"{regime}_share": column(pl.Float64, f"share of the entries in the regime `{regime}`", ge=0, le=1)
+            f"{regime}_share": column(
+                pl.Float64,
+                f"share of the entries in the regime `{regime}`; null without accelerations",
+                nullable=True,
+                ge=0,
+                le=1,
+            )
             for regime in REGIMES
         },
         "mean_speed_mps": column(pl.Float64, "mean speed of the follower", unit="m/s"),
-        "mean_gap_m": column(pl.Float64, "mean bumper-to-bumper gap", unit="m"),
-        "least_gap_m": column(pl.Float64, "least bumper-to-bumper gap; negative = overlap", unit="m"),
+        "mean_gap_m": column(
+            pl.Float64, "mean bumper-to-bumper gap; null where the leader's length is unknown", unit="m", nullable=True
+        ),
+        "least_gap_m": column(pl.Float64, "least bumper-to-bumper gap; negative = overlap", unit="m", nullable=True),
         "least_ttc_s": column(
             pl.Float64, "least time to collision; null where the gap never closes", unit="s", nullable=True, ge=0
         ),
@@ -149,5 +156,36 @@ EDIE = Table(
         "flow_vph": column(pl.Float64, "distance / (length * seconds)", unit="veh/h"),
         "density_vpkm": column(pl.Float64, "time / (length * seconds)", unit="veh/km", ge=0),
         "speed_mps": column(pl.Float64, "distance / time; null where no time was spent", unit="m/s", nullable=True),
+    },
+)
+
+SKIPPED = {
+    "arterial": "entries of arterials, which these tables leave out",
+    "one_entry": "vehicles with one entry, which have no motion",
+    "frame_gap": "pairs of successive entries of a vehicle with frames missing between them",
+    "no_lane": "entries without a lane",
+    "no_leader_known": "entries of a source that names no leaders",
+    "leader_absent": "entries whose leader has no entry at that frame",
+    "leader_in_other_lane": "entries whose leader, as recorded, is in another lane",
+    "no_gap": "entries whose leader's length is unknown",
+    "short_episode": "episodes shorter than the setting `car_following_min_s`",
+    "lane_flicker": "stays of under 2 s in a lane between two in the same other lane",
+    "no_extent": "entries of a subset whose section or recording has no length",
+}
+"""Reasons why something has no row in a derived table, and what is counted then."""
+DERIVED_TABLES = (CAR_FOLLOWING, LANE_CHANGE_EVENTS, SAFETY, VIRTUAL_DETECTORS, EDIE)
+
+TRAFFIC_SKIPS = Table(
+    "traffic_skips",
+    "One row per derived table and reason: what has no row in the table.",
+    key=("derived_table", "reason"),
+    columns={
+        **PLACE,
+        "derived_table": column(
+            pl.String, "the table that lacks it", isin=tuple(table.name for table in DERIVED_TABLES)
+        ),
+        "reason": column(pl.String, "why", isin=tuple(SKIPPED)),
+        "counted": column(pl.String, "what is counted", isin=tuple(SKIPPED.values())),
+        "number": column(pl.Int64, "how many", ge=1),
     },
 )

@@ -20,6 +20,7 @@ COMMANDS = {
     "remove": "Take recordings out of the lake, with all that was made of them; raw files stay.",
     "validate": "Check every entry of recordings from above against the rules; `tracklake run` also checks drives.",
     "repair": "Find late starts and estimate what is missing of them.",
+    "traffic": "Derive tables for traffic research: car following, lane changes, safety, detectors, flow and density.",
     "samples": "Draw samples with maneuvers and neighbors.",
     "split": "Divide the subsets into train and eval.",
     "tensors": "Write the split as flat arrays.",
@@ -41,7 +42,7 @@ COMMANDS = {
 }
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
 
-MODULES = {"validate": "stage", "samples": "stage", "tensors": "stage", "fuse": "stage"}
+MODULES = {"validate": "stage", "traffic": "stage", "samples": "stage", "tensors": "stage", "fuse": "stage"}
 """Modules of the commands that have none of their own."""
 DIAGNOSIS = "Diagnosis"
 """Title of the options that every command takes, on its help page."""

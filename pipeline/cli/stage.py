@@ -1,4 +1,4 @@
-"""`tracklake validate`, `samples`, `tensors` and `fuse`: stages without options of their own."""
+"""`tracklake validate`, `traffic`, `samples`, `tensors` and `fuse`: stages without options of their own."""
 
 from collections.abc import Callable
 
@@ -27,6 +27,7 @@ def _make_command(name: str) -> Callable[..., None]:
 
 
 validate = _make_command("validate")
+traffic = _make_command("traffic")
 samples = _make_command("samples")
 tensors = _make_command("tensors")
 fuse = _make_command("fuse")

@@ -13,6 +13,7 @@ from tracklake.pipeline.stages import (
     score,
     split,
     tensors,
+    traffic,
     validate,
 )
 from tracklake.pipeline.stages.stage import Stage
@@ -21,6 +22,7 @@ STAGES: tuple[Stage, ...] = (
     validate.STAGE,
     repair.STAGE,
     assess.STAGE,
+    traffic.STAGE,
     samples.STAGE,
     split.STAGE,
     tensors.STAGE,

@@ -36,6 +36,19 @@ def add_gaps(tracks: pl.DataFrame, vehicles: pl.DataFrame, *, use_recorded_headw
     return tracks.with_columns(pl.Series("gap_m", gap_m, nan_to_null=True).round(3))
 
 
+def find_rows(
+    ids: npt.NDArray[np.int32], frames: npt.NDArray[np.int32], wanted: npt.NDArray[np.integer]
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    """Find the row of vehicle `wanted[i]` at the frame of entry i, (N,), and whether there is one.
+
+    The entries are sorted by vehicle and frame.
+    """
+    known = ids[find_run_starts(ids)]
+    at = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+    row, is_present = _find_rows(ids, frames, known, at)
+    return row, is_present & (known[at] == wanted) if ids.size else is_present
+
+
 def _find_rows(
     ids: npt.NDArray[np.int32], frames: npt.NDArray[np.int32], known: npt.NDArray[np.int32], at: npt.NDArray[np.intp]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
