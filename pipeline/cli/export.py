@@ -11,6 +11,7 @@ from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOptio
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.pipeline.export.csp.export import export_csp
 from tracklake.pipeline.export.csp.result import CspExport, CspOptions
+from tracklake.pipeline.export.sumo.export import CONFIG, export_sumo_fcd
 from tracklake.pipeline.export.windows.export import export_windows
 from tracklake.pipeline.export.windows.result import Format
 from tracklake.pipeline.settings import Settings
@@ -90,6 +91,30 @@ def npz(
     """Write NumPy arrays of samples, their histories, futures and neighbors; a file per part, and a data card."""
     with command(quiet=quiet, json=json) as terminal:
         _write_windows(terminal, read_settings(lake=lake, protocol=protocol), out, "npz", absolute, force)
+
+
+@export.command()
+def sumo_fcd(
+    out: OutOption,
+    lake: LakeOption = None,
+    subset: Annotated[
+        str | None, typer.Option("--subset", help="Carriageway to export; not needed where the lake has only one.")
+    ] = None,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write a carriageway's tracks as SUMO's floating-car data, with its road and a configuration that replays them."""
+    with command(quiet=quiet, json=json) as terminal:
+        with terminal.show_stages():
+            written = export_sumo_fcd(read_settings(lake=lake), out, subset, force=force)
+        terminal.print_origin(written.synthetic)
+        counts = f"{written.vehicles:,} vehicles, {written.entries:,} entries, {written.lanes} lanes"
+        terminal.print_line(f"{written.dataset}/{written.subset}, {written.tracks_from} tracks: {counts}")
+        for note in (*written.notes, *(f"licence of {own}" for own in written.licences)):
+            terminal.print_line(note, style="dim")
+        terminal.print_line(f"in {written.out}; replay: sumo-gui -c {written.out / CONFIG}", style="bold green")
+        terminal.print_json(written.to_dict())
 
 
 def _write_windows(

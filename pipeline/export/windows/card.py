@@ -9,9 +9,9 @@ from typing import Any
 
 import polars as pl
 
+from tracklake.pipeline.export.provenance import describe_licences, describe_provenance
 from tracklake.pipeline.export.windows.files import list_columns, list_npz_arrays
 from tracklake.pipeline.export.windows.result import WindowsExport
-from tracklake.pipeline.sources import SOURCES
 from tracklake.schemas.columns import PARTS
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -52,7 +52,8 @@ def write_card(path: Path, export: WindowsExport, folder: TensorFolder, facts: p
         "",
         *([f"**{export.synthetic}**", ""] if export.synthetic else []),
         *_describe_counts(export, folder),
-        *_describe_provenance(facts),
+        *describe_licences(facts, "Windows"),
+        *describe_provenance(facts),
         *_describe_protocol(folder),
         *_describe_split(folder.index),
         "## What the files hold",
@@ -73,30 +74,7 @@ def _describe_counts(export: WindowsExport, folder: TensorFolder) -> list[str]:
         subsets = ", ".join(sorted(folder.subsets_of(part))) or "-"
         counts = f"{export.samples[part]:,} | {export.neighbors[part]:,}"
         lines.append(f"| {part}.{export.format} | {counts} | {subsets} |")
-    lines += ["", "## Licence", "", *(f"- {note}" for note in export.notes), ""]
-    if all(origin == "synthetic" for origin in folder.origins.values()):
-        return lines
-    return [
-        *lines,
-        "Windows are the recordings' data in another form: each data set's licence applies to them too.",
-        "",
-    ]
-
-
-def _describe_provenance(facts: pl.DataFrame) -> list[str]:
-    lines = [
-        "## Provenance",
-        "",
-        "| subset | recording | vehicles | file | sha256 |",
-        "| --- | --- | ---: | --- | --- |",
-    ]
-    for row in facts.iter_rows(named=True):
-        for file in row["source_files"] or [{"file": "-", "sha256": "-"}]:
-            subset = f"{row['dataset']}/{row['subset']} | {row['recording']} | {row['vehicles']:,}"
-            lines.append(f"| {subset} | {file['file']} | {file['sha256']} |")
-    used = set(facts.filter(pl.col("origin") == "recorded")["dataset"])
-    cited = [line for source in SOURCES if source.name in used for line in (f"Cite: {source.citation}", "")]
-    return [*lines, "", *cited]
+    return [*lines, ""]
 
 
 def _describe_protocol(folder: TensorFolder) -> list[str]:
