@@ -45,7 +45,7 @@ CORE := tests/test_extras.py tests/schemas tests/quality_reports/rules tests/pip
 test-lowest: install
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
 	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct \
-		--editable ".[flows,report,forest,matlab,sample,dev]"
+		--editable ".[flows,report,forest,matlab,reconstruct,sample,dev]"
 	$(LOWEST)/bin/pytest -n 2 --dist loadgroup $(CORE)
 
 # mypy and import-linter read folders, not what an import finds: links give the packages their installed names.

@@ -10,6 +10,7 @@ EXTRAS = {
     "training": ("torch",),
     "forest": ("sklearn", "skops"),
     "matlab": ("scipy",),
+    "reconstruct": ("scipy",),
     "sample": ("sumo",),
     "distributed": ("prefect_dask",),
     "onboard": ("pyproj", "rosbags", "scipy", "sklearn"),

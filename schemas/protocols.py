@@ -8,6 +8,7 @@ from typing import Literal
 from tracklake.schemas.hashing import hash_values
 
 Headline = Literal["rmse", "rmse-by-axis", "mae"]
+TracksFrom = Literal["recorded", "filtered", "reconstructed"]
 
 HEADLINES: Mapping[Headline, str] = {
     "rmse": "square root of the mean squared distance between predicted and true place",
@@ -16,6 +17,10 @@ HEADLINES: Mapping[Headline, str] = {
 }
 """Errors by name that published tables state and that ours show first."""
 
+
+RECORDED: TracksFrom = "recorded"
+RECONSTRUCTED_TRACKS: TracksFrom = "reconstructed"
+"""Names of the tracks as recorded, and of those with reconstructed positions."""
 
 LAST_LANES = {"us-101": 6}
 """Highest lane by site in the script of convolutional social pooling, where lanes with higher numbers count as it."""
@@ -39,6 +44,8 @@ class Protocol:
         scored_s: seconds ahead at which errors are stated; of those beyond the horizon there are none.
         headline: which error, of HEADLINES.
         fold_lanes: whether lanes beyond LAST_LANES count as the last one, for maneuvers and neighbors.
+        tracks_from: which tracks samples and positions are of: recorded, filtered by past entries alone, or
+            reconstructed from all entries.
     """
 
     name: str
@@ -53,6 +60,7 @@ class Protocol:
     scored_s: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     headline: Headline = "rmse"
     fold_lanes: bool = False
+    tracks_from: TracksFrom = RECORDED
 
     @property
     def history_ticks(self) -> int:
@@ -89,8 +97,9 @@ class Protocol:
 
     @property
     def _parameters(self) -> dict[str, object]:
-        """Parameters that are hashed; lanes that are not folded are no parameter, as before there was one."""
-        return {name: value for name, value in asdict(self).items() if name != "fold_lanes" or value}
+        """Parameters that are hashed: those that came later only where they are not as everything was before."""
+        before = {"fold_lanes": False, "tracks_from": RECORDED}
+        return {name: value for name, value in asdict(self).items() if name not in before or value != before[name]}
 
 
 CSP = Protocol(name="csp", fold_lanes=True)

@@ -43,6 +43,7 @@ NEEDS = {
     ("validate",): ("flows",),
     ("repair",): ("flows",),
     ("repair", "--assess"): ("flows", "report"),
+    ("reconstruct",): ("flows",),
     ("samples",): ("flows",),
     ("split",): ("flows",),
     ("tensors",): ("flows",),

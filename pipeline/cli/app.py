@@ -19,6 +19,7 @@ COMMANDS = {
     "ingest": "Read raw files into tracks, vehicles and subsets (the format is detected).",
     "remove": "Take recordings out of the lake, with all that was made of them; raw files stay.",
     "validate": "Check every entry of recordings from above against the rules; `tracklake run` also checks drives.",
+    "reconstruct": "Reconstruct physically possible tracks near the recorded ones, and check them against the rules.",
     "repair": "Find late starts and estimate what is missing of them.",
     "traffic": "Derive tables for traffic research: car following, lane changes, safety, detectors, flow and density.",
     "samples": "Draw samples with maneuvers and neighbors.",
@@ -42,7 +43,7 @@ COMMANDS = {
 }
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
 
-MODULES = {"validate": "stage", "traffic": "stage", "samples": "stage", "tensors": "stage", "fuse": "stage"}
+MODULES = dict.fromkeys(("validate", "reconstruct", "traffic", "samples", "tensors", "fuse"), "stage")
 """Modules of the commands that have none of their own."""
 DIAGNOSIS = "Diagnosis"
 """Title of the options that every command takes, on its help page."""

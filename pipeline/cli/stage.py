@@ -1,4 +1,4 @@
-"""`tracklake validate`, `traffic`, `samples`, `tensors` and `fuse`: stages without options of their own."""
+"""Commands of stages that have no options of their own, such as `tracklake validate`."""
 
 from collections.abc import Callable
 
@@ -8,8 +8,8 @@ from tracklake.pipeline.cli.session import report_result, run_steps
 from tracklake.pipeline.stages.registry import STAGES
 
 
-def _make_command(name: str) -> Callable[..., None]:
-    """Make the command of a stage, with the stage's meaning as its help."""
+def _make_command(name: str, *others: str) -> Callable[..., None]:
+    """Make the command of a stage, and of others that follow it; its help is the first stage's meaning."""
 
     def run_stage(
         lake: LakeOption = None,
@@ -20,13 +20,14 @@ def _make_command(name: str) -> Callable[..., None]:
     ) -> None:
         with command(quiet=quiet, json=json) as terminal:
             settings = read_settings(lake=lake, workers=workers, protocol=protocol)
-            report_result(terminal, settings, run_steps(terminal, settings, (name,)), headline=False)
+            report_result(terminal, settings, run_steps(terminal, settings, (name, *others)), headline=False)
 
     run_stage.__doc__ = next(stage.meaning for stage in STAGES if stage.name == name)
     return run_stage
 
 
 validate = _make_command("validate")
+reconstruct = _make_command("reconstruct", "revalidate")
 traffic = _make_command("traffic")
 samples = _make_command("samples")
 tensors = _make_command("tensors")

@@ -49,7 +49,7 @@ def describe_stages(root: Path, manifest: Manifest, settings: Settings) -> list[
     for stage in STAGES:
         # Pages and the report come after no stage, but show what all have made.
         shown = [name for name in waiting if manifest.of_stage(name)]
-        before = [name for name in stage.after or shown if name in waiting]
+        before = [name for name in stage.list_inputs(settings) or shown if name in waiting]
         commits = {commit.key: commit for commit in manifest.of_stage(stage.name)}
         try:
             if before:

@@ -22,14 +22,17 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.column_mapping import load_mapping
 from tracklake.pipeline.stages.planner import Planner, find_pending
 from tracklake.pipeline.stages.registry import STAGES
-from tracklake.pipeline.stages.stage import INGEST, Job, Stage
+from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Job, Stage
 from tracklake.schemas.errors import UsageError
-from tracklake.schemas.extras import require_extras
+from tracklake.schemas.extras import find_missing, require_extras
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 
 ALL_STEPS = (INGEST, *(stage.name for stage in STAGES))
 """Every step of `tracklake run`, in order."""
 QUALITY_STEPS = ("validate", "repair", "assess", "report")
 """Steps of the flow that checks what is in the lake."""
+OPTIONAL_STEPS = (RECONSTRUCTION, "revalidate")
+"""Steps that `tracklake run` leaves out where the setting `reconstruct` is false or the extra is not installed."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +78,14 @@ class RunRequest:
         """Refuse paths and missing packages that would only fail in a later stage.
 
         Raises:
-            MissingExtraError: Prefect is not installed, or what draws the requested report is not.
+            MissingExtraError: Prefect is not installed, or what a requested step needs is not.
             UsageError: the path of the lake or the source is no UTF-8 text.
         """
         require_extras("the pipeline", "flows", *(("report",) if "report" in self.steps else ()))
+        if self.get_settings().tracks_from == RECONSTRUCTED_TRACKS:
+            require_extras('tracks_from = "reconstructed"', "reconstruct")
+        if RECONSTRUCTION in self.steps and INGEST not in self.steps:
+            require_extras("`tracklake reconstruct`", "reconstruct")
         for name, path in (("lake", self.root), ("SOURCE", self.origin)):
             full = str(path.resolve())
             if any(0xD800 <= ord(character) <= 0xDFFF for character in full):
@@ -89,7 +96,13 @@ class RunRequest:
     def list_stages(self) -> list[Stage]:
         """Return the requested stages after ingestion; with the report, the pages that it links to."""
         wanted = {*self.steps, *({"pages", "drive_pages"} if "report" in self.steps else ())}
-        return [stage for stage in STAGES if stage.name in wanted]
+        return [stage for stage in STAGES if stage.name in wanted.difference(self.list_left_out())]
+
+    def list_left_out(self) -> tuple[str, ...]:
+        """Return the optional steps that a run leaves out by its settings, or as their extra is not installed."""
+        if INGEST not in self.steps or (self.get_settings().reconstruct and not find_missing("reconstruct")):
+            return ()
+        return tuple(step for step in self.steps if step in OPTIONAL_STEPS)
 
 
 @dataclass
@@ -260,6 +273,14 @@ def remove_missing(writer: Writer, request: RunRequest, plan: IngestPlan, result
         result.notes += explain_missing(plan)
 
 
+def remove_outdated(writer: Writer, request: RunRequest, settings: Settings) -> None:
+    """Remove reconstructed tracks of recordings that have changed, where the run does not reconstruct them again."""
+    if left_out := request.list_left_out():
+        jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(RECONSTRUCTION)
+        tails = {job.tail for job in jobs} | {key.partition("/")[2] for key in stale}
+        writer.remove({f"{step}/{tail}" for step in left_out for tail in tails})
+
+
 def explain_missing(plan: IngestPlan) -> list[str]:
     """Return a note about the recordings that are in the lake although their files are missing from the source."""
     if not plan.missing:
@@ -278,6 +299,16 @@ def explain_not_rebuilt(before: set[str], manifest: Manifest) -> list[str]:
     return [
         f"{', '.join(missing)}: in the lake before it was rebuilt, and not in it now; "
         "`tracklake run` on the files of these adds them"
+    ]
+
+
+def explain_not_reconstructed(request: RunRequest) -> list[str]:
+    """Return a note where tracks are not reconstructed although no setting says so."""
+    if not request.list_left_out() or not request.get_settings().reconstruct:
+        return []
+    return [
+        "tracks were not reconstructed, which needs the extra [reconstruct]: pip install "
+        '"tracklake[reconstruct]"; everything else is complete'
     ]
 
 

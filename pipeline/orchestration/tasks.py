@@ -33,10 +33,12 @@ from tracklake.pipeline.orchestration.run_plan import (
     RunResult,
     explain_left_out,
     explain_not_rebuilt,
+    explain_not_reconstructed,
     plan_ingest,
     remember_hashes,
     remember_places,
     remove_missing,
+    remove_outdated,
 )
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile, SourceError
@@ -207,6 +209,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
             _ingest(writer, request, plan, result)
         else:
             name_run(request, [commit.tail.rpartition("/")[2] for commit in writer.manifest.of_stage(INGEST)])
+        remove_outdated(writer, request, settings)
         for stage in request.list_stages():
             if result.failed and stage.after:
                 continue  # it builds on what failed; the report, which comes after no stage, shows what there is
@@ -217,6 +220,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
             _build_all(writer, stage.name, jobs, request, result)
         if set(request.steps) & {"repair", "samples", "split", "tensors"}:
             result.notes += explain_left_out(writer.manifest)
+        result.notes += explain_not_reconstructed(request)
         result.notes += explain_not_rebuilt(before, writer.manifest)
         return writer.manifest
 

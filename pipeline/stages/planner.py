@@ -9,8 +9,19 @@ from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load,
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
-from tracklake.pipeline.stages.stage import INGEST, Job, Scope, Stage, StageError, StageResult, make_commit, make_job
+from tracklake.pipeline.stages.stage import (
+    INGEST,
+    RECONSTRUCTION,
+    Job,
+    Scope,
+    Stage,
+    StageError,
+    StageResult,
+    make_commit,
+    make_job,
+)
 from tracklake.schemas import TRACKS
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 
 
 class Planner:
@@ -54,11 +65,12 @@ class Planner:
         if commit is None or commit.fingerprint != job.fingerprint:
             what = f"{stage} of {job.title}" if job.tail else stage
             state = "has not been made" if commit is None else "was made from other inputs or with other settings"
-            raise StageError(f"{what} {state}. Run `tracklake {stage}` first, or `tracklake run` for everything.")
+            command = self._stages[stage].command or stage
+            raise StageError(f"{what} {state}. Run `tracklake {command}` first, or `tracklake run` for everything.")
         return commit
 
     def _plan(self, stage: Stage) -> list[Job]:
-        inputs = {name: self._select(stage, self.require(name)) for name in stage.after}
+        inputs = {name: self._select(stage, self.require(name)) for name in stage.list_inputs(self._settings)}
         values = stage.describe_settings(self._settings)
         extra = stage.extra_inputs(self._root, self._manifest, self._settings) if stage.extra_inputs else {}
 
@@ -91,6 +103,17 @@ class Planner:
             return commits
         others = "subsets" if of_drives else "drives"
         return {key: commit for key, commit in commits.items() if not commit.info.get(others)}
+
+
+def open_reader(manifest: Manifest, settings: Settings) -> LakeReader:
+    """Return the reader of a lake for commands that read tracks as the setting `tracks_from` says.
+
+    Raises:
+        StageError: it says reconstructed, and some recording's tracks are not, or by other settings.
+    """
+    if settings.tracks_from == RECONSTRUCTED_TRACKS:
+        Planner(settings.lake, manifest, settings).require(RECONSTRUCTION)
+    return LakeReader(settings.lake, manifest)
 
 
 def find_recordings(manifest: Manifest) -> list[Commit]:
@@ -146,8 +169,10 @@ def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings
         return [build_job(stage, root, job, settings) for job in jobs]
     started = time.perf_counter()
     manifest = load(root)
-    verify_files(root, {file.path: file for job in jobs for file in _list_inputs(stage, manifest, job)}.values())
-    results = stage.build([LakeReader(root, manifest, stage.after, job) for job in jobs], settings)
+    verify_files(
+        root, {file.path: file for job in jobs for file in _list_inputs(stage, manifest, job, settings)}.values()
+    )
+    results = stage.build([LakeReader(root, manifest, stage.list_inputs(settings), job) for job in jobs], settings)
     assert isinstance(results, list)
     share = (time.perf_counter() - started) * (len(jobs) - 1) / len(jobs)  # each has taken its part of the time
     return [
@@ -168,11 +193,11 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
         return build_jobs(stage, root, [job], settings)[0]
     started = time.perf_counter()
     manifest = load(root)
-    verify_files(root, _list_inputs(stage, manifest, job))
+    verify_files(root, _list_inputs(stage, manifest, job, settings))
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
     notes: list[str] = []
-    for reader in _open_readers(stage, root, manifest, job):
+    for reader in _open_readers(stage, root, manifest, job, settings):
         built = stage.build(reader, settings)
         assert not isinstance(built, list)
         result = built if isinstance(built, StageResult) else StageResult(built)
@@ -186,16 +211,16 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     return make_commit(job, files, {**info, "notes": notes}, started)
 
 
-def _list_inputs(stage: Stage, manifest: Manifest, job: Job) -> Iterator[LakeFile]:
+def _list_inputs(stage: Stage, manifest: Manifest, job: Job, settings: Settings) -> Iterator[LakeFile]:
     """Yield the files that a job may read; a stage that comes after none reads all tables."""
     for commit in manifest.commits.values():
         if commit.tail in ("", job.tail or commit.tail):
-            read = commit.stage in stage.after
+            read = commit.stage in stage.list_inputs(settings)
             yield from (file for file in commit.all_files if read or (not stage.after and file.rows is not None))
 
 
-def _open_readers(stage: Stage, root: Path, manifest: Manifest, job: Job) -> Iterator[LakeReader]:
-    lake = LakeReader(root, manifest, stage.after, job)
+def _open_readers(stage: Stage, root: Path, manifest: Manifest, job: Job, settings: Settings) -> Iterator[LakeReader]:
+    lake = LakeReader(root, manifest, stage.list_inputs(settings), job)
     if stage.scope == "lake":
         yield lake
         return

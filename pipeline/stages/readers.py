@@ -8,8 +8,12 @@ from typing import Any
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.stage import Job
-from tracklake.schemas import SUBSETS, Table
+from tracklake.pipeline.transforms.reconstruction.causal import filter_tracks
+from tracklake.pipeline.transforms.reconstruction.clean_tracks import replace_positions
+from tracklake.schemas import FINDINGS, RECONSTRUCTED, RECONSTRUCTED_FINDINGS, SUBSETS, TRACKS, VEHICLES, Table
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,28 @@ class SubsetReader(LakeReader):
     def facts(self) -> dict[str, Any]:
         """The subset's row of `subsets`, by column."""
         return self.table(SUBSETS).row(0, named=True)
+
+    def read_tracks(self, settings: Settings, *columns: str) -> pl.DataFrame:
+        """Return some columns of the subset's tracks (all where none is named), from what `tracks_from` says."""
+        return self.read_tracks_from(settings.tracks_from, *columns)
+
+    def read_tracks_from(self, tracks_from: TracksFrom, *columns: str) -> pl.DataFrame:
+        """Return tracks as recorded, or with filtered or reconstructed positions; those left out are as recorded.
+
+        Raises as `scan` does.
+        """
+        if tracks_from == RECORDED:
+            return self.table(TRACKS, *columns)
+        recorded = self.table(TRACKS)
+        is_reconstructed = tracks_from == RECONSTRUCTED_TRACKS
+        motion = self.table(RECONSTRUCTED) if is_reconstructed else filter_tracks(recorded, self.facts)
+        tracks = replace_positions(recorded, motion, self.table(VEHICLES, "vehicle_id", "length_m"), self.facts)
+        return tracks.select(columns) if columns else tracks
+
+    def read_findings(self, settings: Settings, *columns: str) -> pl.DataFrame:
+        """Return the findings on the tracks that `read_tracks` returns; on filtered ones, those on the recorded."""
+        is_reconstructed = settings.tracks_from == RECONSTRUCTED_TRACKS
+        return self.table(RECONSTRUCTED_FINDINGS if is_reconstructed else FINDINGS, *columns)
 
     @property
     def clock(self) -> dict[str, Any]:

@@ -7,8 +7,10 @@ from tracklake.pipeline.stages import (
     drive_score,
     fuse,
     pages,
+    reconstruct,
     repair,
     report,
+    revalidate,
     samples,
     score,
     split,
@@ -20,6 +22,8 @@ from tracklake.pipeline.stages.stage import Stage
 
 STAGES: tuple[Stage, ...] = (
     validate.STAGE,
+    reconstruct.STAGE,
+    revalidate.STAGE,
     repair.STAGE,
     assess.STAGE,
     traffic.STAGE,

@@ -2,15 +2,13 @@
 
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
-from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
+from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Stage, StageResult
 from tracklake.pipeline.transforms.samples.selection import TRACK_COLUMNS, draw_samples
 from tracklake.schemas import (
-    FINDINGS,
     MISSING_STARTS,
     SAMPLE_DROPS,
     SAMPLES,
     SUBSET_STATUS,
-    TRACKS,
     VEHICLE_STARTS,
 )
 from tracklake.schemas.protocols import LAST_LANES
@@ -20,10 +18,10 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Draw the samples of a subset."""
     protocol = settings.get_protocol()
     drawn = draw_samples(
-        reader.table(TRACKS, *TRACK_COLUMNS),
+        reader.read_tracks(settings, *TRACK_COLUMNS),
         reader.table(VEHICLE_STARTS),
         reader.table(MISSING_STARTS),
-        reader.table(FINDINGS),
+        reader.read_findings(settings),
         protocol=protocol,
         last_lane=LAST_LANES.get(reader.facts["site"]) if protocol.fold_lanes else None,
         excluded=reader.table(SUBSET_STATUS)["excluded"][0],
@@ -42,6 +40,7 @@ STAGE = Stage(
     meaning="Draw samples with maneuvers and neighbors.",
     scope="freeway recording",
     after=(INGEST, "validate", "repair"),
+    after_reconstruction=(RECONSTRUCTION, "revalidate"),
     settings=(lambda settings: {"protocol": settings.get_protocol().sampling_digest},),
     version=3,
     build=build,

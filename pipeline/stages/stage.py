@@ -14,7 +14,10 @@ from tracklake.pipeline.settings import Settings
 from tracklake.schemas import SCHEMA_VERSION, Table
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.hashing import hash_values
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED
 
+RECONSTRUCTION = "reconstruct"
+"""Name of the stage whose tracks later stages read where the setting `tracks_from` is "reconstructed"."""
 INGEST = "ingest"
 """Name of the stage that makes the recordings; every other stage works on what it committed."""
 Scope = Literal["recording", "freeway recording", "drive", "lake"]
@@ -76,6 +79,9 @@ class Stage:
         scope: what one job works on; freeway recordings are those with freeway subsets, and only these are built.
             Recordings are carriageways seen from above; drives are recordings of an instrumented vehicle.
         after: stages whose tables it reads, `ingest` among them. Without any, it takes the lake as it is.
+        after_reconstruction: stages whose tables it reads as well where the setting `tracks_from` is "reconstructed":
+            RECONSTRUCTION, and `revalidate` where it reads findings. If it names any, the stage reads tracks as
+            `tracks_from` says (`SubsetReader.read_tracks`), and its result depends on that setting.
         settings: what its result depends on: names of settings, or functions that give values by name.
         version: number to raise when the code makes other results of the same inputs.
         build: (reader, settings) to frames by table, or a StageResult. The reader is a SubsetReader, once for every
@@ -84,6 +90,7 @@ class Stage:
             LakeReaders and returns a list of StageResults. 0: recordings are built one by one.
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
             (by "" for the scope `lake`).
+        command: command that runs the stage, where it is called otherwise.
     """
 
     name: str
@@ -95,6 +102,13 @@ class Stage:
     settings: tuple[str | Callable[[Settings], Mapping[str, Any]], ...] = ()
     batch_entries: int = 0
     extra_inputs: Callable[[Path, Manifest, Settings], Mapping[str, Mapping[str, Any]]] | None = None
+    after_reconstruction: tuple[str, ...] = ()
+    command: str = ""
+
+    def list_inputs(self, settings: Settings) -> tuple[str, ...]:
+        """Return the stages whose tables it reads with these settings."""
+        reads_reconstructed = settings.tracks_from == RECONSTRUCTED_TRACKS
+        return (*self.after, *self.after_reconstruction) if reads_reconstructed else self.after
 
     def describe_settings(self, settings: Settings) -> dict[str, Any]:
         """Return the values of the settings that the result depends on, by name."""
@@ -103,6 +117,8 @@ class Stage:
         for item in self.settings:
             if not isinstance(item, str):
                 values |= item(settings)
+        if self.after_reconstruction and settings.tracks_from != RECORDED:
+            values["tracks_from"] = settings.tracks_from
         return values
 
 

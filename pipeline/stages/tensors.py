@@ -14,10 +14,10 @@ from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
 from tracklake.pipeline.stages.split import find_training_split
-from tracklake.pipeline.stages.stage import INGEST, Stage, StageError, StageResult
+from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Stage, StageError, StageResult
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
-from tracklake.schemas import FINDINGS, NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, TRACKS, VEHICLES
+from tracklake.schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, VEHICLES
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.split_recipes import TIME_BLOCKS
@@ -47,7 +47,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
         for subset in included:
             vehicles = left_out.filter(**subset.partition)["vehicle_id"]
             blocks = splits.filter(**subset.partition)
-            tensors = build_subset(subset, blocks, vehicles, protocol, storage, drop_cut=drops)
+            tensors = build_subset(subset, blocks, vehicles, settings, drop_cut=drops)
             cut_samples[:] += tensors.cut_samples
             yield subset.facts, tensors
 
@@ -95,18 +95,19 @@ def read_split(reader: LakeReader, split: str) -> tuple[pl.DataFrame, pl.DataFra
 
 
 def build_subset(
-    reader: SubsetReader, blocks: pl.DataFrame, left_out: pl.Series, protocol: Protocol, storage: str, *, drop_cut: bool
+    reader: SubsetReader, blocks: pl.DataFrame, left_out: pl.Series, settings: Settings, *, drop_cut: bool
 ) -> SubsetTensors:
     """Read a subset's tables and build its arrays; see `build_subset_tensors`."""
+    protocol = settings.get_protocol()
     return build_subset_tensors(
-        put_on_clock(reader.table(TRACKS, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
+        put_on_clock(reader.read_tracks(settings, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
         reader.table(SAMPLES, *SAMPLE_COLUMNS),
         reader.table(NEIGHBORS, *NEIGHBOR_COLUMNS),
         blocks,
         vehicles=reader.table(VEHICLES, *VEHICLE_COLUMNS),
-        findings=reader.table(FINDINGS, *FINDING_COLUMNS),
+        findings=reader.read_findings(settings, *FINDING_COLUMNS),
         protocol=protocol,
-        storage=storage,
+        storage=settings.tensor_positions,
         left_out=left_out,
         drop_cut=drop_cut,
         **reader.clock,
@@ -137,6 +138,7 @@ STAGE = Stage(
     meaning="Write the split as flat arrays.",
     scope="lake",
     after=(INGEST, "validate", "samples", "split"),
+    after_reconstruction=(RECONSTRUCTION, "revalidate"),
     settings=(_describe_settings,),
     version=6,
     build=build,

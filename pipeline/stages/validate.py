@@ -14,7 +14,8 @@ from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMN
 from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
 
 
-def _describe_rules(settings: Settings) -> dict[str, Any]:
+def describe_rules(settings: Settings) -> dict[str, Any]:
+    """Return the rules over tracks and their thresholds, on which findings depend."""
     return {"rules": [rule.name for rule in RULES], "thresholds": resolve(RULES, _select(settings))}
 
 
@@ -23,12 +24,17 @@ def _select(settings: Settings) -> dict[str, float]:
     return select_thresholds(RULES, settings.thresholds)
 
 
+def open_scene(reader: SubsetReader, tracks: pl.DataFrame) -> tuple[Scene, frozenset[str]]:
+    """Return a subset's tracks as what rules are checked on, and the columns that its source does not have."""
+    vehicles = reader.table(VEHICLES, "vehicle_id", *VEHICLE_COLUMNS)
+    facts = reader.table(SUBSETS, *SUBSET_COLUMNS, "columns_missing")
+    return Scene(tracks, vehicles, *facts.select(SUBSET_COLUMNS).row(0)), find_lacking(vehicles, facts)
+
+
 def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Find what breaks rules in a subset, score its vehicles, and judge the subset."""
-    tracks, vehicles = reader.table(TRACKS, *tracks_needed()), reader.table(VEHICLES, "vehicle_id", *VEHICLE_COLUMNS)
-    facts = reader.table(SUBSETS, *SUBSET_COLUMNS, "columns_missing")
-    scene = Scene(tracks, vehicles, *facts.select(SUBSET_COLUMNS).row(0))
-    judged = judge(scene, find_lacking(vehicles, facts), _select(settings))
+    tracks = reader.table(TRACKS, *tracks_needed())
+    judged = judge(*open_scene(reader, tracks), _select(settings))
     status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
     # No NGSIM recording has lane markings, so a note about each of them would tell nothing.
     lacking = [rule.name for rule in judged.unchecked if "lane_markings_m" not in rule.columns]
@@ -51,7 +57,7 @@ STAGE = Stage(
     meaning="Check every entry of recordings from above against the rules; `tracklake run` also checks drives.",
     scope="recording",
     after=(INGEST,),
-    settings=(_describe_rules, "max_backward_share"),
+    settings=(describe_rules, "max_backward_share"),
     version=3,
     build=build,
 )

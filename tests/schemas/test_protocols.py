@@ -19,6 +19,7 @@ CHANGED = {
     "drop_error_findings": True, "nearest": 3, "split": "time-blocks", "train_share": 0.7, "scored_s": (1.0,),
     "headline": "mae",
     "fold_lanes": False,
+    "tracks_from": "reconstructed",
 }  # fmt: skip
 
 

@@ -108,7 +108,7 @@ def _check_storage(file: Path, index: dict[str, Any]) -> None:
 def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
     """Read the protocol whose parameters, those of this version, the index holds with their digest."""
     file, digest = path / INDEX_FILE, index["protocol"].get("digest")
-    parameters: dict[str, Any] = {
+    parameters: dict[str, Any] = {"tracks_from": "recorded"} | {  # tensors without it are older than that choice
         name: tuple(value) if isinstance(value, list) else value  # JSON has no tuples
         for name, value in index["protocol"].items()
         if name != "digest"

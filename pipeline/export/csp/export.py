@@ -19,6 +19,7 @@ from tracklake.pipeline.export.folder import ExportError, refuse_taken, write_fi
 from tracklake.pipeline.lake import Manifest, load, scan
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.planner import open_reader
 from tracklake.pipeline.transforms.csp.grid import OverwritingGrid
 from tracklake.pipeline.transforms.csp.parts import EXCLUDED, NO_LANE, number_datasets
 from tracklake.pipeline.transforms.csp.subset import (
@@ -30,10 +31,10 @@ from tracklake.pipeline.transforms.csp.subset import (
     put_on_csp_clock,
     stack_tracks,
 )
-from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas import SUBSETS, VEHICLES
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.extras import require_extras
-from tracklake.schemas.protocols import LAST_LANES
+from tracklake.schemas.protocols import LAST_LANES, RECORDED
 
 FILES = ("TrainSet.mat", "ValSet.mat", "TestSet.mat")
 """Names of the files, in the order of `schemas.columns.PARTS`."""
@@ -53,7 +54,7 @@ def export_csp(settings: Settings, out: Path, options: CspOptions, *, force: boo
         MissingExtraError: SciPy is not installed.
         LakeMissingError: the lake does not exist.
         ExportError: nothing can be exported, or not to this folder, or it is too large for the format.
-        StageError: --clean needs a stage that has not run.
+        StageError: --clean or `tracks_from` needs a stage that has not run.
     """
     require_extras("the export of .mat files", "matlab")
     root = settings.lake
@@ -97,6 +98,9 @@ def _prepare_all(
 ) -> list[CspSubset]:
     """Read the subsets and select their samples; subsets that cannot be exported are left out and noted."""
     root, prepared = settings.lake, []
+    reader = open_reader(manifest, settings)
+    if settings.tracks_from != RECORDED:
+        export.notes.append(f"positions are {settings.tracks_from}, not those that were recorded")
     contexts = read_context(settings, manifest, subsets, export.notes) if options.clean else None
     show = reporter()
     show.begin("read", len(subsets))
@@ -109,7 +113,7 @@ def _prepare_all(
             last_lane=LAST_LANES.get(facts["site"]),
             by_frame=_find_row_order(manifest, facts, export) == "frame",
         )
-        clock = put_on_csp_clock(scan(root, manifest, TRACKS, **values).select(TRACK_COLUMNS).collect(), recorded)
+        clock = put_on_csp_clock(reader.open_subset(**values).read_tracks(settings, *TRACK_COLUMNS), recorded)
         context = None if contexts is None else contexts[facts["dataset"], facts["subset"]]
         reason = (
             NO_LANE if clock["lane"].null_count() else EXCLUDED if contexts is not None and context is None else None

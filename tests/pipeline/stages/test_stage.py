@@ -104,6 +104,25 @@ def test_it_is_redone_after_settings_version_inputs_or_files_change(root):
     assert run(root, "toy", other) == ["toy/highd/03"]
 
 
+def test_a_stage_of_tracks_depends_on_their_reconstruction_only_where_it_reads_it(root):
+    of_tracks = Stage(**{**vars(TOTAL), "after": ("ingest",), "after_reconstruction": ("toy",)})
+    stages = (TOY, of_tracks)
+    (plain,) = plan_stage(root, "total", SETTINGS, (TOY, Stage(**{**vars(of_tracks), "after_reconstruction": ()})))
+    assert plan_stage(root, "total", SETTINGS, stages) == [plain], "with recorded tracks the fingerprint is the same"
+    (filtered,) = plan_stage(root, "total", Settings(tracks_from="filtered"), stages)
+    assert filtered.built_from == {**plain.built_from, "tracks_from": "filtered"}
+    reconstructed = Settings(tracks_from="reconstructed")
+    with pytest.raises(StageError, match="toy of 01 has not been made"):
+        plan_stage(root, "total", reconstructed, stages)
+    run(root, "toy")
+    (job,) = plan_stage(root, "total", reconstructed, stages)
+    assert job.built_from.keys() == {*plain.built_from, "toy", "tracks_from"}
+    assert len({job.fingerprint, filtered.fingerprint, plain.fingerprint}) == 3
+    renamed = Stage(**{**vars(TOY), "command": "toys", "version": 2})
+    with pytest.raises(StageError, match="Run `tracklake toys` first"):
+        plan_stage(root, "total", reconstructed, (renamed, of_tracks))
+
+
 def test_it_is_refused_when_its_inputs_are_missing_or_outdated(root):
     with pytest.raises(StageError, match=r"toy of 01 has not been made\. Run `tracklake toy` first"):
         plan_stage(root, "total", SETTINGS, STAGES)

@@ -1,0 +1,34 @@
+"""Revalidate: findings and scores of the reconstructed tracks, by the rules that check the recorded ones."""
+
+import polars as pl
+
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.readers import SubsetReader
+from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Stage
+from tracklake.pipeline.stages.validate import describe_rules, open_scene
+from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
+from tracklake.quality_reports.rules.registry import RULES, select_thresholds
+from tracklake.schemas import RECONSTRUCTED_FINDINGS, RECONSTRUCTED_SUBSET_SCORES, Table
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
+
+UNCHANGED = frozenset({"headway_recorded_m"})
+"""Columns of `tracks` that say nothing about reconstructed positions; rules that read them are not checked again."""
+
+
+def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]:
+    """Find what breaks rules in a subset's reconstructed tracks; tracks that were left out are as recorded."""
+    scene, lacking = open_scene(reader, reader.read_tracks_from(RECONSTRUCTED_TRACKS, *tracks_needed()))
+    judged = judge(scene, lacking | UNCHANGED, select_thresholds(RULES, settings.thresholds))
+    return {RECONSTRUCTED_FINDINGS: judged.findings, RECONSTRUCTED_SUBSET_SCORES: judged.subset_scores}
+
+
+STAGE = Stage(
+    name="revalidate",
+    meaning="Check the reconstructed tracks against the rules.",
+    scope="recording",
+    after=(INGEST, RECONSTRUCTION),
+    settings=(describe_rules,),
+    version=1,
+    build=build,
+    command=RECONSTRUCTION,
+)
