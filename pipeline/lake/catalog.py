@@ -7,7 +7,8 @@ stored in it. A lake that was moved or copied gets another catalog when tracklak
 
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,9 @@ JOINED: dict[str, tuple[Table, tuple[str, ...]]] = {
     SUBSETS.name: (SUBSET_STATUS, ("backward_vehicles", "excluded", "excluded_reason")),
 }
 """Views that show columns of a later stage beside those that ingestion wrote."""
+
+_TABLE = r"\bmain\.(\w+)"
+"""Pattern of a table's name in a macro's statement."""
 
 STORED_ROWS = 20_000
 """Most rows of a table that catalog.duckdb stores; a larger one is a view of its files."""
@@ -190,22 +194,60 @@ def build_catalog(root: Path, manifest: Manifest) -> bytes:
 
 def _build_catalog(root: Path, manifest: Manifest, stored_rows: int) -> bytes:
     """Return the catalog's content; tables of at most so many rows are stored in it."""
+    selects = _write_selects(root, manifest)
+    files = {table: manifest.live(table.name) for table in TABLES}
+    filled = {table: sum(file.rows or 0 for file in live) for table, live in files.items() if live}
+
+    def fill(connection: "duckdb.DuckDBPyConnection") -> None:
+        for table, rows in filled.items():
+            if rows <= stored_rows:
+                _create(connection, root, table.name, f'INSERT INTO "{table.name}" {selects[table.name]}')
+            else:
+                connection.execute(f'DROP TABLE "{table.name}"')
+                _create(connection, root, table.name, f'CREATE VIEW "{table.name}" AS {selects[table.name]}')
+                connection.execute(";".join(_write_comments(table, "VIEW")))
+        _create_macros(connection, selects, {table.name for table in filled})
+
+    return _edit_database(_make_empty_catalog(), fill)
+
+
+@cache
+def _make_empty_catalog() -> bytes:
+    """Return a catalog of no rows. A process makes it once: most of a small catalog's time goes into the comments."""
+    selects = _write_selects(Path(), Manifest(lake_id=""))
+
+    def create(connection: "duckdb.DuckDBPyConnection") -> None:
+        for table in TABLES:
+            connection.execute(f'CREATE TABLE "{table.name}" AS {selects[table.name]}')
+            connection.execute(";".join(_write_comments(table, "TABLE")))
+        _create_macros(connection, selects, {table.name for table in TABLES})
+
+    return _edit_database(b"", create)
+
+
+def _create_macros(
+    connection: "duckdb.DuckDBPyConnection", selects: Mapping[str, str], changed: Collection[str]
+) -> None:
+    """Create the macros that read one of the changed tables, each with the tables' SELECTs in place of their names."""
+    for macro in MACROS:
+        if not {found[1] for found in re.finditer(_TABLE, macro.statement)}.isdisjoint(changed):
+            connection.execute(f"DROP MACRO TABLE IF EXISTS {macro.name}")
+            connection.execute(re.sub(_TABLE, lambda found: f"({selects[found[1]]})", macro.statement))
+            connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
+
+
+def _edit_database(content: bytes, edit: Callable[["duckdb.DuckDBPyConnection"], None]) -> bytes:
+    """Return a database file's content after a change in one transaction; no content is an empty database."""
     import duckdb
 
-    selects = _write_selects(root, manifest)
     # In a temporary folder, as DuckDB takes "?" in a database's path for the start of its options.
     with tempfile.TemporaryDirectory() as elsewhere:
         made = Path(elsewhere) / CATALOG
+        if content:
+            made.write_bytes(content)
         with duckdb.connect(str(made), config={"threads": 1}) as connection:  # small files: more only wait
             connection.begin()  # or each statement is written to disk by itself
-            for table in TABLES:
-                rows = sum(file.rows or 0 for file in manifest.live(table.name))
-                kind = "TABLE" if rows <= stored_rows else "VIEW"
-                _create(connection, root, table.name, f'CREATE {kind} "{table.name}" AS {selects[table.name]}')
-                connection.execute(";".join(_write_comments(table, kind)))
-            for macro in MACROS:
-                connection.execute(re.sub(r"\bmain\.(\w+)", lambda found: f"({selects[found[1]]})", macro.statement))
-                connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
+            edit(connection)
             connection.commit()
         return made.read_bytes()
 
