@@ -70,7 +70,7 @@ OF_THE_RUN = {
     "versions": "versions of libraries",
 }
 """What is left out of `provenance` in quality.json, and why. No table has such a column: all of them count."""
-NO_DATA = {"README.md", "truth.parquet"}
+NO_DATA = {"README.md", "truth.parquet", "true_tracks.parquet"}
 """Files of the generated sample that are not read."""
 
 STEPS = 50

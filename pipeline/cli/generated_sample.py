@@ -7,7 +7,15 @@ from tracklake.pipeline.cli.options import require_choice
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.lake import LakeError, LakeMissingError, load
 from tracklake.pipeline.stages.stage import INGEST
-from tracklake.pipeline.synthetic import ALL_FORMATS, DEFAULT_FORMATS, DEFAULT_MINUTES, SampleSummary, write_sample
+from tracklake.pipeline.synthetic import (
+    ALL_FORMATS,
+    DEFAULT_FORMATS,
+    DEFAULT_MINUTES,
+    DEFAULT_NOISE,
+    NOISE_MODELS,
+    SampleSummary,
+    write_sample,
+)
 from tracklake.pipeline.synthetic.scenarios import DRIVES
 from tracklake.schemas.errors import explain_file_errors
 from tracklake.schemas.extras import find_missing
@@ -44,11 +52,18 @@ def refuse_mixing(lake: Path, discovery: Discovery) -> None:
 
 
 def write_generated(
-    out: Path, minutes: float | None, seed: int | None, terminal: Terminal, formats: list[str] | None = None
+    out: Path,
+    minutes: float | None,
+    seed: int | None,
+    terminal: Terminal,
+    formats: list[str] | None = None,
+    noise: list[str] | None = None,
 ) -> SampleSummary:
     """Write the generated sample into a folder."""
     for name in formats or ():
         require_choice("--format", name, ALL_FORMATS)
+    for name in noise or ():
+        require_choice("--noise", name, NOISE_MODELS)
     if not formats and find_missing("onboard"):
         formats = [name for name in DEFAULT_FORMATS if name != DRIVES]
         terminal.print_line("without drives, which need the extra [onboard]", style="dim")
@@ -58,5 +73,6 @@ def write_generated(
             formats=tuple(formats) if formats else DEFAULT_FORMATS,
             minutes=DEFAULT_MINUTES if minutes is None else minutes,
             seed=1 if seed is None else seed,
+            noise=tuple(noise) if noise else DEFAULT_NOISE,
             progress=lambda text: terminal.print_line(text, style="dim"),
         )

@@ -17,6 +17,12 @@ def sample(
     format: Annotated[
         list[str] | None, typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives; repeatable.")
     ] = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--noise", help="smooth (default), autocorrelated, handover, quantised; repeatable: errors add up."
+        ),
+    ] = None,
     minutes: MinutesOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -25,7 +31,7 @@ def sample(
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
     with command(quiet=quiet, json=json) as terminal:
         refuse_lake(out)
-        summary = write_generated(out, minutes, seed, terminal, formats=format)
+        summary = write_generated(out, minutes, seed, terminal, formats=format, noise=noise)
         terminal.print_line(
             f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)"
         )

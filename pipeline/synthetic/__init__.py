@@ -8,7 +8,8 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.build import README_FILE, TRUTH_FILE, build_sample
+from tracklake.pipeline.synthetic.build import README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
+from tracklake.pipeline.synthetic.noise import NOISE_MODELS, SMOOTH
 from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
 from tracklake.pipeline.synthetic.sumo import SumoError
 from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
@@ -18,7 +19,18 @@ from tracklake.schemas.files import name_unfinished
 ALL_FORMATS = FORMATS
 DEFAULT_MINUTES = 1.0
 """Length of the recordings in minutes, unless set."""
-__all__ = ["ALL_FORMATS", "DEFAULT_FORMATS", "DEFAULT_MINUTES", "SampleSummary", "SumoError", "write_sample"]
+DEFAULT_NOISE = (SMOOTH,)
+"""Noise models of a sample, unless set."""
+__all__ = [
+    "ALL_FORMATS",
+    "DEFAULT_FORMATS",
+    "DEFAULT_MINUTES",
+    "DEFAULT_NOISE",
+    "NOISE_MODELS",
+    "SampleSummary",
+    "SumoError",
+    "write_sample",
+]
 
 
 @dataclass(frozen=True)
@@ -37,14 +49,16 @@ def write_sample(
     formats: tuple[str, ...] = DEFAULT_FORMATS,
     minutes: float = DEFAULT_MINUTES,
     seed: int = 1,
+    noise: tuple[str, ...] = DEFAULT_NOISE,
     progress: Callable[[str], None] | None = None,
 ) -> SampleSummary:
-    """Write a sample: raw files, `truth.parquet` and a README.
+    """Write a sample: raw files, `truth.parquet`, `true_tracks.parquet` and a README.
 
     The folder appears whole or not at all: the files are written to a hidden folder, which is renamed. Some of
     ALL_FORMATS are written into `out`, which is missing, empty, or holds only an earlier sample, which is replaced.
-    Recordings last 0.4 to 1.9 times `minutes`; the same seed, formats and minutes give the same bytes. `progress` is
-    called with a description of each step.
+    Recordings last 0.4 to 1.9 times `minutes`; the same seed, formats and minutes give the same bytes. `noise` are some
+    of NOISE_MODELS, whose errors add up; with none, positions are exact but for the defects. `progress` is called with
+    a description of each step.
 
     Raises:
         UsageError: an argument is invalid, or `out` holds other files.
@@ -57,6 +71,9 @@ def write_sample(
         raise UsageError(f"minutes: expected {LEAST_MINUTES:g} to {MOST_MINUTES:g}, got {minutes}")
     if seed < 0:
         raise UsageError(f"seed: expected a whole number from 0, got {seed}")
+    models = tuple(name for name in NOISE_MODELS if name in noise)
+    if unknown := [name for name in noise if name not in models]:
+        raise UsageError(f"noise: expected some of {', '.join(NOISE_MODELS)}, got {', '.join(unknown)}")
     out = Path(out).absolute()
     _require_replaceable(out)
     began = time.perf_counter()
@@ -64,7 +81,7 @@ def write_sample(
     aside, old = name_unfinished(out), name_unfinished(out)
     aside.mkdir()
     try:
-        rows, recordings = build_sample(aside, formats, minutes, seed, progress or (lambda _: None))
+        rows, recordings = build_sample(aside, formats, minutes, seed, models, progress or (lambda _: None))
         _require_replaceable(out)
         if out.exists():
             out.rename(old)
@@ -93,7 +110,7 @@ def _require_replaceable(out: Path) -> None:
         raise UsageError(f"{truth} cannot be read, so {out} is not known to be a sample. {advice}") from error
     if table.schema != pl.Schema(TRUTH_SCHEMA):
         raise UsageError(f"{truth} is not that of a sample of this version. {advice}")
-    known = set(table["file"].drop_nulls()) | {TRUTH_FILE, README_FILE}
+    known = set(table["file"].drop_nulls()) | {TRUTH_FILE, TRUE_TRACKS_FILE, README_FILE}
     present = {file.relative_to(out).as_posix() for file in out.rglob("*") if not file.is_dir()}
     foreign = sorted(present - known)
     if foreign:

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
-from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, truth
+from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, true_tracks, truth
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.scenarios import (
     DRIVES,
@@ -31,18 +31,19 @@ AT_ONCE = 2
 STOP_POLL_S = 0.05
 """Time between two attempts to end what is still simulated, in seconds."""
 BOM = b"\xef\xbb\xbf"
-TRUTH_FILE = "truth.parquet"
+TRUTH_FILE, TRUE_TRACKS_FILE = "truth.parquet", "true_tracks.parquet"
 README_FILE = "README.md"
 README = """# A generated sample
 
 These files have the raw formats of highD and NGSIM, but were not recorded: SUMO simulated the traffic, and tracking
-noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes).
+noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes, {noise} noise).
 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
 - `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
 - `drive-1`, `drive-2`: what two cars of recording 02 would have logged as instrumented vehicles, each with `truth.csv`.
 - `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
+- `true_tracks.parquet`: where every vehicle truly was, without noise and defects, in the frame of the lake's `tracks`.
 """
 
 
@@ -61,7 +62,12 @@ class _Job:
 
 
 def build_sample(
-    folder: Path, formats: tuple[str, ...], minutes: float, seed: int, progress: Callable[[str], None]
+    folder: Path,
+    formats: tuple[str, ...],
+    minutes: float,
+    seed: int,
+    noise: tuple[str, ...],
+    progress: Callable[[str], None],
 ) -> tuple[int, int]:
     """Write a whole sample into an empty folder; the arguments are those of `write_sample`.
 
@@ -84,13 +90,20 @@ def build_sample(
     clean = _simulate_all(home, jobs, seed, progress)
     found = truth.Found()
     rows: list[dict[str, object]] = []
+    true: list[pl.DataFrame] = []
     for scenario in recordings:
         progress(f"writing highD recording {scenario.recording}")
-        rows += _write_highd(folder, scenario, _list_pair(jobs, scenario.recording), clean, seed)
+        pair = _list_pair(jobs, scenario.recording)
+        tracks = _number_vehicles(pair, clean)
+        rows += _write_highd(folder, scenario, pair, tracks, seed, noise)
         truth.read_highd(folder, scenario.recording, found)
+        true += [_find_true_tracks(job, tracks[job.subset], found) for job in pair]
     for kind, file, scenarios in groups:
         progress(f"writing {file}")
-        rows += _write_ngsim(folder, kind, file, scenarios, [job for job in jobs if job.file == file], clean, seed)
+        of_file = [job for job in jobs if job.file == file]
+        numbered = _shift_vehicles(scenarios, of_file, clean)
+        rows += _write_ngsim(folder, kind, file, scenarios, of_file, numbered, seed, noise)
+        true += [_find_true_tracks(job, numbered[job.subset], found) for job in of_file]
         names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
         truth.read_ngsim(folder / file, names, found)
     for drive in drives.SCENARIOS if driven else ():
@@ -100,7 +113,11 @@ def build_sample(
         rows += drives.write_drive(folder, drive, tracks[drive.subset], pair[0].road.rate_hz, seed)
     progress("writing the truth")
     truth.build_truth(rows + truth.list_counts(found)).write_parquet(folder / TRUTH_FILE)
-    (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes), encoding="utf-8")
+    pl.concat([pl.DataFrame(schema=true_tracks.TRUE_TRACKS_SCHEMA), *true]).sort(
+        "dataset", "subset", "vehicle_id", "frame"
+    ).write_parquet(folder / TRUE_TRACKS_FILE)
+    named = " and ".join(noise) or "no"
+    (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes, noise=named), encoding="utf-8")
     lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
     count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
     return lines, count + driven * len(drives.SCENARIOS)
@@ -181,11 +198,13 @@ def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object
     ]  # fmt: skip
 
 
-def _damage_tracks(tracks: pl.DataFrame, job: _Job, seed: int) -> tuple[pl.DataFrame, list[dict[str, object]]]:
+def _damage_tracks(
+    tracks: pl.DataFrame, job: _Job, seed: int, noise: tuple[str, ...]
+) -> tuple[pl.DataFrame, list[dict[str, object]]]:
     """Add noise and defects; also return the truth about them."""
     random = np.random.default_rng([seed, job.index, 1])
     is_ngsim = job.dataset == "ngsim"
-    noisy = add_noise(tracks, job.road, MAST if is_ngsim else DRONE, random)
+    noisy = add_noise(tracks, job.road, MAST if is_ngsim else DRONE, noise, random)
     injected = defects.inject_defects(
         noisy,
         job.traffic.plan,
@@ -237,13 +256,39 @@ def _number_vehicles(pair: list[_Job], clean: dict[str, pl.DataFrame]) -> dict[s
     }
 
 
+def _shift_vehicles(
+    scenarios: tuple[NgsimScenario, ...], jobs: list[_Job], clean: dict[str, pl.DataFrame]
+) -> dict[str, pl.DataFrame]:
+    """Return tracks by subset under the ids of an NGSIM file."""
+    return {
+        job.subset: clean[job.subset].with_columns(pl.col("vehicle") + pl.lit(scenario.first_vehicle_id - 1, pl.Int32))
+        for scenario, job in zip(scenarios, jobs, strict=True)
+    }
+
+
+def _find_true_tracks(job: _Job, tracks: pl.DataFrame, found: truth.Found) -> pl.DataFrame:
+    """Find a subset's true tracks by its simulated ones under the file's ids, and by its file, read back."""
+    # On the upper carriageway x_m counts from the hindmost recorded position.
+    counted = job.subset.endswith("-upper")
+    start_m = job.road.window_m + found.hindmost[job.recording] if counted else 0.0
+    rows = true_tracks.build_true_tracks(tracks, job.road.rate_hz, start_m=start_m, pointed=job.dataset == "highd")
+    place = {"dataset": job.dataset, "recording": job.recording, "subset": job.subset}
+    return rows.with_columns(pl.lit(value).alias(name) for name, value in place.items()).select(
+        pl.col(name).cast(dtype) for name, dtype in true_tracks.TRUE_TRACKS_SCHEMA.items()
+    )
+
+
 def _write_highd(
-    folder: Path, scenario: HighdScenario, pair: list[_Job], clean: dict[str, pl.DataFrame], seed: int
+    folder: Path,
+    scenario: HighdScenario,
+    pair: list[_Job],
+    tracks: dict[str, pl.DataFrame],
+    seed: int,
+    noise: tuple[str, ...],
 ) -> list[dict[str, object]]:
     both_damaged, rows = [], []
-    tracks = _number_vehicles(pair, clean)
     for job in pair:
-        damaged, declared = _damage_tracks(tracks[job.subset], job, seed)
+        damaged, declared = _damage_tracks(tracks[job.subset], job, seed, noise)
         both_damaged.append(damaged)
         rows += declared
     files = highd.build_recording(scenario, *both_damaged, frames=pair[0].frames)
@@ -264,14 +309,13 @@ def _write_ngsim(
     file: str,
     scenarios: tuple[NgsimScenario, ...],
     jobs: list[_Job],
-    clean: dict[str, pl.DataFrame],
+    tracks: dict[str, pl.DataFrame],
     seed: int,
+    noise: tuple[str, ...],
 ) -> list[dict[str, object]]:
     written, rows = [], []
     for scenario, job in zip(scenarios, jobs, strict=True):
-        shift = scenario.first_vehicle_id - 1
-        tracks = clean[job.subset].with_columns(pl.col("vehicle") + pl.lit(shift, pl.Int32))
-        damaged, declared = _damage_tracks(tracks, job, seed)
+        damaged, declared = _damage_tracks(tracks[job.subset], job, seed, noise)
         written.append(ngsim.build_rows(damaged, scenario.start_time))
         rows += declared
     random = np.random.default_rng([seed, jobs[0].index, 2])

@@ -56,11 +56,16 @@ class FileCount:
 
 @dataclass
 class Found:
-    """The contents read back: entries by subset and (vehicle, frame), and counts of lines."""
+    """The contents read back: entries by subset and (vehicle, frame), and counts of lines.
+
+    `hindmost` are positions by highD's recording, in m to the left in the image, from which x_m of the upper
+    carriageway counts.
+    """
 
     entries: dict[tuple[str, str, str], dict[tuple[int, int], Entry]] = field(default_factory=dict)
     surfaces: dict[str, Surface] = field(default_factory=dict)
     files: list[FileCount] = field(default_factory=list)
+    hindmost: dict[str, float] = field(default_factory=dict)
 
 
 def _usable(line: str, separator: str | None, fields: int) -> list[str] | None:
@@ -122,6 +127,7 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         middle = numbers[2] + numbers[4] / 2
         fronts[key] = (-middle if direction[key[0]] == 1 else middle) + numbers[4] / 2 * math.cos(headings[key])
     hindmost = min((front for (vehicle, _), front in fronts.items() if direction[vehicle] == 1), default=0.0)
+    found.hindmost[recording] = hindmost
     for (vehicle, frame), numbers in rows.items():
         left = direction[vehicle] == 1
         along = -1 if left else 1

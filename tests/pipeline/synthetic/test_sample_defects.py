@@ -226,7 +226,7 @@ def test_the_same_seed_damages_the_same_vehicles():
 
 def test_noise_is_small_and_leaves_standing_vehicles_standing():
     tracks = platoon().with_columns(speed=pl.when(pl.col("vehicle") == 3).then(0.0).otherwise(20.0))
-    noisy = add_noise(tracks, TWO_LANES, DRONE, np.random.default_rng(1))
+    noisy = add_noise(tracks, TWO_LANES, DRONE, ("smooth",), np.random.default_rng(1))
     error = (noisy["x"] - tracks["x"]).to_numpy()
     assert 0.015 < error.std() < 0.025
     assert (noisy.filter(pl.col("vehicle") == 3)["speed"] == 0).all()
@@ -236,10 +236,10 @@ def test_noise_is_small_and_leaves_standing_vehicles_standing():
 
 def test_noise_makes_no_slow_speed_constant():
     tracks = platoon().with_columns(speed=pl.lit(1.0), accel=pl.lit(0.0))
-    noisy = add_noise(tracks, TWO_LANES, DRONE, np.random.default_rng(1))
+    noisy = add_noise(tracks, TWO_LANES, DRONE, ("smooth",), np.random.default_rng(1))
     assert (noisy["accel"].abs().round(2) > 0).all()
 
 
 def test_noise_keeps_ramp_vehicles_on_the_ramp():
     tracks = platoon().with_columns(lane=pl.lit(7, pl.Int16), y=pl.lit(6.5 * FREEWAY.lane_width_m))
-    assert add_noise(tracks, FREEWAY, DRONE, np.random.default_rng(1))["lane"].unique().to_list() == [7]
+    assert add_noise(tracks, FREEWAY, DRONE, ("smooth",), np.random.default_rng(1))["lane"].unique().to_list() == [7]
