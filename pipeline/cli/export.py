@@ -1,7 +1,7 @@
 """`tracklake export ...`: the lake in other projects' formats."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast, get_args
 
 import typer
 
@@ -9,6 +9,8 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
 from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.export.car_following.export import Format as FollowingFormat
+from tracklake.pipeline.export.car_following.export import export_car_following
 from tracklake.pipeline.export.csp.export import export_csp
 from tracklake.pipeline.export.csp.result import CspExport, CspOptions
 from tracklake.pipeline.export.sumo.export import CONFIG, export_sumo_fcd
@@ -114,6 +116,31 @@ def sumo_fcd(
         for note in (*written.notes, *(f"licence of {own}" for own in written.licences)):
             terminal.print_line(note, style="dim")
         terminal.print_line(f"in {written.out}; replay: sumo-gui -c {written.out / CONFIG}", style="bold green")
+        terminal.print_json(written.to_dict())
+
+
+@export.command()
+def car_following(
+    out: OutOption,
+    lake: LakeOption = None,
+    file_format: Annotated[str, typer.Option("--format", help="parquet or csv.")] = "parquet",
+    force: ForceOption = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Write episodes of car following, a row per entry of follower and leader, ready for calibration."""
+    with command(quiet=quiet, json=json) as terminal:
+        require_choice("--format", file_format, get_args(FollowingFormat))
+        with terminal.show_stages():
+            written = export_car_following(
+                read_settings(lake=lake), out, cast(FollowingFormat, file_format), force=force
+            )
+        terminal.print_origin(written.synthetic)
+        for subset, episodes in written.episodes.items():
+            terminal.print_line(f"{subset}: {episodes:,} episodes, {written.entries[subset]:,} entries")
+        for licence in written.licences:
+            terminal.print_line(f"licence of {licence}", style="dim")
+        terminal.print_line(f"in {written.out / written.file}; what it holds: README.md", style="bold green")
         terminal.print_json(written.to_dict())
 
 

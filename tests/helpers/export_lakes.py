@@ -52,6 +52,11 @@ def ingest(root, folder, recordings, highd=()):
         canonical |= {("ngsim", name): value for name, value in found.items()}
     for number in highd:
         canonical["highd", number] = read_highd(write_highd(Path(folder) / "highd", number), number)
+    return commit_recordings(root, canonical)
+
+
+def commit_recordings(root, canonical):
+    """A lake of recordings as sources return them: {(dataset, recording): Canonical}."""
     with open_for_writing(root) as writer:
         for (dataset, recording), made in canonical.items():
             files = {}

@@ -21,8 +21,8 @@ from tracklake.pipeline.export.sumo.road import Road, find_road, write_network
 from tracklake.pipeline.lake import Manifest, load, scan
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.pipeline.stages.planner import open_reader
+from tracklake.schemas import SUBSETS, VEHICLES
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.text import suggest_name
 
@@ -68,10 +68,10 @@ def export_sumo_fcd(settings: Settings, out: Path, subset: str | None = None, *,
     refuse_taken(out, NAMES, force=force)
     facts = _choose_subset(settings.lake, manifest, subset)
     half_ms = find_half_step(facts["frame_rate_hz"])
-    reader = LakeReader(settings.lake, manifest).open_subset(facts["dataset"], facts["subset"])
+    reader = open_reader(manifest, settings).open_subset(facts["dataset"], facts["subset"])
     show = reporter()
     show.begin("write", 3)
-    tracks = reader.table(TRACKS, *TRACK_COLUMNS)
+    tracks = reader.read_tracks(settings, *TRACK_COLUMNS)
     types = list_types(reader.table(VEHICLES, "vehicle_id", "class", "length_m", "width_m"))
     road = find_road(tracks, facts)
     placed = place_vehicles(tracks, types, road, facts)
@@ -82,7 +82,7 @@ def export_sumo_fcd(settings: Settings, out: Path, subset: str | None = None, *,
         out=out,
         dataset=facts["dataset"],
         subset=facts["subset"],
-        tracks_from="recorded",
+        tracks_from=settings.tracks_from,
         vehicles=placed["vehicle_id"].n_unique(),
         entries=placed.height,
         lanes=road.lanes,
@@ -170,8 +170,8 @@ def _write_card(path: Path, export: SumoExport, road: Road, facts: pl.DataFrame)
     lines = [
         f"# {export.dataset}/{export.subset} for SUMO",
         "",
-        f"Written by tracklake {version('tracklake')}: `tracklake export sumo-fcd --subset {export.subset}`, tracks as "
-        f"{export.tracks_from}: {export.vehicles:,} vehicles, {export.entries:,} entries.",
+        f"Written by tracklake {version('tracklake')}: `tracklake export sumo-fcd --subset {export.subset}`, "
+        f"{export.tracks_from} tracks: {export.vehicles:,} vehicles, {export.entries:,} entries.",
         "",
         *([f"**{export.synthetic}**", ""] if export.synthetic else []),
         FILES,

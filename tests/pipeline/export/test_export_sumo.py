@@ -16,8 +16,9 @@ from tracklake.pipeline.export.sumo import floating_cars
 from tracklake.pipeline.export.sumo.export import NAMES, export_sumo_fcd
 from tracklake.pipeline.export.sumo.floating_cars import add_ends, find_half_step, list_types, place_vehicles
 from tracklake.pipeline.export.sumo.road import Road, find_road
-from tracklake.pipeline.lake import load, scan
+from tracklake.pipeline.lake import load
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.synthetic.sumo import find_sumo
 from tracklake.schemas import TRACKS
 
@@ -60,20 +61,27 @@ def read_fcd(path, rate):
     return found
 
 
-@pytest.mark.parametrize(("subset", "rate", "gaps"), [("us-101-0750", 10, True), ("01-upper", 25, False)])
-def test_replayed_positions_are_those_of_the_tracks(lake, tmp_path, subset, rate, gaps):
-    export = export_sumo_fcd(Settings(lake=lake), tmp_path / "out", subset)
+@pytest.mark.parametrize(
+    ("subset", "rate", "gaps", "tracks_from"),
+    [("us-101-0750", 10, True, "recorded"), ("us-101-0750", 10, True, "filtered"), ("01-upper", 25, False, "recorded")],
+)
+def test_replayed_positions_are_those_of_the_tracks(lake, tmp_path, subset, rate, gaps, tracks_from):
+    settings = Settings(lake=lake, tracks_from=tracks_from)
+    export = export_sumo_fcd(settings, tmp_path / "out", subset)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*NAMES}
     home, replayed = find_sumo(), tmp_path / "replayed.xml"
     call = [home / "bin" / "sumo", "-c", tmp_path / "out" / "replay.sumocfg", "--fcd-output", replayed]
     done = subprocess.run(call, env={"SUMO_HOME": str(home)}, capture_output=True, text=True, check=True, timeout=60)
     assert done.stderr == ""
 
-    tracks = scan(lake, load(lake), TRACKS).filter(pl.col("subset") == subset).sort("vehicle_id", "frame").collect()
+    facts = sumo_export._choose_subset(lake, load(lake), subset)
+    reader = LakeReader(lake, load(lake)).open_subset(facts["dataset"], subset)
+    tracks = reader.read_tracks(settings)
+    assert (tracks["x_m"] != reader.table(TRACKS)["x_m"]).any() is (tracks_from == "filtered")
     written, shown = read_fcd(tmp_path / "out" / "fcd.xml", rate), read_fcd(replayed, rate)
     assert len(written) == len(shown) == tracks.height == export.entries
     parts, before = {}, {}
-    markings = export_road(tracks, subset, lake).markings_m
+    markings = find_road(tracks, facts).markings_m
     for vehicle, frame, time_s, x, y, lane, speed in tracks.select(
         "vehicle_id", "frame", "time_s", "x_m", "y_m", "lane", "speed_mps"
     ).iter_rows():
@@ -90,10 +98,6 @@ def test_replayed_positions_are_those_of_the_tracks(lake, tmp_path, subset, rate
             assert shown[name, at][3] == f"road_{export.lanes - lies_in}"
     assert (max(parts.values()) > 1) is gaps
     assert any(round(t * rate) == 0 for t in tracks["time_s"])
-
-
-def export_road(tracks, subset, lake):
-    return find_road(tracks, sumo_export._choose_subset(lake, load(lake), subset))
 
 
 def make_tracks(rows):

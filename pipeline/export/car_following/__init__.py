@@ -1,0 +1,1 @@
+"""Episodes of car following, one row per entry, ready for calibration."""
