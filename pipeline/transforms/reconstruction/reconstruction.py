@@ -1,14 +1,25 @@
 """Reconstruction of a subset: physically possible tracks near the recorded ones."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.transforms.reconstruction.config import ReconstructionConfig
+from tracklake.pipeline.transforms.reconstruction.bounds import (
+    Runs,
+    find_breaks,
+    limit_motion,
+    list_runs,
+    measure_motion,
+)
+from tracklake.pipeline.transforms.reconstruction.config import DEFAULT_CLASS, ReconstructionConfig
+from tracklake.pipeline.transforms.reconstruction.lateral import bound_lateral, find_lane_changes
+from tracklake.pipeline.transforms.reconstruction.motion import Problem, bound_motion
+from tracklake.pipeline.transforms.reconstruction.noise import LEAST_HZ, Noise, estimate_noise
 from tracklake.pipeline.transforms.reconstruction.pieces import Pieces, Skip, cut_pieces
+from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, keep_behind_leaders
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, make_penalty, smooth_robustly
 from tracklake.schemas.arrays import Flags, Floats
 from tracklake.schemas.columns import Table
@@ -20,6 +31,8 @@ from tracklake.schemas.reconstruction import (
 )
 
 DEFAULT_CONFIG = ReconstructionConfig()
+MOVED_M = 0.001
+"""Least distance from the smoothed position, in m, at which an entry counts as moved by the bounds."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +57,21 @@ class Axis:
     """One coordinate at every point of the pieces, and how it was found.
 
     Args:
-        noise_m: standard deviation of the recorded positions' noise.
-        weight_s6: weight of the squared third derivative.
-        moved: whether bounds moved the point.
+        recorded: (N,) recorded positions, interpolated in gaps.
+        noise: their noise and the weight of smoothness; None where there are no points.
+        problem: the smoothed pieces.
+        x: (N,) positions within the bounds.
     """
 
     recorded: Floats
+    noise: Noise | None
+    problem: Problem
     x: Floats
-    noise_m: float | None
-    weight_s6: float | None
-    moved: Flags
+
+    @property
+    def moved(self) -> Flags:
+        """Whether bounds moved the point, (N,)."""
+        return np.asarray(np.abs(self.x - self.problem.smoothed) > MOVED_M, np.bool_)
 
 
 def reconstruct(
@@ -66,32 +84,87 @@ def reconstruct(
 
     Args:
         tracks: vehicle_id, frame, time_s, x_m, y_m, lane, leader_id, in any order.
-        vehicles: vehicle_id, class, length_m, width_m; all but the first may be null.
+        vehicles: vehicle_id, class, length_m; all but the first may be null.
         facts: the subset's row of `subsets`.
         config: settings.
     """
     pieces, skips = cut_pieces(tracks, facts, config.max_gap_s)
     series = Series(pieces.first, pieces.size, pieces.rate_hz)
-    along = _smooth_axis(pieces, series, "x_m", config.noise_x_m, config.weight_x_s6)
-    across = _smooth_axis(pieces, series, "y_m", config.noise_y_m, config.weight_y_s6)
+    runs: list[Runs] = []
+    if not pieces.points:
+        nothing = Axis(np.empty(0), None, Problem(series, np.empty(0), np.empty((4, 0)), np.empty(0)), np.empty(0))
+        along = across = nothing
+    else:
+        along, runs = _reconstruct_along(pieces, series, vehicles, config, skips)
+        across, lateral_runs = _reconstruct_across(pieces, series, config, skips)
+        runs.append(lateral_runs)
     entries = _list_entries(pieces, series, along, across, facts)
+    unkept = _list_unkept(pieces, runs, facts)
     return Reconstruction(
         entries,
-        _summarise(entries, vehicles, along, across, facts, config),
+        _summarise(entries, vehicles, along, across, unkept.height, facts, config),
         _list_skips(skips, facts),
-        UNKEPT_BOUNDS.empty(),
+        unkept,
     )
 
 
-def _smooth_axis(pieces: Pieces, series: Series, column: str, noise_m: float | None, weight_s6: float | None) -> Axis:
+def _smooth_axis(pieces: Pieces, series: Series, column: str, config: ReconstructionConfig) -> Axis:
+    """Smooth one coordinate of all pieces without bounds."""
     recorded = pieces.interpolate(column)
-    moved = np.zeros(pieces.points, bool)
-    if not pieces.points:
-        return Axis(recorded, recorded, noise_m, weight_s6, moved)
-    weight_s6 = 0.01 if weight_s6 is None else weight_s6
-    noise_m = 0.1 if noise_m is None else noise_m
-    x, _ = smooth_robustly(make_penalty(series, weight_s6), recorded, pieces.recorded.astype(np.float64), noise_m)
-    return Axis(recorded, x, noise_m, weight_s6, moved)
+    set_noise, set_weight = (
+        (config.noise_x_m, config.weight_x_s6) if column == "x_m" else (config.noise_y_m, config.weight_y_s6)
+    )
+    noise = estimate_noise(series, recorded, pieces.recorded, set_noise, set_weight, LEAST_HZ[column])
+    penalty = make_penalty(series, noise.weight_s6)
+    x, weights = smooth_robustly(penalty, recorded, pieces.recorded.astype(np.float64), noise.noise_m)
+    return Axis(recorded, noise, Problem(series, x, penalty, weights), x)
+
+
+def _reconstruct_along(
+    pieces: Pieces, series: Series, vehicles: pl.DataFrame, config: ReconstructionConfig, skips: list[Skip]
+) -> tuple[Axis, list[Runs]]:
+    """Return the positions along the road, and the runs that break a bound all the same; `skips` may grow."""
+    smoothed = _smooth_axis(pieces, series, "x_m", config)
+    names = list(config.bounds)
+    classes = pieces.tracks.select("vehicle_id").join(
+        vehicles.select("vehicle_id", "class"), on="vehicle_id", how="left", maintain_order="left"
+    )["class"]
+    place = classes.fill_null(DEFAULT_CLASS).replace_strict(
+        names, range(len(names)), default=names.index(DEFAULT_CLASS)
+    )
+    kind = place.to_numpy()[pieces.row].astype(np.int64)
+    bounds = list(config.bounds.values())
+    x, limits = bound_motion(smoothed.problem, bounds, kind)
+    leaders = find_leaders(pieces, vehicles)
+    keep_behind_leaders(smoothed.problem, x, limits, leaders)
+    unknown = (leaders.point >= 0) & np.isnan(leaders.length_m) & pieces.recorded
+    if unknown.any():
+        followers = len(np.unique(pieces.tracks["vehicle_id"].to_numpy()[pieces.row[unknown]]))
+        skips.append(Skip("no_length", followers, int(unknown.sum()), "overlaps with leaders of unknown length"))
+    values = measure_motion(series, x)
+    broken = find_breaks(values, limit_motion(bounds, kind, differentiate(series, x)[0]))
+    values["overlap"] = leaders.measure_gaps(x)
+    broken["overlap"] = values["overlap"] < 0
+    runs = [list_runs(series, bound, broken[bound], values[bound]) for bound in broken]
+    return replace(smoothed, x=x), runs
+
+
+def _reconstruct_across(
+    pieces: Pieces, series: Series, config: ReconstructionConfig, skips: list[Skip]
+) -> tuple[Axis, Runs]:
+    """Return the positions across the road, and the runs that break their bound all the same; `skips` may grow."""
+    smoothed = _smooth_axis(pieces, series, "y_m", config)
+    if pieces.tracks["lane"].null_count() == pieces.tracks.height:
+        vehicles = pieces.tracks["vehicle_id"].n_unique()
+        left_out = "the one way through lane changes"
+        if pieces.tracks["leader_id"].null_count() == pieces.tracks.height:
+            left_out += "; overlaps with leaders"
+        skips.append(Skip("no_lanes", vehicles, pieces.tracks.height, left_out))
+    direction = find_lane_changes(pieces, series, smoothed.x)
+    y = bound_lateral(smoothed.problem, direction, config.lateral_accel_mps2)
+    accel = differentiate(series, y)[1]
+    runs = list_runs(series, "lateral_acceleration", np.abs(accel) > config.lateral_accel_mps2, accel)
+    return replace(smoothed, x=y), runs
 
 
 def _list_entries(pieces: Pieces, series: Series, along: Axis, across: Axis, facts: Mapping[str, Any]) -> pl.DataFrame:
@@ -124,6 +197,7 @@ def _summarise(
     vehicles: pl.DataFrame,
     along: Axis,
     across: Axis,
+    unkept: int,
     facts: Mapping[str, Any],
     config: ReconstructionConfig,
 ) -> pl.DataFrame:
@@ -136,18 +210,38 @@ def _summarise(
             "entries": [len(moved)],
             "imputed_entries": [entries["imputed"].sum()],
             "constrained_entries": [entries["constrained"].sum()],
-            "noise_x_m": [along.noise_m],
-            "noise_y_m": [across.noise_m],
+            "noise_x_m": [along.noise and along.noise.noise_m],
+            "noise_y_m": [across.noise and across.noise.noise_m],
             "noise_is_set": [config.noise_x_m is not None or config.noise_y_m is not None],
-            "weight_x_s6": [along.weight_s6],
-            "weight_y_s6": [across.weight_s6],
+            "weight_x_s6": [along.noise and along.noise.weight_s6],
+            "weight_y_s6": [across.noise and across.noise.weight_s6],
             "median_moved_m": [moved.median()],
             "moved_over_half_m_share": [(moved > 0.5).mean()],
             "moved_over_2_m_share": [(moved > 2.0).mean()],
-            "bounds_not_kept": [0],
+            "bounds_not_kept": [unkept],
         }
     )
     return _conform(RECONSTRUCTION_QUALITY, frame, facts)
+
+
+def _list_unkept(pieces: Pieces, runs: list[Runs], facts: Mapping[str, Any]) -> pl.DataFrame:
+    """Write runs that break a bound as rows of `unkept_bounds`."""
+    ids = pieces.tracks["vehicle_id"].to_numpy()
+    frames = [
+        pl.DataFrame(
+            {
+                "vehicle_id": ids[pieces.row[run.first]],
+                "bound": [run.bound] * len(run.first),
+                "first_frame": pieces.frame[run.first],
+                "last_frame": pieces.frame[run.last],
+                "entries": run.last - run.first + 1,
+                "worst": run.worst,
+            }
+        )
+        for run in runs
+        if len(run.first)
+    ]
+    return _conform(UNKEPT_BOUNDS, pl.concat(frames), facts) if frames else UNKEPT_BOUNDS.empty()
 
 
 def _list_skips(skips: list[Skip], facts: Mapping[str, Any]) -> pl.DataFrame:

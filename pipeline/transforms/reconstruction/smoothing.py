@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tracklake.schemas.arrays import Flags, Floats, Integers
+from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges
 
 THIRD_DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
-HUBER = 1.345
-"""Residuals, in standard deviations, beyond which Huber's distance is linear: 95 % efficient with normal noise."""
+HUBER = 4.0
+"""Residuals, in standard deviations of the noise, beyond which the distance is linear. Smaller residuals are often
+motion that the penalty cuts off, such as hard braking, and no outliers."""
 ROUNDS = 5
 """Rounds of reweighting."""
 
@@ -41,6 +42,13 @@ class Series:
         """Test, at each of the N points, whether the point `reach` later belongs to the same piece."""
         left = np.repeat(self.first + self.size, self.size) - np.arange(int(self.size.sum()))
         return np.asarray(left > reach, np.bool_)
+
+
+def select_pieces(series: Series, pieces: Integers) -> tuple[Integers, Series]:
+    """Return the points of some pieces, and these pieces one after the other."""
+    size = series.size[pieces]
+    points, _ = expand_ranges(series.first[pieces], size)
+    return points, Series(np.cumsum(size) - size, size, series.rate_hz)
 
 
 def make_penalty(series: Series, weight_s6: float) -> Floats:

@@ -1,108 +1,15 @@
 import numpy as np
 import polars as pl
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recorded import MAX_ID, make_tracks, make_vehicles, run_reconstruction
 
-from tracklake.pipeline.transforms.reconstruction.config import ReconstructionConfig
-from tracklake.pipeline.transforms.reconstruction.reconstruction import Reconstruction, reconstruct
-from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, make_penalty, smooth
-from tracklake.schemas.reconstruction import (
-    RECONSTRUCTED,
-    RECONSTRUCTION_QUALITY,
-    RECONSTRUCTION_SKIPS,
-    UNKEPT_BOUNDS,
-)
-
-MAX_ID = 2**31 - 1
-
-
-def make_facts(rate_hz=10.0, **others):
-    return {"dataset": "custom", "subset": "s", "frame_rate_hz": rate_hz, "first_frame": 0, "freeway": True, **others}
-
-
-def make_tracks(*vehicles, rate_hz=10.0):
-    """Each vehicle is (id, frames, x_m) or (id, frames, x_m, leader_id)."""
-    parts = [
-        pl.DataFrame(
-            {"vehicle_id": vehicle, "frame": list(frames), "x_m": x, "leader_id": leader[0] if leader else None}
-        )
-        for vehicle, frames, x, *leader in vehicles
-    ]
-    return pl.concat(
-        [
-            part.select(
-                pl.col("vehicle_id", "frame", "leader_id").cast(pl.Int32),
-                pl.col("x_m").cast(pl.Float64),
-                time_s=pl.col("frame") / rate_hz,
-                y_m=pl.lit(2.0),
-                lane=pl.lit(1, pl.Int16),
-            )
-            for part in parts
-        ]
-    )
-
-
-def make_vehicles(tracks, length_m=4.0, kind="car"):
-    return tracks.select(pl.col("vehicle_id").unique().sort()).with_columns(
-        pl.lit(kind, pl.String).alias("class"),
-        length_m=pl.lit(length_m, pl.Float32),
-        width_m=pl.lit(1.8, pl.Float32),
-    )
-
-
-def run(tracks, vehicles=None, rate_hz=10.0, config=None, **facts) -> Reconstruction:
-    vehicles = make_vehicles(tracks) if vehicles is None else vehicles
-    done = reconstruct(tracks, vehicles, make_facts(rate_hz, **facts), config or ReconstructionConfig())
-    for table, frame in (
-        (RECONSTRUCTED, done.entries),
-        (RECONSTRUCTION_QUALITY, done.quality),
-        (RECONSTRUCTION_SKIPS, done.skips),
-        (UNKEPT_BOUNDS, done.unkept),
-    ):
-        table.validate(frame, where="test")
-    return done
-
-
-@pytest.mark.parametrize("rate_hz", [10.0, 25.0])
-def test_smoothing_solves_the_normal_equations_of_each_piece(rate_hz):
-    random = np.random.default_rng(1)
-    sizes = np.array([4, 9, 15])
-    series = Series(np.cumsum(sizes) - sizes, sizes, rate_hz)
-    z, w, weight = random.normal(500, 10, sizes.sum()), random.uniform(0.1, 1, sizes.sum()), 1e-3
-    w[6] = 0.0
-    x = smooth(make_penalty(series, weight), z, w)
-    for first, size in zip(series.first, sizes, strict=True):
-        own = slice(first, first + size)
-        third = np.diff(np.eye(size), 3, axis=0) * rate_hz**3
-        expected = np.linalg.solve(np.diag(w[own]) + weight * third.T @ third, w[own] * z[own])
-        np.testing.assert_allclose(x[own], expected, atol=1e-6)
-
-
-def test_the_weight_means_the_same_at_any_frame_rate():
-    smoothed = {}
-    for rate_hz in (10, 25):
-        time_s = np.arange(20 * rate_hz + 1) / rate_hz
-        series = Series(np.array([0]), np.array([time_s.size]), float(rate_hz))
-        x = smooth(make_penalty(series, 0.05), np.sin(2 * np.pi * 0.25 * time_s), np.ones(time_s.size))
-        smoothed[rate_hz] = np.interp([8.0, 9.0, 10.0, 11.0, 12.0], time_s, x)
-    np.testing.assert_allclose(smoothed[10], smoothed[25], atol=0.01)
-    share = 1 / (1 + 0.05 * (2 * np.pi * 0.25) ** 6)
-    np.testing.assert_allclose(smoothed[25], share * np.sin(2 * np.pi * 0.25 * np.arange(8, 13)), atol=0.02)
-
-
-def test_speed_and_acceleration_are_central_differences_that_go_on_as_a_parabola():
-    series = Series(np.array([0, 5]), np.array([5, 5]), 10.0)
-    time_s = np.arange(5) / 10
-    x = np.concatenate([3 + 2 * time_s + 0.5 * 1.5 * time_s**2, 100 - 1.0 * time_s])
-    speed, accel = differentiate(series, x)
-    np.testing.assert_allclose(speed, np.concatenate([2 + 1.5 * time_s, np.full(5, -1.0)]))
-    np.testing.assert_allclose(accel, np.repeat([1.5, 0.0], 5), atol=1e-10)
+from tracklake.pipeline.transforms.reconstruction.config import CAR, TRUCK, ReconstructionConfig
 
 
 def test_constant_motion_stays_as_it_is():
     tracks = make_tracks((7, range(50), np.arange(50) * 2.0))
-    done = run(tracks)
+    done = run_reconstruction(tracks)
     np.testing.assert_allclose(done.entries["x_m"], tracks["x_m"], atol=1e-6)
     np.testing.assert_allclose(done.entries["speed_mps"], 20.0, atol=1e-4)
     np.testing.assert_allclose(done.entries["moved_m"], 0.0, atol=1e-6)
@@ -113,7 +20,7 @@ def test_constant_motion_stays_as_it_is():
 
 def test_gaps_of_two_seconds_are_filled_and_longer_ones_are_not():
     frames = [*range(10), *range(29, 40), *range(60, 70)]
-    done = run(make_tracks((1, frames, np.array(frames) * 1.0)))
+    done = run_reconstruction(make_tracks((1, frames, np.array(frames) * 1.0)))
     assert done.entries["frame"].to_list() == [*range(40), *range(60, 70)]
     assert done.entries.filter("imputed")["frame"].to_list() == list(range(10, 29))
     np.testing.assert_allclose(done.entries["x_m"], done.entries["frame"], atol=1e-6)
@@ -129,7 +36,7 @@ def test_bad_tracks_are_skipped_with_a_counted_reason():
         (3, [1, 2, 3], [1.0, 2.0, 3.0]),
         (4, [*range(8), 60, 61], np.arange(10.0)),
     )
-    done = run(tracks)
+    done = run_reconstruction(tracks)
     assert done.entries["vehicle_id"].unique().to_list() == [4]
     assert done.entries["frame"].to_list() == list(range(8))
     found = {row["reason"]: (row["vehicles"], row["entries"]) for row in done.skips.iter_rows(named=True)}
@@ -138,14 +45,14 @@ def test_bad_tracks_are_skipped_with_a_counted_reason():
 
 
 def test_arterials_are_skipped():
-    done = run(make_tracks((1, range(20), np.arange(20.0))), freeway=False)
+    done = run_reconstruction(make_tracks((1, range(20), np.arange(20.0))), freeway=False)
     assert done.entries.is_empty()
     assert done.skips["reason"].to_list() == ["arterial"]
     assert done.quality["noise_x_m"].item() is None
 
 
 def test_an_empty_frame_gives_empty_tables():
-    done = run(make_tracks((1, [], [])))
+    done = run_reconstruction(make_tracks((1, [], [])))
     assert done.entries.is_empty()
     assert done.skips.is_empty()
     assert done.quality["vehicles"].item() == 0
@@ -165,9 +72,138 @@ def test_order_of_rows_does_not_matter(sizes, seed, rate_hz):
         frames = np.sort(random.choice(size + size // 4, size, replace=False))
         vehicles.append((vehicle, frames, frames * 20 / rate_hz + random.normal(0, 0.05, size)))
     tracks = make_tracks(*vehicles, rate_hz=rate_hz)
-    done = run(tracks, rate_hz=rate_hz)
-    shuffled = run(tracks.sample(fraction=1.0, shuffle=True, seed=seed), make_vehicles(tracks), rate_hz=rate_hz)
+    done = run_reconstruction(tracks, rate_hz=rate_hz)
+    shuffled = run_reconstruction(
+        tracks.sample(fraction=1.0, shuffle=True, seed=seed), make_vehicles(tracks), rate_hz=rate_hz
+    )
     for name in ("entries", "quality", "skips", "unkept"):
         assert getattr(done, name).equals(getattr(shuffled, name))
     kept = done.entries.filter(~pl.col("imputed")).height
     assert kept + done.skips["entries"].sum() == tracks.height
+
+
+def check_bounds(done, rate_hz, bounds=CAR):
+    """Check every written entry against the bounds, one track after the other, from the written positions."""
+    unkept = {(row["vehicle_id"], row["bound"]) for row in done.unkept.iter_rows(named=True)}
+    for track in done.entries.partition_by("vehicle_id"):
+        x, frame = track["x_m"].to_list(), track["frame"].to_list()
+        vehicle = track["vehicle_id"][0]
+        for i in range(1, len(x) - 1):
+            if frame[i + 1] - frame[i - 1] != 2:
+                continue
+            assert x[i + 1] >= x[i] >= x[i - 1] or (vehicle, "backward") in unkept
+            speed = (x[i + 1] - x[i - 1]) * rate_hz / 2
+            assert abs(track["speed_mps"][i] - speed) < 1e-3
+        for speed, accel in track.select("speed_mps", "accel_mps2").iter_rows():
+            fallen = bounds.accel_mps2 - bounds.accel_fall_per_s * max(speed - bounds.full_accel_until_mps, 0)
+            assert speed >= 0 or (vehicle, "backward") in unkept
+            assert accel <= max(fallen, bounds.least_accel_mps2) + 1e-4 or (vehicle, "acceleration") in unkept
+            assert accel >= -bounds.braking_mps2 - 1e-4 or (vehicle, "deceleration") in unkept
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    rate_hz=st.sampled_from([10.0, 25.0, 30.0]),
+    noise_m=st.sampled_from([0.0, 0.1, 1.0]),
+    speed_mps=st.sampled_from([0.0, 0.5, 12.0, 40.0]),
+)
+def test_all_bounds_hold_whatever_was_recorded(seed, rate_hz, noise_m, speed_mps):
+    random = np.random.default_rng(seed)
+    frames = np.flatnonzero(random.random(90) < 0.9)
+    x = frames / rate_hz * speed_mps + random.normal(0, noise_m, frames.size) + 3.0 * (frames > 45)
+    done = run_reconstruction(make_tracks((3, frames, x), rate_hz=rate_hz), rate_hz=rate_hz)
+    check_bounds(done, rate_hz)
+    assert done.unkept.is_empty()
+
+
+def test_a_vehicle_recorded_backward_stands_still():
+    time_s = np.arange(100) / 10
+    x = np.where(time_s < 5, 10 * time_s - time_s**2, 25 - 0.4 * np.minimum(time_s - 5, 1))
+    done = run_reconstruction(make_tracks((1, range(100), x)))
+    assert done.entries["speed_mps"].min() >= 0
+    assert done.entries.filter("constrained").height > 10
+    assert done.quality["constrained_entries"].item() == done.entries["constrained"].sum()
+    assert done.entries["x_m"][-20:].is_between(24.6, 25.0).all()
+
+
+def test_a_truck_accelerates_less_than_a_car():
+    time_s = np.arange(80) / 10
+    tracks = make_tracks((1, range(80), 1.7 * np.maximum(time_s - 2, 0) ** 2))
+    fastest = {}
+    for kind, bounds in (("car", CAR), ("truck", TRUCK), (None, CAR)):
+        done = run_reconstruction(tracks, make_vehicles(tracks, kind=kind))
+        check_bounds(done, 10.0, bounds)
+        fastest[kind] = done.entries["accel_mps2"].max()
+    assert fastest["car"] > 3.0
+    assert fastest["truck"] <= 2.5
+    assert fastest[None] == fastest["car"]
+
+
+def measure_gaps(done, follower, leader, length_m=4.0):
+    x = dict(done.entries.filter(vehicle_id=leader).select("frame", "x_m").iter_rows())
+    own = done.entries.filter(vehicle_id=follower).select("frame", "x_m").iter_rows()
+    return [x[frame] - length_m - position for frame, position in own if frame in x]
+
+
+def test_followers_keep_behind_their_leaders_which_are_solved_first():
+    time_s = np.arange(120) / 10
+    bump = 3.0 * np.exp(-(((time_s - 6) / 1.5) ** 2))
+    first, second, third = 50 + 8 * time_s, 44 + 8 * time_s + bump, 38 + 8 * time_s + bump / 2
+    tracks = make_tracks((9, range(120), first, None), (5, range(120), second, 9), (1, range(120), third, 5))
+    done = run_reconstruction(tracks)
+    assert done.unkept.is_empty()
+    assert min(measure_gaps(done, 5, 9)) > 0
+    assert min(measure_gaps(done, 1, 5)) > 0
+    np.testing.assert_allclose(done.entries.filter(vehicle_id=9)["x_m"], first, atol=0.01)
+    unknown = run_reconstruction(tracks, make_vehicles(tracks, length_m=None))
+    assert min(measure_gaps(unknown, 5, 9)) < 0
+    assert unknown.skips.select("reason", "vehicles", "entries").rows() == [("no_length", 2, 240)]
+
+
+def test_overlaps_that_motion_cannot_avoid_are_listed():
+    frames, time_s = range(60), np.arange(60) / 10
+    leader, follower = 20 + 0 * time_s, 10 + 10 * np.minimum(time_s, 0.9)
+    tracks = make_tracks((1, frames, leader, 2), (2, frames, follower, 1))
+    done = run_reconstruction(tracks)
+    check_bounds(done, 10.0)
+    found = done.unkept.filter(bound="overlap")
+    assert found["vehicle_id"].to_list() == [1]
+    assert found["entries"].item() == 60
+    assert found["worst"].item() < -4
+
+
+def test_a_recording_without_lanes_is_smoothed_and_says_what_is_left_out():
+    tracks = make_tracks((1, range(40), np.arange(40.0))).with_columns(lane=pl.lit(None, pl.Int16))
+    done = run_reconstruction(tracks)
+    assert done.entries.height == 40
+    assert done.skips.select("reason", "vehicles", "entries").rows() == [("no_lanes", 1, 40)]
+    assert "overlaps" in done.skips["left_out"].item()
+
+
+def test_lane_changes_go_one_way_with_bounded_acceleration():
+    random = np.random.default_rng(2)
+    time_s = np.arange(300) / 10
+    share = np.clip((time_s - 13) / 4, 0, 1)
+    y = 2 + 3.6 * (3 * share**2 - 2 * share**3) + random.normal(0, 0.15, 300)
+    tracks = make_tracks((1, range(300), 20 * time_s)).with_columns(
+        y_m=pl.Series(y), lane=pl.Series(np.where(time_s < 15, 1, 2), dtype=pl.Int16)
+    )
+    done = run_reconstruction(tracks)
+    smoothed = done.entries["y_m"].to_numpy()
+    assert (np.diff(smoothed[135:166]) >= -1e-6).all()
+    assert np.abs(smoothed - (2 + 3.6 * (3 * share**2 - 2 * share**3))).max() < 0.3
+    jumped = tracks.with_columns(y_m=pl.when(pl.col("lane") == 1).then(1.8).otherwise(5.4))
+    strict = run_reconstruction(jumped, config=ReconstructionConfig(lateral_accel_mps2=1.5, weight_y_s6=1e-4))
+    lateral = np.diff(strict.entries["y_m"].to_numpy(), 2) * 100
+    assert np.abs(lateral).max() <= 1.5
+    assert strict.unkept.is_empty()
+    assert (np.diff(strict.entries["y_m"].to_numpy())[110:190] >= -1e-6).all()
+
+
+def test_the_noise_can_be_set():
+    tracks = make_tracks((1, range(80), np.arange(80) + np.random.default_rng(0).normal(0, 0.1, 80)))
+    done = run_reconstruction(tracks, config=ReconstructionConfig(noise_x_m=0.2, noise_y_m=0.1, weight_x_s6=0.03))
+    row = done.quality.row(0, named=True)
+    assert (row["noise_x_m"], row["noise_y_m"], row["weight_x_s6"]) == (0.2, 0.1, 0.03)
+    assert row["noise_is_set"]

@@ -1,0 +1,109 @@
+"""Positions along the road within the bounds of motion.
+
+Pieces whose smoothed track breaks a bound are solved again, as quadratic programs under the bounds. Bounds hold for
+compact differences, of which the written speeds and accelerations are means (see `differentiate`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from tracklake.pipeline.transforms.reconstruction.bounds import Limits, find_breaks, limit_motion, measure_motion
+from tracklake.pipeline.transforms.reconstruction.config import MotionBounds
+from tracklake.pipeline.transforms.reconstruction.programs import Rows, solve_programs
+from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, select_pieces
+from tracklake.schemas.arrays import Floats, Integers
+
+MARGIN = 0.99
+"""Share of each bound that programs use, so that the written values keep the whole of it."""
+CREEP_MPS = 2e-6
+"""Least speed that programs use, in m/s, so that rounding moves nothing backward: 2 mm in a quarter of an hour."""
+BATCH_POINTS = 20_000
+"""Points of the programs that are solved together; more would not fit a processor's cache."""
+ROUNDS = 3
+"""Times that a piece is solved, since the greatest acceleration depends on the speed that comes out."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Smoothed pieces, and what their programs minimise.
+
+    Args:
+        series: the pieces.
+        smoothed: (N,) positions without bounds.
+        penalty: (4, N) lower diagonals of the penalty.
+        weights: (N,) weights of the recorded positions.
+    """
+
+    series: Series
+    smoothed: Floats
+    penalty: Floats
+    weights: Floats
+
+    def solve(self, pieces: Integers, x: Floats, make_rows: Callable[[Series, Integers], list[Rows]]) -> None:
+        """Write the positions of some pieces within their rows into x; a piece without a solution stays as it is."""
+        if not pieces.size:
+            return
+        batch = (np.cumsum(self.series.size[pieces]) - 1) // BATCH_POINTS
+        for number in np.unique(batch):
+            points, series = select_pieces(self.series, pieces[batch == number])
+            bands = self.penalty[:, points]
+            bands[0] += self.weights[points]
+            way, solved = solve_programs(bands, make_rows(series, points), series.first, series.size)
+            done = np.repeat(solved, series.size)
+            x[points[done]] = (self.smoothed[points] + way)[done]
+
+
+def bound_motion(problem: Problem, bounds: Sequence[MotionBounds], kind: Integers) -> tuple[Floats, Limits]:
+    """Return positions (N,) within the bounds of motion, and the bounds at their speeds.
+
+    Args:
+        problem: the smoothed pieces.
+        bounds: bounds of the classes.
+        kind: (N,) place of each point's bounds in `bounds`.
+    """
+    series, x = problem.series, problem.smoothed.copy()
+    limits = limit_motion(bounds, kind, differentiate(series, x)[0])
+    for _ in range(ROUNDS):
+        broken = np.logical_or.reduce(list(find_breaks(measure_motion(series, x), limits).values()))
+        pieces = np.flatnonzero(np.logical_or.reduceat(broken, series.first))
+        if not pieces.size:
+            break
+        problem.solve(pieces, x, partial(make_motion_rows, problem, limits))
+        limits = limits.lower_to(limit_motion(bounds, kind, differentiate(series, x)[0]))
+    return x, limits
+
+
+def make_motion_rows(problem: Problem, limits: Limits, series: Series, points: Integers) -> list[Rows]:
+    """Return the rows that keep pieces within the bounds of motion.
+
+    The bound of a compact difference is the least of those of the points that it has a part in.
+
+    Args:
+        problem: the smoothed pieces.
+        limits: bounds at the N points.
+        series: the pieces that are solved.
+        points: their points among the N.
+    """
+    rate, x = series.rate_hz, problem.smoothed[points]
+    accel, braking, jerk = limits.accel_mps2[points], limits.braking_mps2[points], limits.jerk_mps3[points]
+    one, two, three = series.lie_within(1)[:-1], series.lie_within(2)[:-2], series.lie_within(3)[:-3]
+    second, third = np.diff(x, 2) * rate**2, np.diff(x, 3) * rate**3
+    least = MARGIN * np.minimum(accel[1:-1], np.minimum(accel[:-2], accel[2:]))
+    up, down = (rate**2, -2 * rate**2, rate**2), (-(rate**2), 2 * rate**2, -(rate**2))
+    rise, fall = (-(rate**3), 3 * rate**3, -3 * rate**3, rate**3), (rate**3, -3 * rate**3, 3 * rate**3, -(rate**3))
+    first, last = series.first, series.first + series.size - 3
+    every = np.ones(len(first), bool)
+    starting = (-3 * x[first] + 4 * x[first + 1] - x[first + 2]) * (rate / 2) - CREEP_MPS
+    ending = (x[last] - 4 * x[last + 1] + 3 * x[last + 2]) * (rate / 2) - CREEP_MPS
+    return [
+        Rows((rate, -rate), np.diff(x) * rate - CREEP_MPS, one, 1.0),
+        Rows(up, least - second, two, 1.0),
+        Rows(down, MARGIN * braking[1:-1] + second, two, 1.0),
+        Rows(rise, MARGIN * jerk[:-3] - third, three, 5.0),
+        Rows(fall, MARGIN * jerk[:-3] + third, three, 5.0),
+        Rows((1.5 * rate, -2 * rate, 0.5 * rate), starting, every, 1.0, at=first),
+        Rows((-0.5 * rate, 2 * rate, -1.5 * rate), ending, every, 1.0, at=last),
+    ]
