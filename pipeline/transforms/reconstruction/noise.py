@@ -5,8 +5,8 @@ over about half a second. So blocks of BLOCK_S are left out, and the error of th
 block, which no recorded neighbour shares its noise with, is compared for a range of weights (Burman, Chow and Nolan
 1994, A cross-validatory method for dependent data).
 
-Noise that is correlated over longer than a block, as that of NGSIM is, cannot be told from motion in this way. There
-the weight is the least with which the smoothed jerk is not denser than that of drivers (JERK_DENSITY).
+Noise that is correlated over longer than a block, as that of NGSIM is, looks like motion in this test. There the
+weight is the least with which the smoothed jerk is not denser than that of drivers (JERK_DENSITY).
 """
 
 from dataclasses import dataclass
