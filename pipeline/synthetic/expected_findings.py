@@ -179,21 +179,21 @@ def _breaks_overlap(scene: Scenery, key: Key) -> bool:
             if abs(other.front - own.front) > LONGEST_M:
                 break
             is_near = math.dist(own.middle, other.middle) < own.radius + other.radius  # spares most of the comparisons
-            if is_near and round(min(_reach_into(own, other), _reach_into(other, own)), 3) > 0:
+            if is_near and _meets_along_axes(own, other) and _meets_along_axes(other, own):
                 return True
             place += step
     return False
 
 
-def _reach_into(one: Entry, other: Entry) -> float:
-    """Compute how far two boxes overlap along or across the first, whichever is less; negative = apart."""
+def _meets_along_axes(one: Entry, other: Entry) -> bool:
+    """Test whether two boxes overlap both across and along the first; across comes first, as it parts lanes."""
     cosine, sine = math.cos(one.heading), math.sin(one.heading)
-    depths = []
-    for axis in ((cosine, sine), (-sine, cosine)):
+    for axis in ((-sine, cosine), (cosine, sine)):
         own = [axis[0] * x + axis[1] * y for x, y in one.corners]
         theirs = [axis[0] * x + axis[1] * y for x, y in other.corners]
-        depths.append(min(max(own) - min(theirs), max(theirs) - min(own)))
-    return min(depths)
+        if round(min(max(own) - min(theirs), max(theirs) - min(own)), 3) <= 0:
+            return False
+    return True
 
 
 def _breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
@@ -298,9 +298,9 @@ RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {
 
 def find_broken(entries: dict[Key, Entry], surface: Surface) -> Iterator[tuple[str, list[Key]]]:
     """Find the entries of one subset that break each rule, sorted."""
-    scene = Scenery(entries, surface)
+    scene, ordered = Scenery(entries, surface), sorted(entries)
     for rule, breaks_rule in RULE_TESTS.items():
-        yield rule, [key for key in sorted(entries) if breaks_rule(scene, key)]
+        yield rule, [key for key in ordered if breaks_rule(scene, key)]
 
 
 def count_rules(entries: dict[Key, Entry], surface: Surface) -> dict[str, tuple[int, int, int]]:

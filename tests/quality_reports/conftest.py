@@ -1,7 +1,9 @@
 """Lakes in memory: DuckDB views named and shaped like the catalog's, over hand-made Polars frames."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import duckdb
 import polars as pl
@@ -42,17 +44,14 @@ def convert_once(request, monkeypatch) -> None:
         monkeypatch.setattr(vl_convert, "vegalite_to_svg", look_up)
 
 
-@pytest.fixture(scope="module")
-def open_lake() -> Iterator[Callable[..., duckdb.DuckDBPyConnection]]:
-    """Open a lake of the given tables, as lists of rows in which an absent column is null; the others are empty."""
-    opened = []
-
-    def open_(**tables: list[dict]) -> duckdb.DuckDBPyConnection:
-        connection = duckdb.connect(":memory:", config={"threads": 1})
-        opened.append(connection)
+@pytest.fixture(scope="session")
+def empty_lake(tmp_path_factory) -> Path:
+    """A database of empty tables, views and macros: lakes begin as copies of it, as its statements take 0.2 s."""
+    path = tmp_path_factory.mktemp("empty") / "lake.duckdb"
+    with duckdb.connect(str(path), config={"threads": 1}) as connection:
+        connection.begin()
         for table in TABLES:
-            rows = [{**dict.fromkeys(table.dtypes), **row} for row in tables.get(table.name, [])]
-            connection.register("frame", pl.DataFrame(rows, schema=table.dtypes, orient="row"))
+            connection.register("frame", table.empty())
             connection.execute(f"CREATE TABLE {table.name}_rows AS FROM frame")  # faster to query than frames
         for table in TABLES:
             later, key = JOINED.get(table.name, (None, ()))
@@ -60,6 +59,26 @@ def open_lake() -> Iterator[Callable[..., duckdb.DuckDBPyConnection]]:
             connection.execute(f"CREATE VIEW {table.name} AS SELECT * FROM {table.name}_rows{join}")
         for macro in MACROS:
             connection.execute(macro.statement)
+        connection.commit()
+    return path
+
+
+@pytest.fixture(scope="module")
+def open_lake(empty_lake, tmp_path_factory) -> Iterator[Callable[..., duckdb.DuckDBPyConnection]]:
+    """Open a lake of the given tables, as lists of rows in which an absent column is null; the others are empty."""
+    opened, folder = [], tmp_path_factory.mktemp("opened")
+
+    def open_(**tables: list[dict]) -> duckdb.DuckDBPyConnection:
+        copied = shutil.copy(empty_lake, folder / f"{len(opened)}.duckdb")
+        connection = duckdb.connect(str(copied), config={"threads": 1})
+        opened.append(connection)
+        connection.begin()
+        for table in TABLES:
+            if tables.get(table.name):
+                rows = [{**dict.fromkeys(table.dtypes), **row} for row in tables[table.name]]
+                connection.register("frame", pl.DataFrame(rows, schema=table.dtypes, orient="row"))
+                connection.execute(f"INSERT INTO {table.name}_rows FROM frame")
+        connection.commit()
         return connection
 
     yield open_
