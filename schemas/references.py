@@ -157,10 +157,52 @@ VOGEL = Reference(
     "Vogel, K. (2002). What characterizes a free vehicle in an urban area? Transportation Research Part F 5(1), 15-29.",
     "the time headway beyond which a vehicle is free",
 )
+TOLEDO = Reference(
+    "Toledo and Zohar (2007)",
+    "Toledo, T., Zohar, D. (2007). Modeling Duration of Lane Changes. Transportation Research Record 1999, 71-78.",
+    "begin and end of a lane change",
+    doi="10.3141/1999-08",
+)
+HAYWARD = Reference(
+    "Hayward (1972)",
+    "Hayward, J. C. (1972). Near-miss determination through use of a scale of danger. Highway Research Record 384, "
+    "24-34.",
+    "time to collision",
+)
+ALLEN = Reference(
+    "Allen, Shin and Cooper (1978)",
+    "Allen, B. L., Shin, B. T., Cooper, P. J. (1978). Analysis of Traffic Conflicts and Collisions. Transportation "
+    "Research Record 667, 67-74.",
+    "post-encroachment time",
+)
+COOPER = Reference(
+    "Cooper and Ferguson (1976)",
+    "Cooper, D. F., Ferguson, N. (1976). Traffic studies at T-junctions: a conflict simulation record. Traffic "
+    "Engineering and Control 17, 306-309.",
+    "deceleration rate to avoid a crash",
+)
+ALMQVIST = Reference(
+    "Almqvist et al. (1991)",
+    "Almqvist, S., Hyden, C., Risser, R. (1991). Use of speed limiters in cars for increased safety and a better "
+    "environment. Transportation Research Record 1318, 34-39.",
+    "deceleration rate to avoid a crash",
+)
+ARCHER = Reference(
+    "Archer (2005)",
+    "Archer, J. (2005). Indicators for traffic safety assessment and prediction and their application in "
+    "micro-simulation modelling. Royal Institute of Technology, Stockholm.",
+    "the threshold of the deceleration rate to avoid a crash",
+)
+GETTMAN = Reference(
+    "Gettman et al. (2008)",
+    "Gettman, D., Pu, L., Sayed, T., Shelby, S. (2008). Surrogate Safety Assessment Model and Validation: Final "
+    "Report. FHWA-HRT-08-051, Federal Highway Administration.",
+    "the threshold of time to collision",
+)
 
 REFERENCES = (
     *(HAMALAINEN, NGSIM, KRAJEWSKI, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
-    *(GRAVES, TREIBER_2013, SHARMA, VOGEL),
+    *(GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER, GETTMAN),
 )
 """All references, the one whose method tracklake builds on first."""
 

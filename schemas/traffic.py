@@ -11,9 +11,11 @@ the leader leaves the lane, or the view (cut-out); the source names another lead
 these."""
 REGIMES = ("standing", "free_acceleration", "cruising", "accelerating", "following", "decelerating")
 """Driving regimes, of one entry each; docs/DESIGN.md defines them (Treiber and Kesting 2013; Sharma et al. 2018)."""
-MEASURES = ("ttc_s", "drac_mps2", "time_headway_s", "pet_s")
-"""Surrogate measures of safety: time to collision, deceleration rate to avoid a crash, time headway, post-encroachment
-time."""
+SAFETY_THRESHOLDS = {"ttc_s": 1.5, "drac_mps2": 3.35, "time_headway_s": 1.0, "pet_s": 1.0}
+"""Surrogate measures of safety, and thresholds beyond which they are listed: time to collision, deceleration rate to
+avoid a crash (m/s2, critical above), time headway, post-encroachment time (s, critical below)."""
+MEASURES = tuple(SAFETY_THRESHOLDS)
+"""Names of the surrogate measures of safety."""
 
 CAR_FOLLOWING = Table(
     "car_following",
@@ -61,11 +63,11 @@ LANE_CHANGE_EVENTS = Table(
         **PLACE,
         "vehicle_id": column(pl.Int32, "who changes its lane", ge=0),
         "crossing_frame": column(pl.Int32, "first entry in the new lane"),
-        "first_frame": column(pl.Int32, "first entry of the lateral motion"),
-        "last_frame": column(pl.Int32, "last entry of the lateral motion"),
+        "first_frame": column(pl.Int32, "first entry of the lateral motion; the crossing where that is a slow drift"),
+        "last_frame": column(pl.Int32, "last entry of the lateral motion; the crossing where that is a slow drift"),
         "seconds": column(pl.Float64, "from the first to the last entry", unit="s", ge=0),
-        "begin_seen": column(pl.Boolean, "the lateral motion begins within the track"),
-        "end_seen": column(pl.Boolean, "the lateral motion ends within the track"),
+        "begin_seen": column(pl.Boolean, "the lateral motion begins within the track; False for slow drifts"),
+        "end_seen": column(pl.Boolean, "the lateral motion ends within the track; False for slow drifts"),
         "from_lane": column(pl.Int16, "lane before", ge=0),
         "to_lane": column(pl.Int16, "lane after", ge=0),
         "direction": column(pl.String, "left or right, as the driver sees it", isin=("left", "right")),
@@ -169,7 +171,8 @@ SKIPPED = {
     "leader_in_other_lane": "entries whose leader, as recorded, is in another lane",
     "no_gap": "entries whose leader's length is unknown",
     "short_episode": "episodes shorter than the setting `car_following_min_s`",
-    "lane_flicker": "stays of under 2 s in a lane between two in the same other lane",
+    "lane_flicker": "stays of at most 2 s in a lane between two in the same other lane",
+    "lane_change_in_gap": "pairs of successive entries in different lanes with frames missing between them",
     "no_extent": "entries of a subset whose section or recording has no length",
 }
 """Reasons why something has no row in a derived table, and what is counted then."""

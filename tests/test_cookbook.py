@@ -82,6 +82,7 @@ def test_the_page_and_the_listing_name_every_macro_and_table(command):
 
 
 CALLS = {
+    "detector_counts": "'02-lower', 100, 5", "edie_cells": "'02-lower', 100, 5",
     "flow_density": "'02-lower', 5", "lane_changes": "'02-lower'", "leader_follower": "'02-lower'",
     "near": "'02-lower', 200, 100, 5, 50", "scene": "'02-lower', 200", "track": "'02-lower', 21",
 }  # fmt: skip

@@ -19,6 +19,7 @@ from tracklake.schemas.protocols import (
 )
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
 from tracklake.schemas.text import suggest_name
+from tracklake.schemas.traffic import SAFETY_THRESHOLDS
 
 PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split", "tracks_from")
 """Names of the settings that replace a protocol's own values."""
@@ -51,6 +52,16 @@ class DeclaredSettings(BaseModel):
         0.01, ge=0, le=1, description="a subset with a larger share of vehicles driving backwards is excluded"
     )
     car_following_min_s: float = Field(2.0, ge=0, description="car_following: shortest episode, s")
+    lane_change_lateral_mps: float = Field(
+        0.2, gt=0, description="lane_change_events: lateral speed at which the motion begins and ends, m/s"
+    )
+    safety_thresholds: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=dict, description="safety: thresholds by measure, such as ttc_s"
+    )
+    detector_spacing_m: float = Field(100.0, ge=1, description="virtual_detectors: distance between detectors, m")
+    detector_interval_s: float = Field(30.0, ge=1, description="virtual_detectors: length of an interval, s")
+    edie_cell_m: float = Field(100.0, ge=1, description="edie: length of a cell along the road, m")
+    edie_cell_s: float = Field(30.0, ge=1, description="edie: length of a cell in time, s")
     on_ramp_lanes: dict[str, list[Annotated[int, Field(ge=1)]]] = Field(
         default_factory=dict, description="lanes that are on-ramps by site, where the source does not state them"
     )
@@ -129,6 +140,14 @@ class DeclaredSettings(BaseModel):
         if tracks_from == RECONSTRUCTED_TRACKS and not others.data.get("reconstruct", True):
             raise ValueError("expected reconstruct = true with it")
         return tracks_from
+
+    @field_validator("safety_thresholds")
+    @classmethod
+    def _check_measures(cls, thresholds: dict[str, float]) -> dict[str, float]:
+        for name in thresholds:
+            if name not in SAFETY_THRESHOLDS:
+                raise ValueError(f"no measure is called {name}; {suggest_name(name, SAFETY_THRESHOLDS)}")
+        return thresholds
 
     @field_validator("min_future_s")
     @classmethod

@@ -11,7 +11,9 @@ from tracklake.schemas import BSM, SUBSETS, SURROUNDING, SURROUNDING_TRUTH, TRAC
 
 CALLS = {
     "around_ego": "{subset}, 2.55",
+    "detector_counts": "{subset}, 20, 1",
     "drive_errors": "{subset}",
+    "edie_cells": "{subset}, 20, 1",
     "flow_density": "{subset}, 2",
     "lane_changes": "{subset}",
     "leader_follower": "{subset}",

@@ -75,7 +75,7 @@ def export_car_following(
     export = CarFollowingExport(
         out=out,
         file=file,
-        tracks_from="recorded",
+        tracks_from=settings.tracks_from,
         min_s=settings.car_following_min_s,
         episodes=dict(zip(names, counted["episodes"], strict=True)),
         entries=dict(zip(names, counted["entries"], strict=True)),
@@ -88,7 +88,7 @@ def export_car_following(
 
     def read() -> Iterator[pl.DataFrame]:
         for dataset, subset in counted.select("dataset", "subset").iter_rows():
-            yield _read_subset(reader, dataset, subset)
+            yield _read_subset(reader, settings, dataset, subset)
             show.advance("write", subset)
 
     def write(aside: Path) -> None:
@@ -99,10 +99,10 @@ def export_car_following(
     return export
 
 
-def _read_subset(reader: LakeReader, dataset: str, subset: str) -> pl.DataFrame:
+def _read_subset(reader: LakeReader, settings: Settings, dataset: str, subset: str) -> pl.DataFrame:
     own = reader.open_subset(dataset, subset)
     episodes = own.table(CAR_FOLLOWING, "vehicle_id", "first_frame", "entries")
-    rows = expand_episodes(open_scene(own), episodes, own.table(VEHICLES, "vehicle_id", "class", "length_m"))
+    rows = expand_episodes(open_scene(own, settings), episodes, own.table(VEHICLES, "vehicle_id", "class", "length_m"))
     place = [pl.lit(value).cast(pl.String).alias(name) for name, value in own.partition.items()]
     return rows.select(*place, pl.all())
 

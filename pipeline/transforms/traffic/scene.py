@@ -89,6 +89,23 @@ class Scene:
         return steps
 
     @cached_property
+    def pieces(self) -> Integers:
+        """Number of each entry's piece of track, in which no frame is missing."""
+        return np.cumsum(~self.follows[:-1])
+
+    @cached_property
+    def times_s(self) -> Floats:
+        """Time of each entry since the recording's first frame."""
+        times: Floats = (self.frames - self.first_frame) / self.rate_hz
+        return times
+
+    @cached_property
+    def road_m(self) -> tuple[float, float] | None:
+        """Least and greatest position of all entries; None where they are equal, or there are none."""
+        x_m = self.read("x_m")
+        return (float(x_m.min()), float(x_m.max())) if x_m.size and x_m.min() < x_m.max() else None
+
+    @cached_property
     def lengths_m(self) -> Floats:
         """Length of each entry's vehicle; NaN where it is unknown."""
         known = self.vehicles.sort("vehicle_id").select(
