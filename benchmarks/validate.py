@@ -80,6 +80,8 @@ def save(folder: Path, number: int, case: dict[str, float], scale: float) -> Non
         "subset": pl.repeat(str(number), len(place), eager=True),
         "vehicle_id": place, "frame": frame, "time_s": (frame - 1) / rate, "x_m": x.round(3),
         "y_m": ((lane - 0.5) * 3.75 + random.normal(0, 0.5, len(place))).round(3), "lane": lane,
+        "heading_rad": pl.repeat(0.0 if rate == 25 else None, len(place), dtype=pl.Float32, eager=True),
+        "lateral_speed_mps": random.normal(0, 0.1, len(place)).round(2),
         "speed_mps": speed.round(2), "accel_mps2": random.normal(0, 0.6, len(place)).round(2),
         "speed_10hz_mps": speed + random.normal(0, 0.3, len(place)),
         "leader_id": pl.Series(leader).replace(-1, None),
@@ -97,10 +99,14 @@ def save(folder: Path, number: int, case: dict[str, float], scale: float) -> Non
         {
             "vehicle_id": np.arange(vehicles, dtype=np.int32), "length_m": sizes.astype(np.float32),
             "width_m": np.full(vehicles, 1.8, np.float32), "class": np.where(sizes > 10, "truck", "car"),
+            **dict.fromkeys(("length_range_m", "width_range_m"), np.zeros(vehicles, np.float32)),
         }
     ).write_parquet(folder / "vehicles.parquet")  # fmt: skip
     markings = [3.75 * marking for marking in range(lanes + 1)] if rate == 25 else None
-    facts = {"frame_rate_hz": rate, "lane_markings_m": markings}
+    facts = {
+        "frame_rate_hz": rate, "lane_markings_m": markings, "lanes": lanes,
+        "first_frame": 1, "last_frame": tracks["frame"].max(),
+    }  # fmt: skip
     (folder / "facts.json").write_text(json.dumps(facts))
 
 
@@ -147,7 +153,8 @@ def judge_one(folder: Path) -> tuple[int, set[str]]:
     facts = json.loads((folder / "facts.json").read_text())
     tracks = pl.read_parquet(folder / "tracks.parquet", columns=list(tracks_needed()))
     vehicles = pl.read_parquet(folder / "vehicles.parquet")
-    judged = judge(Scene(tracks, vehicles, **facts), () if facts["lane_markings_m"] else ("lane_markings_m",))
+    lacking = () if facts["lane_markings_m"] else ("lane_markings_m", "heading_rad")
+    judged = judge(Scene(tracks, vehicles, **facts), lacking)
     judge_subset(tracks)
     judged.findings.write_parquet(folder / "findings.parquet")
     judged.vehicle_scores.write_parquet(folder / "vehicle_scores.parquet")

@@ -158,6 +158,15 @@ class RuleFindings(TypedDict):
     subsets: list[FoundInSubset]
 
 
+class CrossSection(TypedDict):
+    """Vehicles at a cross section of the rule cross_section_flow, and between it and the next one."""
+
+    x_m: Annotated[float, "its position"]
+    crossed: Annotated[int, "vehicles that crossed it"]
+    vanished: Annotated[int | None, "vehicles that crossed it and vanished before the next one; null at the last"]
+    appeared: Annotated[int | None, "vehicles that appeared behind it and crossed the next one; null at the last"]
+
+
 class SubsetScores(TypedDict):
     """Feasibility and consistency of a subset's tracks."""
 
@@ -173,9 +182,14 @@ class SubsetScores(TypedDict):
     high_jerk_share: Annotated[float | None, "entries that break high_jerk, among those with a jerk"]
     worst_jerk_mps3: Annotated[float | None, "greatest magnitude of the jerk"]
     jerk_flicker_share: Annotated[float | None, "entries that break jerk_flicker, among those with a jerk"]
+    jerk_reversal_share: Annotated[
+        float | None, "entries whose jerk has another sign than the last one of the second before, among those with one"
+    ]
+    fragments_per_1000_vehicles: Annotated[float | None, "entries that break track_fragment, per 1,000 vehicles"]
     spacing_rms_m: Annotated[float | None, "root mean square of recorded headway - headway from positions"]
     spacings: Annotated[int, "entries behind spacing_rms_m"]
     rules_unchecked: Annotated[list[str], "rules that read a column which the source lacks"]
+    cross_sections: Annotated[list[CrossSection], "balance of vehicles between cross sections; empty where unknown"]
 
 
 class SpeedQuantiles(TypedDict):

@@ -199,10 +199,28 @@ GETTMAN = Reference(
     "Report. FHWA-HRT-08-051, Federal Highway Administration.",
     "the threshold of time to collision",
 )
+RAKHA = Reference(
+    "Rakha, Snare and Dion (2004)",
+    "Rakha, H., Snare, M., Dion, F. (2004). Vehicle Dynamics Model for Estimating Maximum Light-Duty Vehicle "
+    "Acceleration Levels. Transportation Research Record 1883, 40-49.",
+    "models of how acceleration falls with speed",
+)
+RAJAMANI = Reference(
+    "Rajamani (2012)",
+    "Rajamani, R. (2012). Vehicle Dynamics and Control. Springer, second edition.",
+    "the angle between a body and its motion",
+    doi="10.1007/978-1-4614-1433-9",
+)
+DAGANZO = Reference(
+    "Daganzo (1997)",
+    "Daganzo, C. F. (1997). Fundamentals of Transportation and Traffic Operations. Pergamon.",
+    "conservation of vehicles between cross sections",
+)
 
 REFERENCES = (
     *(HAMALAINEN, NGSIM, KRAJEWSKI, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
     *(GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER, GETTMAN),
+    *(RAKHA, RAJAMANI, DAGANZO),
 )
 """All references, the one whose method tracklake builds on first."""
 

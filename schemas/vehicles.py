@@ -17,6 +17,15 @@ VEHICLES = Table(
         ),
         "length_m": column(pl.Float32, "along the direction of travel", unit="m", nullable=True, ge=0, le=100),
         "width_m": column(pl.Float32, "across the direction of travel", unit="m", nullable=True, ge=0, le=20),
+        "length_range_m": column(
+            pl.Float32,
+            "greatest less least length in the rows of the track, to 1 mm; null where they have none, or where another "
+            "size is taken for another vehicle (NGSIM)",
+            unit="m",
+            nullable=True,
+            ge=0,
+        ),
+        "width_range_m": column(pl.Float32, "the same of the width", unit="m", nullable=True, ge=0),
         "first_frame": column(pl.Int32, "the track's first frame"),
         "last_frame": column(pl.Int32, "the track's last frame"),
         "entries": column(pl.Int32, "rows of the track", ge=1),

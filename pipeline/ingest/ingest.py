@@ -20,7 +20,7 @@ from tracklake.pipeline.sources.source import Canonical, Part
 from tracklake.pipeline.stages.stage import Job, make_commit, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES, Table
 
-VERSION = 2
+VERSION = 3
 """Number to raise when the code makes other tables of the same files."""
 SPREADSHEET_ROWS = 1_048_575
 """Most rows that a spreadsheet holds under its header."""

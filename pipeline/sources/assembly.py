@@ -27,8 +27,8 @@ def assemble_subset(
 
     `entries` are sorted by vehicle_id, frame and have x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
     headway_recorded_m, and lateral_speed_mps if the source has it; `sizes` have source_vehicle_id, class, length_m,
-    width_m, entries_announced per vehicle_id; `facts` are the columns of SUBSETS that do not follow from these. For
-    `use_recorded_headway` see `add_gaps`.
+    width_m, entries_announced per vehicle_id, and length_range_m, width_range_m if rows have sizes; `facts` are the
+    columns of SUBSETS that do not follow from these. For `use_recorded_headway` see `add_gaps`.
     """
     rate_hz, first_frame = facts["frame_rate_hz"], facts["first_frame"]
     entries = add_kinematics(entries, rate_hz).with_columns(
@@ -41,6 +41,8 @@ def assemble_subset(
     entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)
     tracks = entries.lazy().pipe(TRACKS.conform).collect()
     del entries
+    if "length_range_m" not in sizes.columns:
+        sizes = sizes.with_columns(length_range_m=pl.lit(None, pl.Float32), width_range_m=pl.lit(None, pl.Float32))
     vehicles = _summarise_vehicles(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
     vehicles = (
         vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()

@@ -116,6 +116,10 @@ def _to_subset(
     upper_m, lower_m = markings_m[UPPER], markings_m[LOWER]
     markings = [upper_m[-1] - y for y in reversed(upper_m)] if direction == UPPER else [y - lower_m[0] for y in lower_m]
     leader = pl.when(pl.col("precedingId") != 0)
+    ranges = entries.group_by(vehicle_id="id").agg(
+        length_range_m=_find_range("width"),
+        width_range_m=_find_range("height"),
+    )
     entries = orient_highd(entries, direction, upper_m, lower_m, meta["frameRate"]).select(
         *("frame", "x_m", "y_m", "heading_rad", "lane", "speed_mps", "accel_mps2", "lateral_speed_mps"),
         vehicle_id="id",
@@ -131,6 +135,7 @@ def _to_subset(
         width_m="height",
         entries_announced="numFrames",
     )
+    sizes = sizes.join(ranges, on="vehicle_id", how="left", maintain_order="left")
     return assemble_subset(
         entries,
         sizes,
@@ -154,6 +159,11 @@ def _to_subset(
         use_recorded_headway=False,
         files=files,
     )
+
+
+def _find_range(column: str) -> pl.Expr:
+    """Return the greatest less the least value of a column, to 1 mm."""
+    return (pl.col(column).max() - pl.col(column).min()).round(3)
 
 
 def _list_announced(meta: dict[str, Any], vehicles: pl.DataFrame) -> Announced:

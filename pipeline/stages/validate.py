@@ -36,8 +36,9 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     tracks = reader.table(TRACKS, *tracks_needed())
     judged = judge(*open_scene(reader, tracks), _select(settings))
     status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
-    # No NGSIM recording has lane markings, so a note about each of them would tell nothing.
-    lacking = [rule.name for rule in judged.unchecked if "lane_markings_m" not in rule.columns]
+    # No NGSIM recording has these, and no arterial a section, so a note about each of them would tell nothing.
+    usual = {"lane_markings_m", "length_range_m", "heading_error_rad", *([] if reader.facts["freeway"] else ["lanes"])}
+    lacking = [rule.name for rule in judged.unchecked if not usual & {*rule.columns, *rule.reads}]
     reasons = status.filter(pl.col("excluded"))["excluded_reason"].to_list()
     unchecked = f"{reader.subset}: rules not checked, since the files lack what they read: {', '.join(lacking)}"
     return StageResult(
@@ -58,6 +59,6 @@ STAGE = Stage(
     scope="recording",
     after=(INGEST,),
     settings=(describe_rules, "max_backward_share"),
-    version=3,
+    version=4,
     build=build,
 )

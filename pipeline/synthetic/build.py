@@ -199,9 +199,9 @@ def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object
 
 
 def _damage_tracks(
-    tracks: pl.DataFrame, job: _Job, seed: int, noise: tuple[str, ...]
+    tracks: pl.DataFrame, job: _Job, seed: int, noise: tuple[str, ...], next_vehicle: int | None = None
 ) -> tuple[pl.DataFrame, list[dict[str, object]]]:
-    """Add noise and defects; also return the truth about them."""
+    """Add noise and defects; also return the truth about them. `next_vehicle` is the first unused id."""
     random = np.random.default_rng([seed, job.index, 1])
     is_ngsim = job.dataset == "ngsim"
     noisy = add_noise(tracks, job.road, MAST if is_ngsim else DRONE, noise, random)
@@ -212,6 +212,7 @@ def _damage_tracks(
         on_ramp_lane=job.road.lanes + 2 if job.road.ramp else None,
         unseen_leaders=is_ngsim,
         random=random,
+        next_vehicle=next_vehicle,
     )
     declared: list[dict[str, object]] = [
         {
@@ -287,8 +288,10 @@ def _write_highd(
     noise: tuple[str, ...],
 ) -> list[dict[str, object]]:
     both_damaged, rows = [], []
+    unused = sum(each["vehicle"].n_unique() for each in tracks.values()) + 1
     for job in pair:
-        damaged, declared = _damage_tracks(tracks[job.subset], job, seed, noise)
+        damaged, declared = _damage_tracks(tracks[job.subset], job, seed, noise, unused)
+        unused += job.traffic.plan.second_tracks
         both_damaged.append(damaged)
         rows += declared
     files = highd.build_recording(scenario, *both_damaged, frames=pair[0].frames)

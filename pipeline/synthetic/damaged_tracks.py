@@ -14,10 +14,12 @@ class Defect:
 
     Args:
         name: late_start, overlap, backward, acceleration_spike, frozen_slow_speed, frame_gap, overlap_unseen,
-            wrong_leader, wrong_headway, lane_flicker, position_jump.
-        value: x_m of the first entry kept (late_start), depth in m (overlap, overlap_unseen), lowest speed in m/s
-            (backward), acceleration in m/s2 (acceleration_spike), speed in m/s (frozen_slow_speed), error in m
-            (wrong_headway, position_jump), wrong lane (lane_flicker).
+            wrong_leader, wrong_headway, lane_flicker, position_jump, hard_braking, sideways_speed, size_change,
+            early_end, second_track.
+        value: x_m of the first entry kept (late_start) or the last one (early_end), depth in m (overlap,
+            overlap_unseen), lowest speed in m/s (backward), acceleration in m/s2 (acceleration_spike, hard_braking),
+            speed in m/s (frozen_slow_speed, to the right: sideways_speed), error in m (wrong_headway, position_jump,
+            size_change), wrong lane (lane_flicker), the copied vehicle (second_track).
     """
 
     name: str
@@ -30,7 +32,10 @@ class Defect:
 
 @dataclass
 class DamagedTracks:
-    """Columns that are being damaged, (rows,) each but begins and ends (vehicles,), and the defects so far."""
+    """Columns that are being damaged, (rows,) each but begins and ends (vehicles,), and the defects so far.
+
+    `copies` are rows that stand in the file a second time, with the id of that track; `next_vehicle` is an unused id.
+    """
 
     rate_hz: float
     random: np.random.Generator
@@ -41,6 +46,7 @@ class DamagedTracks:
     length: Floats
     speed: Floats
     accel: Floats
+    lateral_speed: Floats
     leader: Integers
     begins: Integers
     ends: Integers
@@ -48,6 +54,8 @@ class DamagedTracks:
     lost_later: Flags
     leader_skipped: Flags
     headway_error: Floats
+    next_vehicle: int
+    copies: list[tuple[slice, int]] = field(default_factory=list)
     used: set[int] = field(default_factory=set)
     defects: list[Defect] = field(default_factory=list)
 
@@ -63,12 +71,14 @@ class DamagedTracks:
         """Return the rows of a vehicle."""
         return slice(int(self.begins[index]), int(self.ends[index]))
 
-    def add_defect(self, name: str, first: int, last: int, value: float | None = None) -> None:
-        """Declare that the entries from row `first` to row `last` of one vehicle are damaged."""
+    def add_defect(
+        self, name: str, first: int, last: int, value: float | None = None, vehicle: int | None = None
+    ) -> None:
+        """Declare that a vehicle's entries from row `first` to row `last` are damaged, or those of their copy."""
         self.defects.append(
             Defect(
                 name,
-                int(self.vehicle[first]),
+                int(self.vehicle[first]) if vehicle is None else vehicle,
                 int(self.frame[first]),
                 int(self.frame[last]),
                 last - first + 1,

@@ -1,7 +1,7 @@
 """Injection of known defects into clean tracks.
 
 A vehicle has one defect at most, and a leader that another vehicle is shifted into has none. The one exception is an
-NGSIM overlap whose leader also misses frames, declared as both.
+NGSIM overlap whose leader also misses frames, declared as both. A second track is a defect of its own id.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,14 @@ from tracklake.pipeline.synthetic.recording_errors import (
     make_lane_flicker_injector,
 )
 from tracklake.pipeline.synthetic.scenarios import Plan
+from tracklake.pipeline.synthetic.tracking_errors import (
+    copy_rows,
+    inject_hard_braking,
+    inject_second_track,
+    inject_sideways_speed,
+    inject_size_change,
+    make_early_end_injector,
+)
 from tracklake.schemas.arrays import find_run_starts
 
 LATE_START_M = (20.0, 200.0)
@@ -53,13 +61,15 @@ def inject_defects(
     on_ramp_lane: int | None,
     unseen_leaders: bool,
     random: np.random.Generator,
+    next_vehicle: int | None = None,
 ) -> Injected:
     """Damage the tracks of one subset, which are sorted by vehicle, frame, without gaps.
 
     Vehicles of `on_ramp_lane` begin in mid-section and so cannot start late. With `unseen_leaders` one overlap is with
-    a leader that misses frames, for formats that record its headway.
+    a leader that misses frames, for formats that record its headway. Second tracks have ids from `next_vehicle` on, by
+    default those after the greatest.
     """
-    work = _copy_tracks(tracks, rate_hz, random)
+    work = _copy_tracks(tracks, rate_hz, random, next_vehicle)
     injectors: tuple[tuple[Injector, int], ...] = (
         (_make_overlap_injector(unseen_leaders), plan.overlaps),
         (_make_late_start_injector(on_ramp_lane), plan.late_starts),
@@ -71,6 +81,11 @@ def inject_defects(
         (inject_wrong_leader, plan.wrong_leaders),
         (inject_wrong_headway, plan.wrong_headways),
         (make_lane_flicker_injector(on_ramp_lane), plan.lane_flickers),
+        (inject_hard_braking, plan.hard_brakings),
+        (inject_sideways_speed, plan.sideways_speeds),
+        (inject_size_change, plan.size_changes),
+        (make_early_end_injector(on_ramp_lane), plan.early_ends),
+        (inject_second_track, plan.second_tracks),
     )
     for injector, count in injectors:
         _damage_vehicles(work, injector, count)
@@ -78,15 +93,20 @@ def inject_defects(
         pl.Series("x", work.x),
         pl.Series("speed", work.speed),
         pl.Series("accel", work.accel),
+        pl.Series("lateral_speed", work.lateral_speed),
+        pl.Series("length", work.length),
         pl.Series("lane", work.lane).cast(tracks.schema["lane"]),
         pl.Series("lost", work.lost_later),
         pl.Series("leader_skipped", work.leader_skipped),
         pl.Series("headway_error", work.headway_error),
-    ).filter(~pl.Series(work.never_written))
-    return Injected(damaged, work.defects)
+    )
+    copies = copy_rows(damaged, work.copies)
+    return Injected(pl.concat([damaged.filter(~pl.Series(work.never_written)), *copies]), work.defects)
 
 
-def _copy_tracks(tracks: pl.DataFrame, rate_hz: float, random: np.random.Generator) -> DamagedTracks:
+def _copy_tracks(
+    tracks: pl.DataFrame, rate_hz: float, random: np.random.Generator, next_vehicle: int | None
+) -> DamagedTracks:
     vehicle = tracks["vehicle"].to_numpy().astype(np.int64)
     begins = find_run_starts(vehicle)
     return DamagedTracks(
@@ -96,9 +116,10 @@ def _copy_tracks(tracks: pl.DataFrame, rate_hz: float, random: np.random.Generat
         frame=tracks["frame"].to_numpy().astype(np.int64),
         lane=tracks["lane"].to_numpy().astype(np.int64, copy=True),
         x=tracks["x"].to_numpy().copy(),
-        length=tracks["length"].to_numpy(),
+        length=tracks["length"].to_numpy().copy(),
         speed=tracks["speed"].to_numpy().copy(),
         accel=tracks["accel"].to_numpy().copy(),
+        lateral_speed=tracks["lateral_speed"].to_numpy().copy(),
         leader=find_surroundings(tracks).leader,
         begins=begins,
         ends=np.append(begins[1:], len(vehicle)),
@@ -106,6 +127,7 @@ def _copy_tracks(tracks: pl.DataFrame, rate_hz: float, random: np.random.Generat
         lost_later=np.zeros(len(vehicle), bool),
         leader_skipped=np.zeros(len(vehicle), bool),
         headway_error=np.zeros(len(vehicle)),
+        next_vehicle=int(vehicle.max(initial=0)) + 1 if next_vehicle is None else next_vehicle,
     )
 
 

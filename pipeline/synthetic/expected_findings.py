@@ -5,14 +5,18 @@ The module shares no code with the pipeline, its sources or its rules, so that e
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
-from statistics import median
 
-Key = tuple[int, int]
-"""Key of an entry: vehicle and frame."""
+from tracklake.pipeline.synthetic.expected_tracking import TRACKING_TESTS
+from tracklake.pipeline.synthetic.scenery import Entry, Key, Scenery, Surface
+
 HIGH_ACCELERATION_MPS2 = 3.05
+HARD_DECELERATION_MPS2 = 8.0
+ACCELERATION_BOUNDS = {"car": (5.0, 0.1, 2.0), "truck": (2.5, 0.06, 1.0), "motorcycle": (7.0, 0.1, 3.0)}
+"""Acceleration at rest in m/s2, its fall per m/s, and the least bound in m/s2."""
+LATERAL_ACCELERATION_MPS2 = 3.0
+HEADING_ERROR_RAD = 0.1
+HEADING_SPEED_MPS = 5.0
 LOW_SPEED_MPS = 1.524
 JUMP_M = 2.0
 SPEED_DIFFERENCE_MPS = 1.0
@@ -27,133 +31,24 @@ SIZES_M = {"car": (2.4, 8.0, 1.2, 2.7), "truck": (4.0, 26.0, 1.4, 3.2), "motorcy
 """Least and greatest length, least and greatest width."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One row of a file in SI units: the front centre, `y` from the leftmost marking, `heading` to the right in rad."""
-
-    front: float
-    length: float
-    speed: float
-    accel: float
-    leader: int
-    headway: float | None
-    y: float = 0.0
-    width: float = 0.0
-    lane: int = 1
-    kind: str = "car"
-    heading: float = 0.0
-
-    @cached_property
-    def middle(self) -> tuple[float, float]:
-        """Middle of the body: along and across the road."""
-        back = self.length / 2
-        return self.front - back * math.cos(self.heading), self.y - back * math.sin(self.heading)
-
-    @cached_property
-    def radius(self) -> float:
-        """Distance from the middle of the body to its corners."""
-        return math.hypot(self.length, self.width) / 2
-
-    @cached_property
-    def corners(self) -> list[tuple[float, float]]:
-        """Corners of the body, in turn."""
-        ahead = math.cos(self.heading), math.sin(self.heading)
-        x, y = self.middle
-        turns = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-        return [
-            (
-                x + (long * self.length * ahead[0] - wide * self.width * ahead[1]) / 2,
-                y + (long * self.length * ahead[1] + wide * self.width * ahead[0]) / 2,
-            )
-            for long, wide in turns
-        ]
+def _breaks_acceleration_bound(scene: Scenery, key: Key) -> bool:
+    entry = scene.entries[key]
+    at_rest, fall, least = ACCELERATION_BOUNDS[entry.kind]
+    return round(entry.accel - max(at_rest - fall * max(entry.speed, 0), least), 3) > 0
 
 
-@dataclass(frozen=True)
-class Surface:
-    """The road and the camera of a subset.
-
-    Args:
-        markings: y of the lane markings, leftmost first; empty = unknown.
-        headway_stands_in: whether a recorded headway gives the gap to a leader without an entry in the frame.
-    """
-
-    rate_hz: float = 10.0
-    markings: tuple[float, ...] = ()
-    headway_stands_in: bool = True
+def _breaks_lateral_acceleration(scene: Scenery, key: Key) -> bool:
+    now, before = scene.past_lateral_speed(key, 0), scene.past_lateral_speed(key, 1)
+    if now is None or before is None:
+        return False
+    return round(abs(now - before) * 10, 3) > LATERAL_ACCELERATION_MPS2
 
 
-@dataclass
-class Scenery:
-    """The entries of a subset, indexed by frame and lane."""
-
-    entries: dict[Key, Entry]
-    surface: Surface
-
-    def __post_init__(self) -> None:
-        """Sort entries by frame and lane, and collect facts about every track."""
-        self.lengths = {vehicle: entry.length for (vehicle, _), entry in self.entries.items()}
-        self.in_frame: dict[int, list[Key]] = {}
-        self.in_lane: dict[tuple[int, int], list[Key]] = {}
-        for key in sorted(self.entries, key=lambda key: self.entries[key].front):
-            self.in_frame.setdefault(key[1], []).append(key)
-            self.in_lane.setdefault((key[1], self.entries[key].lane), []).append(key)
-        self.frame_place = {key: place for keys in self.in_frame.values() for place, key in enumerate(keys)}
-        self.lane_place = {key: place for keys in self.in_lane.values() for place, key in enumerate(keys)}
-        self.first_frames: dict[int, int] = {}
-        self.lane_changes: dict[int, int] = {}
-        self.unbroken: dict[Key, int] = {}
-        for key in sorted(self.entries):
-            before = self.near(key, -1)
-            self.first_frames.setdefault(*key)
-            self.unbroken[key] = 0 if before is None else self.unbroken[key[0], key[1] - 1] + 1
-            if before is not None and before.lane != self.entries[key].lane:
-                self.lane_changes[key[0]] = self.lane_changes.get(key[0], 0) + 1
-        self.from_fronts = self._counts_from_fronts()
-
-    def near(self, key: Key, frames: int) -> Entry | None:
-        """Return the vehicle's entry a number of frames later (negative: earlier)."""
-        return self.entries.get((key[0], key[1] + frames))
-
-    def gap(self, key: Key) -> float | None:
-        """Compute the gap from bumper to bumper in m; None = unknown."""
-        own = self.entries[key]
-        if own.leader == 0:
-            return None
-        leader = self.entries.get((own.leader, key[1]))
-        if leader is not None:
-            return round(leader.front - leader.length - own.front, 3)
-        known = self.surface.headway_stands_in and own.headway is not None and own.leader in self.lengths
-        if known and own.headway is not None and own.headway > 0:
-            return round(own.headway - self.lengths[own.leader], 3)
-        return None
-
-    def recorded_gap(self, key: Key) -> float | None:
-        """Compute the gap from bumper to bumper in m by the recorded headway."""
-        own = self.entries[key]
-        if own.leader == 0 or own.headway is None or own.leader not in self.lengths:
-            return None
-        return round(own.headway - (self.lengths[own.leader] if self.from_fronts else 0), 3)
-
-    def _counts_from_fronts(self) -> bool:
-        self.from_fronts = True
-        known = [
-            (front, self.lengths[self.entries[key].leader], gap)
-            for key in self.entries
-            if (front := self.recorded_gap(key)) is not None and (gap := self.gap(key)) is not None
-        ]
-        if not known:
-            return True
-        as_fronts = median(abs(front - gap) for front, _, gap in known)
-        return as_fronts <= median(abs(front + length - gap) for front, length, gap in known)
-
-    def past_accel(self, key: Key, tenths: int) -> float | None:
-        """Return the acceleration some tenths of a second before; between two frames the mean of both."""
-        frames = tenths * self.surface.rate_hz / 10
-        if self.unbroken[key] < frames:
-            return None
-        low, high = math.floor(frames), math.ceil(frames)
-        return (self.entries[key[0], key[1] - low].accel + self.entries[key[0], key[1] - high].accel) / 2
+def _breaks_heading_motion_mismatch(scene: Scenery, key: Key) -> bool:
+    entry, aside = scene.entries[key], scene.lateral_speed(key)
+    if not scene.surface.has_headings or aside is None or entry.speed < HEADING_SPEED_MPS:
+        return False
+    return round(abs(entry.heading - math.atan2(aside, entry.speed)), 4) > HEADING_ERROR_RAD
 
 
 def _breaks_low_constant_speed(scene: Scenery, key: Key) -> bool:
@@ -179,21 +74,10 @@ def _breaks_overlap(scene: Scenery, key: Key) -> bool:
             if abs(other.front - own.front) > LONGEST_M:
                 break
             is_near = math.dist(own.middle, other.middle) < own.radius + other.radius  # spares most of the comparisons
-            if is_near and _meets_along_axes(own, other) and _meets_along_axes(other, own):
+            if is_near and own.meets(other):
                 return True
             place += step
     return False
-
-
-def _meets_along_axes(one: Entry, other: Entry) -> bool:
-    """Test whether two boxes overlap both across and along the first; across comes first, as it parts lanes."""
-    cosine, sine = math.cos(one.heading), math.sin(one.heading)
-    for axis in ((-sine, cosine), (cosine, sine)):
-        own = [axis[0] * x + axis[1] * y for x, y in one.corners]
-        theirs = [axis[0] * x + axis[1] * y for x, y in other.corners]
-        if round(min(max(own) - min(theirs), max(theirs) - min(own)), 3) <= 0:
-            return False
-    return True
 
 
 def _breaks_speed_mismatch(scene: Scenery, key: Key) -> bool:
@@ -278,6 +162,10 @@ RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {
     "negative_headway": lambda scene, key: (scene.gap(key) or 0) < 0,
     "negative_headway_recorded": lambda scene, key: (scene.recorded_gap(key) or 0) < 0,
     "high_acceleration": lambda scene, key: scene.entries[key].accel > HIGH_ACCELERATION_MPS2,
+    "hard_deceleration": lambda scene, key: scene.entries[key].accel < -HARD_DECELERATION_MPS2,
+    "acceleration_bound": _breaks_acceleration_bound,
+    "lateral_acceleration": _breaks_lateral_acceleration,
+    "heading_motion_mismatch": _breaks_heading_motion_mismatch,
     "low_constant_speed": _breaks_low_constant_speed,
     "backward": lambda scene, key: scene.entries[key].speed < 0,
     "position_jump": _breaks_position_jump,
@@ -292,6 +180,7 @@ RULE_TESTS: dict[str, Callable[[Scenery, Key], bool]] = {
     "headway_mismatch": _breaks_headway_mismatch,
     "implausible_size": _breaks_implausible_size,
     "outside_lane": _breaks_outside_lane,
+    **TRACKING_TESTS,
 }
 """Functions that test whether an entry breaks a rule, by the rule's name."""
 

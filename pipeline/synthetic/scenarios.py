@@ -45,6 +45,11 @@ class Plan:
         wrong_leaders: vehicles whose leader's leader is recorded as theirs for a while.
         wrong_headways: vehicles whose recorded headway is wrong for a while.
         lane_flickers: vehicles recorded in the lane beside theirs for less than two seconds.
+        hard_brakings: vehicles with some recorded decelerations beyond 8 m/s2.
+        sideways_speeds: vehicles that seem to slide for one frame; NGSIM's formats have no lateral speeds.
+        size_changes: vehicles recorded longer for a while; in NGSIM's formats they would be two vehicles.
+        early_ends: vehicles that lose the last part of their track.
+        second_tracks: vehicles whose first seconds stand in the file a second time under another id.
     """
 
     late_starts: int = 3
@@ -57,6 +62,11 @@ class Plan:
     wrong_leaders: int = 0
     wrong_headways: int = 0
     lane_flickers: int = 0
+    hard_brakings: int = 0
+    sideways_speeds: int = 0
+    size_changes: int = 0
+    early_ends: int = 0
+    second_tracks: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,6 +133,7 @@ WEAVE_BEGINS_M = 180.0
 WEAVE_ENDS_M = 430.0
 """Positions at which the on-ramp comes into view, becomes the auxiliary lane, and ends, in m."""
 _MISREAD = Plan(jumps=1, wrong_leaders=1, wrong_headways=2, lane_flickers=2)
+_MISTRACKED = Plan(hard_brakings=1, sideways_speeds=2, size_changes=1, early_ends=2, second_tracks=1)
 
 HIGHD = (
     HighdScenario(
@@ -131,7 +142,7 @@ HIGHD = (
     ),
     HighdScenario(
         "02", 2, THREE_LANES, 1.1, "10.2017", "11:10",
-        Traffic(0.30),
+        Traffic(0.30, plan=_MISTRACKED),
         Traffic(0.42, trucks=0.12, bottleneck_mps=11.0, plan=Plan(backward_share=0.01)),
         exponent=True, damaged=True,
     ),
@@ -145,7 +156,7 @@ HIGHD = (
 
 _NGSIM_PLAN = Plan(
     late_starts=4, overlaps=3, backward_share=0.01, spikes=5, frozen=4, gaps=4, jumps=2, wrong_leaders=2,
-    wrong_headways=2, lane_flickers=2,
+    wrong_headways=2, lane_flickers=2, hard_brakings=1, early_ends=2, second_tracks=1,
 )  # fmt: skip
 _MORNING = Traffic(0.30, trucks=0.1, bottleneck_mps=9.0, ramp_arrivals=0.12, plan=_NGSIM_PLAN)
 _QUEUE = Traffic(0.32, trucks=0.12, bottleneck_mps=5.0, pulsing=True, ramp_arrivals=0.10, plan=_NGSIM_PLAN)

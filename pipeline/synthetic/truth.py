@@ -12,7 +12,8 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.expected_findings import Entry, Surface, count_rules
+from tracklake.pipeline.synthetic.expected_findings import count_rules
+from tracklake.pipeline.synthetic.scenery import Entry, Surface
 
 TRUTH_SCHEMA = {
     "kind": pl.String(),
@@ -105,16 +106,25 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
             else:
                 count.kept += 1
         found.files.append(count)
-    direction, kinds = {}, {}
+    direction, kinds, sizes = {}, {}, {}
     for line in _lines(folder / f"{recording}_tracksMeta.csv")[1:]:
         meta = line.split(",")
         direction[int(meta[0])] = int(meta[7])
         kinds[int(meta[0])] = meta[6].lower()
+        sizes[int(meta[0])] = float(meta[1]), float(meta[2])
     facts = _lines(folder / f"{recording}_recordingMeta.csv")[1].split(",")
     upper, lower = ([float(y) for y in field.split(";")] for field in facts[13:15])
     markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
     for side, places in markings.items():
-        found.surfaces[f"{recording}-{side}"] = Surface(float(facts[1]), tuple(places), headway_stands_in=False)
+        found.surfaces[f"{recording}-{side}"] = Surface(
+            float(facts[1]),
+            tuple(places),
+            headway_stands_in=False,
+            has_headings=True,
+            lanes=len(places) - 1,
+            ramps=(),
+            first_frame=1,
+        )
     path = folder / f"{recording}_tracks.csv"
     count = FileCount(path.name, "highd", recording)
     rows = {(int(row[1]), int(row[0])): row for row in _read_rows(_lines(path)[1:], ",", 25, range(25), count)}
@@ -135,16 +145,18 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         heading, half = headings[vehicle, frame], numbers[4] / 2
         entry = Entry(
             front=round(fronts[vehicle, frame] - (hindmost if left else 0), 3),
-            length=numbers[4],
+            length=sizes[vehicle][0],
             speed=along * numbers[6],
             accel=along * numbers[8],
             leader=int(numbers[16]),
             headway=numbers[12],
             y=round((upper[-1] - middle if left else middle - lower[0]) + half * math.sin(heading), 3),
-            width=numbers[5],
+            width=sizes[vehicle][1],
             lane=lanes + 2 - lane if left else lane - lanes - 2,
             kind=kinds[vehicle],
             heading=round(heading, 4),
+            lateral=along * numbers[7],
+            box=(numbers[4], numbers[5]),
         )
         subset = f"{recording}-{'upper' if left else 'lower'}"
         found.entries.setdefault(("highd", recording, subset), {})[vehicle, frame] = entry

@@ -39,11 +39,39 @@ def measure_jerk(scene: Scene) -> Floats:
     return np.round(change * CLOCK_HZ, 3)
 
 
+def measure_lateral_acceleration(scene: Scene) -> Floats:
+    """Measure the change of the lateral speed in the last 0.1 s / 0.1 s, m/s², to 0.001; NaN without either."""
+    now, before = (_get_past(scene, tick, "lateral_speed_mps") for tick in (0, 1))
+    return np.round((now.astype(np.float64) - before) * CLOCK_HZ, 3)
+
+
+def measure_heading_error(scene: Scene) -> Floats:
+    """Measure the angle between an entry's heading and its motion, rad, to 0.0001; NaN without a heading."""
+    speed, aside, heading = (scene.measurements(name) for name in ("speed_mps", "lateral_speed_mps", "heading_rad"))
+    error: Floats = np.round(np.abs(heading - np.arctan2(aside, speed)).astype(np.float64), 4)
+    return error
+
+
 def count_jerk_reversals(scene: Scene) -> NDArray[np.int8]:
     """Count the changes of sign among the ten jerks, 0.1 s apart, of the second that ends at an entry.
 
     Jerks of zero and missing ones are skipped: at a track's beginning and after a frame gap the second is shorter.
     """
+    return scene.once(_compare_jerks)[0]
+
+
+def find_jerk_reversals(scene: Scene) -> pl.Series:
+    """Return whether an entry's jerk has another sign than the last one of the second before; null without a jerk.
+
+    Jerks of zero and missing ones are skipped, as `count_jerk_reversals` does.
+    """
+    reverses = scene.once(_compare_jerks)[1]
+    has_jerk = ~np.isnan(_get_past(scene, 0) - _get_past(scene, 1))
+    return pl.Series(reverses).set(pl.Series(~has_jerk), None)
+
+
+def _compare_jerks(scene: Scene) -> tuple[NDArray[np.int8], Flags]:
+    """Count each entry's changes of sign within a second; also return whether its own jerk is one."""
     reversals = np.zeros(scene.height, np.int8)
     sign = np.zeros(scene.height, np.int8)
     before = _get_past(scene, TICKS)
@@ -51,26 +79,27 @@ def count_jerk_reversals(scene: Scene) -> NDArray[np.int8]:
         now = _get_past(scene, tick)
         change = now - before
         new = (change > NO_CHANGE_MPS2).view(np.int8) - (change < -NO_CHANGE_MPS2).view(np.int8)
-        reversals += (new * sign) < 0
+        reverses = (new * sign) < 0
+        reversals += reverses
         np.copyto(sign, new, where=new != 0)
         before = now
-    return reversals
+    return reversals, reverses
 
 
-def _get_past(scene: Scene, tick: int) -> Singles:
-    """Return the recorded acceleration `tick` tenths of a second before each entry; NaN where it is missing.
+def _get_past(scene: Scene, tick: int, column: str = "accel_mps2") -> Singles:
+    """Return what was recorded `tick` tenths of a second before each entry; NaN where it is missing.
 
     At 25 Hz every other tick lies between two frames; the value there is linear between theirs (their mean). Rates at
     which it lies elsewhere between frames have none: nothing is interpolated over longer.
     """
-    accel: Singles = scene.measurements("accel_mps2")
+    values: Singles = scene.measurements(column)
     halves = 2 * tick * scene.frame_rate_hz / CLOCK_HZ
     if halves % 1 or scene.frame_rate_hz < CLOCK_HZ:
         return np.full(scene.height, np.nan, np.float32)
     low, rest = divmod(int(halves), 2)
-    past = _shift(accel, low)
+    past = _shift(values, low)
     if rest:
-        past += _shift(accel, low + 1)
+        past += _shift(values, low + 1)
         past /= 2
     past[scene.age < low + rest] = np.nan
     return past
@@ -125,3 +154,8 @@ def measure_way_out_of_lane(scene: Scene) -> Floats:
 def repeat_trait(scene: Scene, column: str) -> pl.Series:
     """Repeat a column of `vehicles` for each entry."""
     return scene.traits[column].gather(scene.track)
+
+
+def repeat_motion_class(scene: Scene) -> pl.Series:
+    """Repeat the class of each entry's vehicle for the bounds of its motion: where it is unknown, that of a car."""
+    return scene.traits["class"].fill_null("car").gather(scene.track)

@@ -9,6 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.quality_reports.rules import along_tracks as along
+from tracklake.quality_reports.rules import cross_sections as sections
 from tracklake.quality_reports.rules import within_frames as within
 from tracklake.quality_reports.rules.along_messages import DRIVE_READS
 from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
@@ -18,6 +19,8 @@ ACCELERATION = ("vehicle_id", "frame", "accel_mps2", "frame_rate_hz")
 PLANE = ("vehicle_id", "frame", "x_m", "y_m", "heading_rad", "length_m", "width_m")
 LANE_ORDER = ("vehicle_id", "frame", "x_m", "lane")
 LEADER = ("vehicle_id", "frame", "x_m", "leader_id")
+RECORDING = ("frame_rate_hz", "lanes", "on_ramp_lanes", "first_frame", "last_frame")
+ENDS = (*LANE_ORDER, *RECORDING)
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,20 @@ DERIVED: dict[str, Derived] = {
     "frames_skipped": Derived(along.count_skipped_frames, ("vehicle_id", "frame")),
     "jerk_mps3": Derived(along.measure_jerk, ACCELERATION),
     "jerk_reversals": Derived(along.count_jerk_reversals, ACCELERATION),
+    "jerk_reverses": Derived(along.find_jerk_reversals, ACCELERATION),
+    "lateral_accel_mps2": Derived(
+        along.measure_lateral_acceleration, ("vehicle_id", "frame", "lateral_speed_mps", "frame_rate_hz")
+    ),
+    "heading_error_rad": Derived(along.measure_heading_error, ("heading_rad", "speed_mps", "lateral_speed_mps")),
+    "motion_class": Derived(along.repeat_motion_class, ("vehicle_id",)),
     "lane_stay_s": Derived(along.measure_lane_stays, ("vehicle_id", "frame", "lane", "frame_rate_hz")),
     "out_of_lane_m": Derived(
         along.measure_way_out_of_lane, ("vehicle_id", "y_m", "heading_rad", "length_m", "lane", "lane_markings_m")
     ),
     "overlap_m": Derived(within.measure_overlaps, PLANE),
+    "double_track_s": Derived(within.measure_double_tracks, (*PLANE, "frame_rate_hz")),
+    "fragment_m": Derived(sections.measure_fragments, ENDS),
+    "missed_section_m": Derived(sections.measure_missed_sections, ENDS),
     "nearest_ahead_m": Derived(within.measure_nearest_ahead, LANE_ORDER),
     "leader_ahead_m": Derived(within.measure_leader_ahead, LEADER),
     "leader_in_lane": Derived(within.is_leader_in_lane, ("vehicle_id", "frame", "leader_id", "lane")),

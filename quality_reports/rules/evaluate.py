@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from tracklake.quality_reports.rules.derived import prepare, trace
+from tracklake.quality_reports.rules.cross_sections import balance_sections
+from tracklake.quality_reports.rules.derived import ENDS, prepare, trace
 from tracklake.quality_reports.rules.findings import find, require_one_sorted_subset
 from tracklake.quality_reports.rules.registry import (
     RULES,
@@ -47,6 +48,9 @@ def judge(
     """
     limits = resolve(rules, thresholds)
     require_one_sorted_subset(scene.tracks)
+    if scene.tracks["heading_rad"].null_count() == scene.height:
+        # Other rules do without headings: to them, bodies without one lie along the road.
+        lacking = {*lacking, "heading_error_rad"}
     checked = checkable(rules, lacking)
     unchecked = tuple(rule for rule in rules if rule not in checked)
     scored = [name for name in COLUMNS_SCORED if not set(trace([name])) & set(lacking)]
@@ -56,7 +60,13 @@ def judge(
     return Judgement(
         findings=find(entries, broken, _select_limits(broken, limits)),
         vehicle_scores=vehicle_scores,
-        subset_scores=score_subset(entries.drop(set(lacking), strict=False), vehicle_scores, unchecked, limits),
+        subset_scores=score_subset(
+            entries.drop(set(lacking), strict=False),
+            vehicle_scores,
+            unchecked,
+            limits,
+            None if set(ENDS) & set(lacking) else balance_sections(scene),
+        ),
         unchecked=unchecked,
     )
 

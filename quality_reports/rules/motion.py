@@ -2,7 +2,18 @@
 
 import polars as pl
 
-from tracklake.quality_reports.rules.rule import DESIGN, PUNZO, STUDY, Case, Rule, Threshold, recorded
+from tracklake.quality_reports.rules.rule import (
+    DESIGN,
+    PUNZO,
+    RAJAMANI,
+    RAKHA,
+    STUDY,
+    Case,
+    Limits,
+    Rule,
+    Threshold,
+    recorded,
+)
 
 HIGH_ACCELERATION = Rule(
     name="high_acceleration",
@@ -16,6 +27,122 @@ HIGH_ACCELERATION = Rule(
     extreme="max",
     compared="as recorded, in single precision",
     case=Case({"accel_mps2": (3.05, 3.06, None)}, breaks=(1,)),
+)
+
+HARD_DECELERATION = Rule(
+    name="hard_deceleration",
+    severity="warning",
+    unit="m/s2",
+    thresholds=(Threshold("hard_deceleration_mps2", 8.0, "m/s2"),),
+    meaning="the recorded deceleration exceeds the threshold, that of emergency braking on a dry road",
+    source=f"{DESIGN}; UN Regulation 13-H demands 6.43 m/s² of a car's brakes; implausible accelerations: {PUNZO}",
+    breaks=lambda limits: pl.col("accel_mps2") < -recorded(limits["hard_deceleration_mps2"]),
+    value=pl.col("accel_mps2"),
+    extreme="min",
+    compared="as recorded, in single precision",
+    case=Case({"accel_mps2": (-8.0, -8.01, None)}, breaks=(1,)),
+)
+
+ACCELERATION_BOUNDS: dict[str, tuple[float, float, float]] = {
+    "car": (5.0, 0.1, 2.0),
+    "truck": (2.5, 0.06, 1.0),
+    "motorcycle": (7.0, 0.1, 3.0),
+}
+"""Greatest acceleration at rest in m/s², its fall in m/s² per m/s, and its least value in m/s², by class."""
+
+
+def _make_acceleration_limits() -> tuple[Threshold, ...]:
+    """Make the thresholds of every class."""
+    named = (("at_rest_mps2", "m/s2"), ("fall_per_s", "1/s"), ("least_mps2", "m/s2"))
+    return tuple(
+        Threshold(f"acceleration_bound_{kind}_{name}", value, unit)
+        for kind, values in ACCELERATION_BOUNDS.items()
+        for (name, unit), value in zip(named, values, strict=True)
+    )
+
+
+def _measure_acceleration_excess(limits: Limits) -> pl.Expr:
+    """Measure how far the recorded acceleration exceeds the bound at the recorded speed, m/s², to 0.001."""
+    speed, bound = pl.col("speed_mps").cast(pl.Float64).clip(lower_bound=0), pl.lit(None, pl.Float64)
+    for kind in ACCELERATION_BOUNDS:
+        at_rest, fall, least = (
+            limits[f"acceleration_bound_{kind}_{name}"] for name in ("at_rest_mps2", "fall_per_s", "least_mps2")
+        )
+        own = (at_rest - fall * speed).clip(lower_bound=least)
+        bound = pl.when(pl.col("motion_class") == kind).then(own).otherwise(bound)
+    return (pl.col("accel_mps2").cast(pl.Float64) - bound).round(3)
+
+
+ACCELERATION_BOUND = Rule(
+    name="acceleration_bound",
+    severity="warning",
+    unit="m/s2",
+    thresholds=_make_acceleration_limits(),
+    meaning="the recorded acceleration exceeds what vehicles of the class reach at the recorded speed: a bound at rest "
+    "that falls linearly with speed down to a least value. Vehicles of unknown class are taken for cars. The worst "
+    "value is by how much; reconstructed tracks keep the same bounds",
+    source=f"{DESIGN}; accelerations that fall linearly with speed: {RAKHA}",
+    breaks=lambda limits: _measure_acceleration_excess(limits) > 0,
+    value=_measure_acceleration_excess,
+    extreme="max",
+    compared="rounded to 1 mm/s²",
+    case=Case(
+        {
+            "speed_mps": (0.0, 20.0, 20.0, 40.0, 20.0),
+            "accel_mps2": (5.0, 3.0, 3.01, 2.01, 1.31),
+            "class": ("car", "car", "car", None, "truck"),
+        },
+        breaks=(2, 3, 4),
+    ),
+)
+
+LATERAL_ACCELERATION = Rule(
+    name="lateral_acceleration",
+    severity="warning",
+    unit="m/s2",
+    thresholds=(Threshold("lateral_acceleration_mps2", 3.0, "m/s2"),),
+    meaning="the lateral speed has changed by more than the threshold times 0.1 s, either way, within the 0.1 s that "
+    "end at the entry; at 25 Hz the lateral speed 0.1 s before is the mean of those 2 and 3 frames before. A lane "
+    "change of 3.6 m needs as much where it takes 2.7 s",
+    source=f"{DESIGN}; UN Regulation 79 allows systems that steer cars 3 m/s²",
+    breaks=lambda limits: pl.col("lateral_accel_mps2").abs() > limits["lateral_acceleration_mps2"],
+    value=pl.col("lateral_accel_mps2").abs(),
+    extreme="max",
+    compared="rounded to 1 mm/s²",
+    case=Case(
+        {"vehicle_id": (1, 1, 2, 2), "frame": (1, 2, 1, 2), "lateral_speed_mps": (0.0, -0.3, 0.0, -0.31)},
+        breaks=(3,),
+        frame_rate_hz=10.0,
+    ),
+)
+
+HEADING_MOTION_MISMATCH = Rule(
+    name="heading_motion_mismatch",
+    severity="warning",
+    unit="rad",
+    thresholds=(
+        Threshold("heading_motion_mismatch_rad", 0.1, "rad"),
+        Threshold("heading_motion_speed_mps", 5.0, "m/s"),
+    ),
+    meaning="the body does not point where the vehicle moves: the heading differs by more than the threshold from the "
+    "direction of the recorded speeds along and across the road, where the speed along it is at least the second "
+    "threshold. Checked where the source has headings",
+    source=f"{DESIGN}; slip angles in normal driving are small: {RAJAMANI}",
+    breaks=lambda limits: (
+        (pl.col("speed_mps") >= recorded(limits["heading_motion_speed_mps"]))
+        & (pl.col("heading_error_rad") > limits["heading_motion_mismatch_rad"])
+    ),
+    value=pl.col("heading_error_rad"),
+    extreme="max",
+    compared="rounded to 0.0001",
+    case=Case(
+        {
+            "speed_mps": (20.0, 20.0, 4.9, 20.0),
+            "lateral_speed_mps": (2.0, 2.01, 2.01, 2.01),
+            "heading_rad": (0.0, 0.0, 0.0, None),
+        },
+        breaks=(1,),
+    ),
 )
 
 LOW_CONSTANT_SPEED = Rule(
@@ -152,6 +279,8 @@ JERK_FLICKER = Rule(
 
 MOTION_RULES = (
     HIGH_ACCELERATION,
+    HARD_DECELERATION,
+    ACCELERATION_BOUND,
     LOW_CONSTANT_SPEED,
     BACKWARD,
     POSITION_JUMP,
@@ -159,5 +288,7 @@ MOTION_RULES = (
     SPEED_MISMATCH,
     HIGH_JERK,
     JERK_FLICKER,
+    LATERAL_ACCELERATION,
+    HEADING_MOTION_MISMATCH,
 )
 """Rules about the motion of one vehicle, in the order of the report."""

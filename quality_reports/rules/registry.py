@@ -12,6 +12,7 @@ from tracklake.quality_reports.rules.drive import DRIVE_RULES
 from tracklake.quality_reports.rules.motion import MOTION_RULES
 from tracklake.quality_reports.rules.place import PLACE_RULES
 from tracklake.quality_reports.rules.rule import Rule, Severity, Threshold
+from tracklake.quality_reports.rules.tracking import TRACKING_RULES
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.text import suggest_name
 
@@ -34,7 +35,7 @@ __all__ = [
     "select_thresholds",
 ]
 
-RULES: tuple[Rule, ...] = (*MOTION_RULES, *PLACE_RULES)
+RULES: tuple[Rule, ...] = (*MOTION_RULES, *PLACE_RULES, *TRACKING_RULES)
 """Rules over tracks, in the order of the report."""
 ALL_RULES = (*RULES, *DRIVE_RULES)
 """Rules in use, those for drives last."""
@@ -45,8 +46,8 @@ class ThresholdError(UsageError):
 
 
 def checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
-    """Select the rules that can be checked where these columns of `tracks`, `vehicles` and `subsets` are lacking."""
-    return tuple(rule for rule in rules if not set(rule.columns) & set(lacking))
+    """Select the rules that can be checked where these columns, of the lake's tables or derived, are lacking."""
+    return tuple(rule for rule in rules if not {*rule.columns, *rule.reads} & set(lacking))
 
 
 def columns_needed(rules: Sequence[Rule]) -> tuple[str, ...]:

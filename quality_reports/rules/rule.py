@@ -15,6 +15,7 @@ Limits = Mapping[str, float]
 
 DESIGN = "docs/DESIGN.md, section 5"
 STUDY, COIFMAN, PUNZO = references.HAMALAINEN.name, references.COIFMAN.name, references.PUNZO.name
+RAKHA, RAJAMANI, DAGANZO = references.RAKHA.name, references.RAJAMANI.name, references.DAGANZO.name
 """Sources that several rules cite."""
 
 
@@ -60,12 +61,16 @@ class Case:
         breaks: indices of the entries that break the rule.
         frame_rate_hz: frame rate of the source.
         lane_markings_m: y_m of the lane markings, leftmost first.
+        lanes: number of main lanes.
+        last_frame: the recording's last frame; its first one is 1.
     """
 
     entries: Mapping[str, Sequence[Any]]
     breaks: tuple[int, ...]
     frame_rate_hz: float = 25.0
     lane_markings_m: tuple[float, ...] | None = None
+    lanes: int | None = None
+    last_frame: int | None = None
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """One subset as arrays: its entries, its vehicles, its road and its camera."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
@@ -15,10 +15,11 @@ ABSENT = -1
 """Index of a row, track or lane that does not exist."""
 UNITS_PER_M = 10_000
 """Units of compared positions in a metre: tenths of a millimetre; files have 0.3 mm (0.001 ft) or 1 cm."""
-VEHICLE_COLUMNS = ("length_m", "width_m", "class")
+VEHICLE_COLUMNS = ("length_m", "width_m", "class", "length_range_m", "width_range_m")
 """Columns of `vehicles` that rules may read."""
-SUBSET_COLUMNS = ("frame_rate_hz", "lane_markings_m")
-"""Columns of `subsets` that rules may read."""
+SUBSET_COLUMNS = ("frame_rate_hz", "lane_markings_m", "lanes", "on_ramp_lanes", "first_frame", "last_frame")
+"""Columns of `subsets` that rules may read, in the order of a Scene's arguments."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,29 @@ class Scene:
             size and class.
         frame_rate_hz: frame rate of the source.
         lane_markings_m: y_m of the lane markings, leftmost first; None where unknown.
+        lanes: number of main lanes; None where unknown.
+        on_ramp_lanes: lanes that are on-ramps.
+        first_frame: the recording's first frame.
+        last_frame: the subset's last frame.
+        results: what `once` has computed, by function.
     """
 
     tracks: pl.DataFrame
     vehicles: pl.DataFrame
     frame_rate_hz: float
     lane_markings_m: Sequence[float] | None = None
+    lanes: int | None = None
+    on_ramp_lanes: Sequence[int] = ()
+    first_frame: int | None = None
+    last_frame: int | None = None
+    results: dict[Callable[["Scene"], Any], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def once(self, compute: Callable[["Scene"], T]) -> T:
+        """Return the result of a function of the scene, which several derived columns share."""
+        if compute not in self.results:
+            self.results[compute] = compute(self)
+        found: T = self.results[compute]
+        return found
 
     @property
     def height(self) -> int:
@@ -63,7 +81,7 @@ class Scene:
     @cached_property
     def ends(self) -> Integers:
         """Row after each track's last entry, (V,)."""
-        return np.append(self.begins[1:], self.height)
+        return np.append(self.begins[1:], self.height)[: len(self.begins)]
 
     @cached_property
     def track(self) -> NDArray[np.int32]:

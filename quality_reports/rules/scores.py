@@ -13,8 +13,8 @@ from tracklake.quality_reports.rules.registry import RULES, Rule, resolve
 from tracklake.schemas import SUBSET_SCORES, VEHICLE_SCORES
 
 COLUMNS_SCORED = (
-    "speed_mps", "speed_10hz_mps", "accel_mps2", "accel_10hz_mps2", "jerk_mps3", "jerk_reversals", "recorded_gap_m",
-    "gap_m", "leader_ahead_m",
+    "speed_mps", "speed_10hz_mps", "accel_mps2", "accel_10hz_mps2", "jerk_mps3", "jerk_reversals", "jerk_reverses",
+    "recorded_gap_m", "gap_m", "leader_ahead_m", "fragment_m",
 )  # fmt: skip
 """Columns of prepared entries that `score_subset` compares where they are present."""
 
@@ -22,7 +22,7 @@ COLUMNS_SCORED = (
 def score_vehicles(
     entries: pl.DataFrame, rules: Sequence[Rule] = RULES, thresholds: Mapping[str, float] | None = None
 ) -> pl.DataFrame:
-    """Return `vehicle_scores`: each vehicle's share of entries without error, and without error and warning.
+    """Return `vehicle_scores`: each vehicle's shares of entries without error and warning, and of reversals of jerk.
 
     The entries are ONE subset's prepared ones, sorted by vehicle_id, frame; thresholds override by name.
 
@@ -36,15 +36,17 @@ def score_vehicles(
         pl.any_horizontal(pl.lit(value=False), *(rule.broken(limits) for rule in rules if rule.severity == severity))
         for severity in ("error", "warning")
     )
+    reverses = pl.col("jerk_reverses") if "jerk_reverses" in entries.columns else pl.lit(None, pl.Boolean)
     scores = (
         entries.lazy()
-        .select("dataset", "subset", "vehicle_id", error=error, either=error | warning)
+        .select("dataset", "subset", "vehicle_id", error=error, either=error | warning, reverses=reverses)
         .group_by("vehicle_id", maintain_order=True)
         .agg(
             pl.col("dataset", "subset").first(),
             entries=pl.len(),
             share_without_error=(~pl.col("error")).mean(),
             share_without_warning=(~pl.col("either")).mean(),
+            jerk_reversal_share=pl.col("reverses").mean(),
         )
     )
     return VEHICLE_SCORES.conform(scores).collect()
@@ -55,11 +57,13 @@ def score_subset(
     vehicle_scores: pl.DataFrame,
     unchecked: Sequence[Rule] = (),
     thresholds: Mapping[str, float] | None = None,
+    cross_sections: Sequence[Mapping[str, float | int | None]] | None = None,
 ) -> pl.DataFrame:
     """Return `subset_scores`: one row, or none where there are no entries.
 
     The entries are ONE subset's prepared ones, with those of COLUMNS_SCORED that its source has; of the thresholds,
-    high_jerk_mps3 and jerk_flicker_changes count here.
+    high_jerk_mps3, jerk_flicker_changes and track_fragment_m count here. For the cross sections see
+    `quality_reports.rules.cross_sections.balance_sections`; None where they are unknown.
 
     Raises:
         ThresholdError: see `quality_reports.rules.registry.resolve`.
@@ -81,6 +85,9 @@ def score_subset(
         "high_jerk_share": (pl.col("jerk_mps3").abs() > limits["high_jerk_mps3"]).mean(),
         "worst_jerk_mps3": pl.col("jerk_mps3").abs().max(),
         "jerk_flicker_share": (pl.col("jerk_reversals") > limits["jerk_flicker_changes"]).filter(has_jerk).mean(),
+        "jerk_reversal_share": pl.col("jerk_reverses").mean(),
+        "fragments_per_1000_vehicles": (pl.col("fragment_m") > limits["track_fragment_m"]).sum()
+        * (1000 / vehicle_scores.height),
         "spacing_rms_m": _root_mean_square(spacing),
         "spacings": spacing.count(),
     }
@@ -93,10 +100,12 @@ def score_subset(
         "subset": [entries["subset"][0]],
         "entries": [entries.height],
         "rules_unchecked": [[rule.name for rule in unchecked]],
+        "cross_sections": [cross_sections],
     }
-    scores = pl.concat(
-        [pl.DataFrame(facts, schema_overrides={"rules_unchecked": pl.List(pl.String)}), feasible, row], how="horizontal"
-    ).with_columns(pl.col("spacings").fill_null(0))
+    types = {name: SUBSET_SCORES.dtypes[name] for name in ("rules_unchecked", "cross_sections")}
+    scores = pl.concat([pl.DataFrame(facts, schema_overrides=types), feasible, row], how="horizontal").with_columns(
+        pl.col("spacings").fill_null(0)
+    )
     return SUBSET_SCORES.conform(scores.lazy()).collect()
 
 

@@ -1,10 +1,15 @@
 """Derived columns that compare the vehicles of one frame: overlaps, nearest vehicles ahead, headways."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tracklake.quality_reports.rules.scene import ABSENT, UNITS_PER_M, Scene
 from tracklake.schemas.arrays import Flags, Floats, Integers
+
+SAME_PLACE_SHARE = 0.7
+"""Share of the smaller of two boxes that lies in the other where two tracks are taken for one vehicle."""
 
 
 def sort_rows(*keys: NDArray[np.integer]) -> Integers:
@@ -34,9 +39,55 @@ def measure_overlaps(scene: Scene) -> Floats:
     """Measure how deep an entry's box lies in that of another vehicle in the same frame, m, to 1 mm.
 
     Depth is the least distance that one of the two would have to move, along or across either of them, to be clear of
-    the other; of several overlaps the deepest. 0 = none: touching is not overlapping. Boxes reach back from the front
-    centre by the length, against the heading (along the road where there is none), and half the width to either side.
-    NaN where the own size is unknown; others of unknown size are skipped.
+    the other; of several overlaps the deepest. 0 = none: touching is not overlapping. NaN where the own size is
+    unknown; others of unknown size are skipped.
+    """
+    overlaps = scene.once(find_overlaps)
+    depth = np.where(overlaps.known, 0.0, np.nan)
+    for rows in (overlaps.first, overlaps.second):
+        np.maximum.at(depth, rows, overlaps.depth)
+    return depth
+
+
+def measure_double_tracks(scene: Scene) -> Floats:
+    """Measure for how long an entry's vehicle shares its place with another one that shares it here, s; 0 = none.
+
+    Two share a place where SAME_PLACE_SHARE of the smaller box lies in the other; all such frames of the two count.
+    NaN where the own size is unknown.
+    """
+    overlaps = scene.once(find_overlaps)
+    same = overlaps.share >= SAME_PLACE_SHARE
+    first, second = overlaps.first[same], overlaps.second[same]
+    tracks = np.sort(scene.track[np.stack([first, second])], axis=0).astype(np.int64)
+    _, pair, frames = np.unique(tracks[0] * len(scene.begins) + tracks[1], return_inverse=True, return_counts=True)
+    together = np.where(overlaps.known, 0.0, np.nan)
+    for rows in (first, second):
+        np.maximum.at(together, rows, frames[pair] / scene.frame_rate_hz)
+    return together
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Overlaps of two boxes in one frame, and of which entries the size is known, (N,).
+
+    Args:
+        first, second: rows of the entries, (P,).
+        depth: how deep the boxes lie in each other, m, to 1 mm.
+        share: share of the smaller box that lies in the other.
+    """
+
+    known: Flags
+    first: Integers
+    second: Integers
+    depth: Floats
+    share: Floats
+
+
+def find_overlaps(scene: Scene) -> Overlaps:
+    """Find all pairs of vehicles whose boxes overlap.
+
+    Boxes reach back from the front centre by the length, against the heading (along the road where there is none), and
+    half the width to either side.
     """
     length, width = (scene.trait(name)[scene.track] for name in ("length_m", "width_m"))
     known = ~(np.isnan(length) | np.isnan(width))
@@ -50,7 +101,8 @@ def measure_overlaps(scene: Scene) -> Floats:
     ahead_m = float(np.max(boxes.half_width * np.abs(boxes.sine), initial=0.0))
     rear = boxes.x - boxes.half_length * boxes.cosine - boxes.half_width * np.abs(boxes.sine) - ahead_m
     side = boxes.half_length * np.abs(boxes.sine) + boxes.half_width * boxes.cosine
-    depth = np.zeros(len(rows))
+    nothing = np.empty(0)
+    found = [(nothing.astype(np.int64), nothing.astype(np.int64), nothing, nothing)]
     ahead, step = np.arange(1, len(rows)), 1
     while ahead.size:
         behind = ahead - step
@@ -59,14 +111,14 @@ def measure_overlaps(scene: Scene) -> Floats:
         behind = ahead - step
         meets = side[ahead] + side[behind] > np.abs(boxes.y[ahead] - boxes.y[behind])
         first, second = behind[meets], ahead[meets]
-        deep = np.round(np.minimum(boxes.measure_depth(first, second), boxes.measure_depth(second, first)), 3)
-        depth[first] = np.maximum(depth[first], deep)
-        depth[second] = np.maximum(depth[second], deep)
+        depths = np.array([*boxes.measure_depths(first, second), *boxes.measure_depths(second, first)])
+        depth = np.round(depths.min(axis=0), 3)
+        deep = depth > 0
+        first, second, depths = first[deep], second[deep], depths[:, deep]
+        found.append((rows[first], rows[second], depth[deep], boxes.measure_share(first, second, depths)))
         step += 1
         ahead = ahead[ahead >= step]
-    overlap = np.full(scene.height, np.nan)
-    overlap[rows] = depth
-    return overlap
+    return Overlaps(known, *(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 class _Boxes:
@@ -81,8 +133,8 @@ class _Boxes:
         x, y = (scene.tracks[name].to_numpy()[rows] for name in ("x_m", "y_m"))
         self.x, self.y = x - self.half_length * self.cosine, y - self.half_length * self.sine
 
-    def measure_depth(self, one: Integers, other: Integers) -> Floats:
-        """Measure the lesser of how far two boxes overlap along and across the first, m; not above 0 = apart."""
+    def measure_depths(self, one: Integers, other: Integers) -> tuple[Floats, Floats]:
+        """Measure how far two boxes overlap along and across the first, m; not above 0 = apart."""
         x, y = self.x[other] - self.x[one], self.y[other] - self.y[one]
         cosine, sine = self.cosine[one], self.sine[one]
         # Of the angle between the two boxes.
@@ -91,8 +143,21 @@ class _Boxes:
         length, width = self.half_length[other], self.half_width[other]
         along = self.half_length[one] + length * turned + width * askew - np.abs(x * cosine + y * sine)
         across = self.half_width[one] + length * askew + width * turned - np.abs(y * cosine - x * sine)
-        depth: Floats = np.minimum(along, across)
-        return depth
+        return along, across
+
+    def measure_share(self, one: Integers, other: Integers, depths: Floats) -> Floats:
+        """Measure the share of the smaller of two boxes that lies in the other, as if they were parallel.
+
+        `depths` are how far they overlap along and across the one and the other, (4, P); the greater share counts.
+        """
+        half = np.minimum(self.half_length[one], self.half_length[other])
+        wide = np.minimum(self.half_width[one], self.half_width[other])
+        area = np.minimum(
+            self.half_length[one] * self.half_width[one], self.half_length[other] * self.half_width[other]
+        )
+        inside = np.minimum(depths[::2], 2 * half) * np.minimum(depths[1::2], 2 * wide)
+        share: Floats = inside.max(axis=0) / (4 * area)
+        return share
 
 
 def measure_nearest_ahead(scene: Scene) -> Floats:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.expected_findings import Entry, Key, Scenery, Surface
+from tracklake.pipeline.synthetic.scenery import Entry, Key, Scenery, Surface
 from tracklake.quality_reports.rules.evaluate import tracks_needed
 from tracklake.quality_reports.rules.rule import Case
 from tracklake.quality_reports.rules.scene import VEHICLE_COLUMNS, Scene
@@ -36,6 +36,7 @@ def scene_of(entries: dict[Key, Entry], surface: Surface = ANY_SURFACE) -> Scene
                 "accel_mps2": entry.accel,
                 "speed_10hz_mps": speed_10hz(slow, (vehicle, frame)),
                 "accel_10hz_mps2": entry.accel,
+                "lateral_speed_mps": slow.lateral_speed((vehicle, frame)),
                 "leader_id": entry.leader or None,
                 "gap_m": slow.gap((vehicle, frame)),
                 "headway_recorded_m": entry.headway if entry.leader else None,
@@ -49,10 +50,13 @@ def scene_of(entries: dict[Key, Entry], surface: Surface = ANY_SURFACE) -> Scene
             "length_m": [entry.length for entry in sizes.values()],
             "width_m": [entry.width for entry in sizes.values()],
             "class": [entry.kind for entry in sizes.values()],
+            "length_range_m": [slow.size_range(vehicle, 0) for vehicle in sizes],
+            "width_range_m": [slow.size_range(vehicle, 1) for vehicle in sizes],
         },
-        schema={"vehicle_id": pl.Int32, "length_m": pl.Float32, "width_m": pl.Float32, "class": pl.String},
+        schema={name: VEHICLES.dtypes[name] for name in ("vehicle_id", *VEHICLE_COLUMNS)},
     ).sort("vehicle_id")
-    return Scene(tracks, vehicles, surface.rate_hz, surface.markings or None)
+    road = (surface.lanes, surface.ramps, slow.first_frame, slow.last_frame)
+    return Scene(tracks, vehicles, surface.rate_hz, surface.markings or None, *road)
 
 
 def speed_10hz(slow: Scenery, key: Key) -> float | None:
@@ -103,7 +107,8 @@ def lay_out(case: Case) -> Scene:
         "dataset": ["highd"] * height, "subset": ["01-upper"] * height, "vehicle_id": list(range(1, height + 1)),
         "frame": [1] * height, "x_m": [0.0] * height, "y_m": [0.0] * height, "lane": [1] * height,
         "speed_mps": [20.0] * height, "accel_mps2": [0.0] * height, "length_m": [4.0] * height,
-        "width_m": [2.0] * height, "class": ["car"] * height,
+        "width_m": [2.0] * height, "class": ["car"] * height, "length_range_m": [None] * height,
+        "width_range_m": [None] * height,
     }  # fmt: skip
     said = usual | {name: list(values) for name, values in case.entries.items()}
     tracks = {name: said.get(name, [None] * height) for name in tracks_needed()}
@@ -115,4 +120,7 @@ def lay_out(case: Case) -> Scene:
         .sort("vehicle_id"),
         case.frame_rate_hz,
         case.lane_markings_m,
+        case.lanes,
+        first_frame=1,
+        last_frame=case.last_frame,
     )

@@ -8,7 +8,7 @@ from unittest import mock
 import polars as pl
 
 from tracklake.pipeline.synthetic import build, truth
-from tracklake.pipeline.synthetic.expected_findings import Entry, Key, Surface
+from tracklake.pipeline.synthetic.scenery import Entry, Key, Surface
 
 simulate = build.simulate
 simulated: dict[str, pl.DataFrame] = {}

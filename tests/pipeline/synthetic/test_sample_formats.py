@@ -6,9 +6,10 @@ import pytest
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
 from tracklake.pipeline.synthetic import highd, ngsim
-from tracklake.pipeline.synthetic.expected_findings import Entry, Surface, count_rules
+from tracklake.pipeline.synthetic.expected_findings import count_rules
 from tracklake.pipeline.synthetic.neighbors import find_surroundings
 from tracklake.pipeline.synthetic.scenarios import TWO_LANES, HighdScenario, Traffic
+from tracklake.pipeline.synthetic.scenery import Entry, Surface
 
 
 def tracks(*rows):
@@ -255,6 +256,8 @@ def test_the_slow_loop_counts_by_hand():
         "negative_headway": (2, 1, 2),
         "negative_headway_recorded": (1, 1, 1),
         "high_acceleration": (2, 1, 2),
+        # At 10 m/s a car may reach 4 m/s2.
+        "acceleration_bound": (1, 1, 1),
         "low_constant_speed": (2, 1, 2),
         "backward": (1, 1, 1),
         # From 97 to 95 m at 10 m/s: 3 m short. Frames 4 to 8 of 2 are missing.

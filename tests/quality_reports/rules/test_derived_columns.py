@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rule_scenes import ANY_SURFACE, change, driver, scene_of
 
-from tracklake.pipeline.synthetic.expected_findings import Surface
+from tracklake.pipeline.synthetic.scenery import Surface
 from tracklake.quality_reports.rules import within_frames
 from tracklake.quality_reports.rules.derived import DERIVED, prepare, trace
 from tracklake.quality_reports.rules.scene import ABSENT

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rule_scenes import change, driver, entries_found, scene_of
 
-from tracklake.pipeline.synthetic.expected_findings import RULE_TESTS, Entry, Surface, find_broken
+from tracklake.pipeline.synthetic.expected_findings import RULE_TESTS, find_broken
+from tracklake.pipeline.synthetic.scenery import Entry, Surface
 from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
 from tracklake.quality_reports.rules.findings import SubsetOrderError
 from tracklake.quality_reports.rules.registry import RULES, ThresholdError
@@ -14,10 +15,15 @@ from tracklake.quality_reports.rules.scene import Scene, find_lacking
 from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSETS, TRACKS, VEHICLE_SCORES
 
 LARGEST = 2**31 - 1
-ROAD = Surface(rate_hz=10.0, markings=(0.0, 4.0, 8.0, 12.0))
+ROAD = Surface(rate_hz=10.0, markings=(0.0, 4.0, 8.0, 12.0), has_headings=True, lanes=3)
 FRAMES = range(1, 41)
 JUDGED = tuple(rule for rule in RULES if rule.name in RULE_TESTS)
 """The rules that the slow loop knows; any other has its own case alone (test_rule_cases.py)."""
+TRACKED = {
+    *("hard_deceleration", "acceleration_bound", "lateral_acceleration", "heading_motion_mismatch"),
+    *("track_fragment", "cross_section_flow", "duplicate_track", "size_change"),
+}
+"""Rules with a scene of their own."""
 
 
 def platoon() -> dict:
@@ -53,7 +59,7 @@ def test_injected_defects_are_found_entry_for_entry_and_nothing_else():
     change(entries, 10, [30, 31], ahead=1.5)
     change(entries, 11, FRAMES, length=12.0)
     change(entries, 11, [3], y=7.5)
-    found = judge(scene_of(entries, ROAD), rules=JUDGED).findings
+    found = judge(scene_of(entries, ROAD), rules=[rule for rule in JUDGED if rule.name not in TRACKED]).findings
     runs = found.select("rule", "vehicle_id", "first_frame", "last_frame", "entries", "worst")
     expected = [
         ("backward", 4, 15, 15, 1, -1.0),
@@ -94,9 +100,53 @@ def test_injected_defects_are_found_entry_for_entry_and_nothing_else():
     ]
     assert [row[:-1] for row in runs.rows()] == [row[:-1] for row in expected]
     assert runs["worst"].to_list() == pytest.approx([row[-1] for row in expected], abs=1e-6)
-    assert set(runs["rule"]) == set(RULE_TESTS), "every rule has its defect"
+    assert set(runs["rule"]) == set(RULE_TESTS) - TRACKED, "every rule has its defect"
     severities = {rule.name: rule.severity for rule in RULES}
     assert all(severities[rule] == severity for rule, severity in found.select("rule", "severity").iter_rows())
+
+
+def test_defects_of_tracking_are_found_entry_for_entry_and_nothing_else():
+    entries = driver(1, FRAMES, x=0.0, speed=0.1, accel=0.5, box=(5.0, 2.0))
+    change(entries, 1, [20], accel=-8.5)
+    change(entries, 1, [8], box=(5.0, 2.3))
+    entries |= driver(2, FRAMES, x=10.0, speed=20.0)
+    change(entries, 2, [5], accel=3.5)
+    change(entries, 2, [25], lateral=2.5, speed=10.0)
+    entries |= driver(3, range(5, 10), x=420.0, lane=2, y=6.0)
+    entries |= driver(4, range(5, 10), x=421.0, lane=2, y=6.2)
+    entries |= driver(5, range(5, 9), x=425.0, lane=2, y=6.1)
+    # 6 and 7 drive from -20 to 500 m; 8 ends at 229 m; 9 begins at 331 m, and 10 does so on the ramp.
+    road = {"lane": 3, "y": 10.0, "speed": 400.0}
+    entries |= driver(6, range(11, 25), x=-20.0, **road) | driver(7, range(12, 26), x=-20.0, **road)
+    entries |= driver(8, range(13, 20), x=-11.0, **road) | driver(9, range(20, 25), x=331.0, **road)
+    entries |= driver(10, range(20, 25), x=331.0, lane=4, y=14.0, speed=400.0)
+    judged = judge(scene_of(entries, ROAD), rules=[rule for rule in JUDGED if rule.name in TRACKED])
+    runs = judged.findings.select("rule", "vehicle_id", "first_frame", "last_frame", "worst").rows()
+    expected = [
+        ("acceleration_bound", 2, 5, 5, 0.5),  # 5 m/s2 - 0.1 1/s * 20 m/s
+        # Cross sections lie at 0, 100, ... and 400 m: 8 crosses 200 but not 300 m, 9 crosses 400 but not 300 m.
+        ("cross_section_flow", 8, 19, 19, 71.0),
+        ("cross_section_flow", 9, 20, 20, 31.0),
+        ("duplicate_track", 3, 5, 9, 0.5),
+        ("duplicate_track", 4, 5, 9, 0.5),
+        ("hard_deceleration", 1, 20, 20, -8.5),
+        ("heading_motion_mismatch", 2, 25, 25, 0.245),  # atan(2.5 / 10)
+        ("lateral_acceleration", 2, 25, 26, 25.0),
+        ("size_change", 1, 1, 40, 0.3),
+        ("track_fragment", 3, 9, 9, 72.0),
+        ("track_fragment", 4, 9, 9, 71.0),
+        ("track_fragment", 5, 8, 8, 69.0),
+        ("track_fragment", 8, 19, 19, 271.0),
+        ("track_fragment", 9, 20, 20, 351.0),
+    ]
+    assert [row[:-1] for row in runs] == [row[:-1] for row in expected]
+    assert [row[-1] for row in runs] == pytest.approx([row[-1] for row in expected], abs=1e-6)
+    assert {rule for rule, *_ in runs} == TRACKED
+    row = judged.subset_scores.row(0, named=True)
+    assert row["fragments_per_1000_vehicles"] == 500
+    # 2 drives from 10 to 88 m; 10, on the ramp, crosses the last one only.
+    sections = [(0.0, 3, 0, 0), (100.0, 3, 0, 0), (200.0, 3, 1, 0), (300.0, 2, 0, 1), (400.0, 4, None, None)]
+    assert [tuple(each.values()) for each in row["cross_sections"]] == sections
 
 
 WIDTHS = [0.5, 1.8, 2.0, 4.0]
@@ -108,7 +158,7 @@ def random_scenes(draw) -> tuple[dict, Surface]:
     """A few vehicles close to each other, with gaps, shared positions and values at and beside the thresholds."""
     rate = draw(st.sampled_from([10.0, 25.0]))
     markings = draw(st.sampled_from([(), (0.0, 4.0, 8.0)]))
-    surface = Surface(rate, markings, headway_stands_in=draw(st.booleans()))
+    surface = Surface(rate, markings, headway_stands_in=draw(st.booleans()), has_headings=True)
     ids = draw(st.lists(st.sampled_from([1, 2, 3, 7, 90, LARGEST]), min_size=1, max_size=4, unique=True))
     entries = {}
     for vehicle in ids:
@@ -119,7 +169,11 @@ def random_scenes(draw) -> tuple[dict, Surface]:
         lanes = draw(st.lists(st.sampled_from([1, 1, 1, 2, 3]), min_size=len(seen), max_size=len(seen)))
         noise = draw(st.lists(st.sampled_from([0.0, 0.0, 0.0, 0.1, 1.5, 4.0]), min_size=len(seen), max_size=len(seen)))
         accels = draw(
-            st.lists(st.sampled_from([0.0, 0.5, 0.51, 2.0, 3.05, 3.06, -1.0]), min_size=len(seen), max_size=len(seen))
+            st.lists(
+                st.sampled_from([0.0, 0.5, 0.51, 2.0, 3.05, 3.06, -1.0, -8.0, -8.01]),
+                min_size=len(seen),
+                max_size=len(seen),
+            )
         )
         calm = draw(st.booleans())
         for place, there in enumerate(seen):
@@ -137,6 +191,8 @@ def random_scenes(draw) -> tuple[dict, Surface]:
                 y=draw(st.sampled_from([2.0, 2.0, 3.9, 3.99, 4.0, 4.01])),
                 lane=lanes[place // 3 * 3] if draw(st.booleans()) else lanes[place],
                 heading=draw(st.sampled_from([0.0, 0.0, 0.125, -0.25])),
+                lateral=draw(st.sampled_from([None, None, 0.0, 0.3, -0.31])),
+                box=draw(st.sampled_from([None, (length, width), (length + 0.1, width), (length, width + 0.11)])),
             )
     return entries, surface
 
@@ -161,7 +217,8 @@ def test_one_entry_alone_and_no_entries():
 
 
 def facts(**values) -> pl.DataFrame:
-    row = {**dict.fromkeys(SUBSETS.dtypes), "columns_missing": [], "frame_rate_hz": 10.0, **values}
+    road = {"lanes": 3, "on_ramp_lanes": [], "first_frame": 1, "last_frame": 40, "frame_rate_hz": 10.0}
+    row = {**dict.fromkeys(SUBSETS.dtypes), "columns_missing": [], **road, **values}
     return pl.DataFrame([row], schema=SUBSETS.dtypes)
 
 
@@ -170,10 +227,15 @@ def test_what_a_source_lacks_leaves_rules_unchecked_rather_than_unbroken():
     change(entries, 10, [30, 31], ahead=1.5)
     whole = scene_of(entries, ROAD)
     lacking = find_lacking(whole.vehicles, facts(columns_missing=["leader_id", "lane"], lane_markings_m=None))
+    lacking -= {"length_range_m", "width_range_m"}
     assert lacking == {"leader_id", "lane", "lane_markings_m"}
     without = whole.tracks.with_columns(leader_id=pl.lit(None, pl.Int32), lane=pl.lit(None, pl.Int16))
     judged = judge(Scene(without, whole.vehicles, 10.0), lacking, rules=JUDGED)
-    unchecked = ["negative_headway_recorded", "lane_flicker", "leader_mismatch", "headway_mismatch", "outside_lane"]
+    unchecked = [
+        *("negative_headway_recorded", "lane_flicker", "leader_mismatch", "headway_mismatch", "outside_lane"),
+        *("track_fragment", "cross_section_flow"),
+    ]
+    assert judged.subset_scores["cross_sections"].to_list() == [None]
     assert [rule.name for rule in judged.unchecked] == unchecked
     assert judged.subset_scores["rules_unchecked"].to_list() == [unchecked]
     assert judged.subset_scores["spacings"].to_list() == [0]
@@ -187,7 +249,7 @@ def test_vehicles_of_unknown_size_leave_the_rules_about_size_unchecked():
         length_m=pl.lit(None, pl.Float32), width_m=pl.lit(None, pl.Float32), **{"class": pl.lit(None, pl.String)}
     )
     lacking = find_lacking(blank, facts(lane_markings_m=[0.0, 4.0]))
-    assert lacking == {"length_m", "width_m", "class"}
+    assert lacking == {"length_m", "width_m", "class", "length_range_m", "width_range_m"}
     judged = judge(Scene(whole.tracks, blank, 10.0, ROAD.markings), lacking, rules=JUDGED)
     assert {rule.name for rule in judged.unchecked} == {
         "negative_headway_recorded",
@@ -195,6 +257,8 @@ def test_vehicles_of_unknown_size_leave_the_rules_about_size_unchecked():
         "headway_mismatch",
         "implausible_size",
         "outside_lane",
+        "duplicate_track",
+        "size_change",
     }
 
 
@@ -202,8 +266,8 @@ def test_thresholds_reach_the_findings():
     entries = platoon()
     change(entries, 2, [10], accel=3.5)
     scene = scene_of(entries, ROAD)
-    assert set(judge(scene).findings["rule"]) == {"high_acceleration", "high_jerk"}
-    looser = {"high_acceleration_mps2": 3.5, "high_jerk_mps3": 30.0}
+    assert set(judge(scene).findings["rule"]) == {"high_acceleration", "high_jerk", "acceleration_bound"}
+    looser = {"high_acceleration_mps2": 3.5, "high_jerk_mps3": 30.0, "acceleration_bound_car_at_rest_mps2": 5.5}
     assert judge(scene, thresholds=looser).findings.is_empty()
     with pytest.raises(ThresholdError):
         judge(scene, thresholds={"no_such": 1.0})
@@ -228,9 +292,9 @@ def test_scores_by_hand():
     scores = VEHICLE_SCORES.validate(judged.vehicle_scores, where="01-upper")
     assert scores["entries"].to_list() == [40] * 11
     shares = {vehicle: shares for vehicle, *shares in scores.drop("dataset", "subset", "entries").iter_rows()}
-    assert shares[9] == [38 / 40, 38 / 40]
-    assert shares[10] == [38 / 40, 36 / 40]
-    assert all(shares[vehicle] == [1, 1] for vehicle in shares if vehicle not in (9, 10))
+    assert shares[9] == [38 / 40, 38 / 40, 0]
+    assert shares[10] == [38 / 40, 36 / 40, 0]
+    assert all(shares[vehicle] == [1, 1, 0] for vehicle in shares if vehicle not in (9, 10))
     row = SUBSET_SCORES.validate(judged.subset_scores, where="01-upper").row(0, named=True)
     assert row["entries"] == 440
     assert row["share_without_error"] == pytest.approx(436 / 440)

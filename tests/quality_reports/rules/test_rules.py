@@ -23,7 +23,9 @@ from tracklake.schemas.columns import SEVERITIES
 NAMES = [
     "negative_headway", "negative_headway_recorded", "high_acceleration", "low_constant_speed", "backward",
     "position_jump", "frame_gap", "overlap", "speed_mismatch", "high_jerk", "jerk_flicker", "lane_flicker",
-    "leader_mismatch", "headway_mismatch", "implausible_size", "outside_lane",
+    "leader_mismatch", "headway_mismatch", "implausible_size", "outside_lane", "hard_deceleration",
+    "acceleration_bound", "lateral_acceleration", "heading_motion_mismatch", "track_fragment", "cross_section_flow",
+    "duplicate_track", "size_change",
 ]  # fmt: skip
 SOUND = {
     "gap_m": (10.0, pl.Float64), "speed_mps": (20.0, pl.Float32), "accel_mps2": (0.5, pl.Float32),
@@ -32,7 +34,9 @@ SOUND = {
     "frames_skipped": (0, pl.Int32), "jerk_mps3": (0.0, pl.Float64), "jerk_reversals": (0, pl.Int8),
     "lane_stay_s": (None, pl.Float64), "out_of_lane_m": (0.0, pl.Float64), "overlap_m": (0.0, pl.Float64),
     "nearest_ahead_m": (14.5, pl.Float64), "leader_ahead_m": (14.5, pl.Float64), "leader_in_lane": (1.0, pl.Float64),
-    "recorded_gap_m": (10.0, pl.Float64),
+    "recorded_gap_m": (10.0, pl.Float64), "motion_class": ("car", pl.String), "lateral_accel_mps2": (0.0, pl.Float64),
+    "heading_error_rad": (0.0, pl.Float64), "fragment_m": (None, pl.Float64), "missed_section_m": (None, pl.Float64),
+    "double_track_s": (0.0, pl.Float64), "length_range_m": (0.0, pl.Float32), "width_range_m": (0.0, pl.Float32),
 }  # fmt: skip
 """An entry that breaks no rule: every column that a rule names, those of tracks and the derived ones."""
 
@@ -112,6 +116,31 @@ BOUNDARIES = [
         [2, 3, 5],
     ),
     ("outside_lane", {"out_of_lane_m": [0.0, 0.001, None]}, [1]),
+    ("hard_deceleration", {"accel_mps2": [-8.0, -8.01, 9.0, None]}, [1]),
+    (
+        "acceleration_bound",
+        {
+            # A car's bound is 5 m/s2 at rest and backwards, 3 at 20 m/s and 2 from 30 m/s on; a truck's 1 from 25 on.
+            "speed_mps": [0.0, -1.0, -1.0, 20.0, 20.0, 30.0, 45.0, 45.0, 25.0, 60.0, 10.0, 0.0],
+            "accel_mps2": [5.0, 5.0, 5.01, 3.0, 3.01, 2.0, 2.0, 2.01, 1.0, 1.01, 6.0, None],
+            "motion_class": [*["car"] * 8, "truck", "truck", "motorcycle", "car"],
+        },
+        [2, 4, 7, 9],
+    ),
+    ("lateral_acceleration", {"lateral_accel_mps2": [3.0, -3.0, 3.001, -3.001, None]}, [2, 3]),
+    (
+        "heading_motion_mismatch",
+        {"heading_error_rad": [0.1, 0.1001, 0.2, 0.2, None], "speed_mps": [20.0, 20.0, 4.99, 5.0, 20.0]},
+        [1, 3],
+    ),
+    ("track_fragment", {"fragment_m": [20.0, 20.001, -3.0, None]}, [1]),
+    ("cross_section_flow", {"missed_section_m": [0.0, 0.001, None]}, [1]),
+    ("duplicate_track", {"double_track_s": [0.0, 0.48, 0.5, None]}, [2]),
+    (
+        "size_change",
+        {"length_range_m": [0.1, 0.101, 0.0, None, None], "width_range_m": [0.0, 0.0, 0.2, 0.2, None]},
+        [1, 2, 3],
+    ),
 ]
 
 
@@ -200,7 +229,7 @@ def test_rules_are_checkable_where_nothing_they_read_is_lacking():
     names = {rule.name for rule in checkable(RULES, ("gap_m", "lane_markings_m", "accel_mps2"))}
     lost = {
         "negative_headway", "negative_headway_recorded", "headway_mismatch", "outside_lane", "high_acceleration",
-        "low_constant_speed", "high_jerk", "jerk_flicker",
+        "low_constant_speed", "high_jerk", "jerk_flicker", "hard_deceleration", "acceleration_bound",
     }  # fmt: skip
     assert names & set(NAMES) == set(NAMES) - lost
 
@@ -223,7 +252,7 @@ def test_as_pandera_checks_sound_entries_and_nulls_pass():
 
 
 def test_as_pandera_checks_take_thresholds():
-    frame = entries(accel_mps2=[3.2])
+    frame = entries(accel_mps2=[3.2], speed_mps=[10.0], speed_10hz_mps=[10.0])
     assert as_schema(thresholds={"high_acceleration_mps2": 3.5}).validate(frame, lazy=True).equals(frame)
 
 
