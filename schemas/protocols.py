@@ -63,6 +63,12 @@ class Protocol:
     tracks_from: TracksFrom = RECORDED
 
     @property
+    def title(self) -> str:
+        """Name and digest, and which tracks it is about where these are not the recorded ones."""
+        tracks = "" if self.tracks_from == RECORDED else f", {self.tracks_from} tracks"
+        return f"{self.name} ({self.digest}{tracks})"
+
+    @property
     def history_ticks(self) -> int:
         """Positions of a history, H, the sample's own included (16 at 5 Hz, 31 at 10 Hz)."""
         return round(self.history_s * self.rate_hz) + 1

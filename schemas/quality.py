@@ -9,6 +9,7 @@ from typing import Annotated, Final, NotRequired
 from typing_extensions import TypedDict
 
 from tracklake.schemas.quality_drives import Drives
+from tracklake.schemas.quality_reconstruction import ReconstructionFigures
 from tracklake.schemas.quality_tracks import (
     Dataset,
     Direction,
@@ -284,6 +285,12 @@ class ShownSettings(TypedDict, total=False):
 
     max_backward_share: Annotated[float, "a subset with a larger share of vehicles driving backwards is excluded"]
     on_ramp_lanes: Annotated[dict[str, list[int]], "lanes that are on-ramps, by site"]
+    car_following_min_s: Annotated[float, "car_following: shortest episode"]
+    reconstruct: Annotated[bool, "true: `tracklake run` reconstructs tracks"]
+    reconstruct_noise_m: Annotated[float | None, "noise of recorded positions along the road; null: estimated"]
+    reconstruct_lateral_noise_m: Annotated[float | None, "the same across the road"]
+    reconstruct_max_gap_s: Annotated[float, "longest gap in a track that is filled"]
+    tracks_from: Annotated[str, "tracks that samples are made of: recorded, filtered or reconstructed"]
     protocol: Annotated[str, "name of the protocol"]
     min_future_s: Annotated[float, "track that a sample needs after it"]
     drop_error_findings: Annotated[
@@ -364,5 +371,6 @@ class Quality(TypedDict):
     completeness: list[Completeness]
     ingestion: Ingestion
     model_scores: list[ModelScores]
+    reconstruction: NotRequired[ReconstructionFigures]
     drives: NotRequired[Drives]
     provenance: Provenance

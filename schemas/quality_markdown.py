@@ -55,6 +55,12 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Source files", "", ("completeness", "ingestion")),
     ("Models", "", ("model_scores",)),
     (
+        "Reconstructed tracks",
+        "Only where tracks were reconstructed. Subsets without a reconstructed track are in `skips` alone. An item of\n"
+        "`rules` without a dataset covers the whole lake, one without a subset a dataset.",
+        ("reconstruction",),
+    ),
+    (
         "Drives",
         "Only where the lake holds drives of instrumented vehicles. Distances are of vehicles' centres from the\n"
         "ego's; errors are against the truth of synthetic drives. `drives.drives` counts messages of other vehicles.",

@@ -1,4 +1,4 @@
-"""Whether published figures may stand beside scores: only where data were recorded and recordings are complete."""
+"""Whether published figures may stand beside scores: only where tracks are as recorded and recordings complete."""
 
 from pathlib import Path
 from typing import cast
@@ -9,6 +9,7 @@ from tracklake.quality_reports.published import explain_gap
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas import SUBSETS
 from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.protocols import RECORDED
 from tracklake.schemas.quality_tracks import RecordingFacts
 from tracklake.training.data.tensor_folder import TensorFolder
 
@@ -20,6 +21,11 @@ def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *,
     """
     terminal.print_origin(describe_synthetic(folder.origins))
     if not published:
+        return ()
+    if (tracks := folder.protocol.tracks_from) != RECORDED:
+        terminal.print_line(
+            f"note: no published figures beside {tracks} tracks: those are of recorded ones", style="dim"
+        )
         return ()
     facts = scan(root, load(root), SUBSETS).select("dataset", "subset", "recording").collect()
     used = {

@@ -133,7 +133,7 @@ def _open_forest(file: Path, folder: TensorFolder) -> LaneForest:
     forest = LaneForest.load(file)
     if forest.facts["protocol"] != folder.index["protocol"]:
         raise ForestError(
-            f"{file}: fitted for another protocol than {folder.protocol.name} ({folder.protocol.digest}), that of the "
+            f"{file}: fitted for another protocol than {folder.protocol.title}, that of the "
             "tensors; run `tracklake lane-forest` without --use"
         )
     return forest
@@ -212,7 +212,7 @@ def _show_scores(
 ) -> None:
     """Print cell accuracies by horizon, those of the last horizon by stratum, and the maneuvers' accuracies."""
     protocol = folder.protocol
-    terminal.print_line(f"eval of {folder.split}, protocol {protocol.name} ({protocol.digest})", style="bold")
+    terminal.print_line(f"eval of {folder.split}, protocol {protocol.title}", style="bold")
     _show_cells(terminal, scores.cells, published=published)
     rows = [
         [own.stratum, f"{own.n:,}", *map(_format_percent, (own.accuracy, *own.recall.values(), own.majority))]

@@ -42,7 +42,7 @@ def show_evaluations(terminal: Terminal, one: Evaluation, table: pl.DataFrame, b
     table = table.filter(pl.col("seconds").is_in([tick / one.protocol.rate_hz for tick in one.protocol.scored_ticks]))
     headline = HEADLINE_FIGURES[one.protocol.headline]
     terminal.print_line(
-        f"{one.part} of {one.split}, protocol {one.protocol.name} ({one.protocol.digest}): {one.samples:,} samples of "
+        f"{one.part} of {one.split}, protocol {one.protocol.title}: {one.samples:,} samples of "
         f"{one.vehicles:,} vehicles",
         style="bold",
     )

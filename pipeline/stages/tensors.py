@@ -161,7 +161,7 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
     if commit.built_from["protocol"] != protocol.digest:
         made = json.loads((root / str(commit.info["path"]) / INDEX_FILE).read_text(encoding="utf-8"))["protocol"]
         raise StageError(
-            f"{root}: the tensors were made by another protocol than {protocol.name} ({protocol.digest}) as it is set "
+            f"{root}: the tensors were made by another protocol than {protocol.title} as it is set "
             f"now: by {made['name']} ({made['digest']}). Run `tracklake run` with these settings, or set what they "
             "were made with."
         )

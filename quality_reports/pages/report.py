@@ -18,6 +18,7 @@ from tracklake.quality_reports.pages.splits import SPLITS_PAGE, compare_splits, 
 from tracklake.quality_reports.plots import charts
 from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.verdicts import draw_verdicts
+from tracklake.quality_reports.reconstruction import collect_reconstruction, describe_reconstruction
 from tracklake.quality_reports.rules.registry import DRIVE_RULES, RULES, Rule, describe
 from tracklake.quality_reports.summaries import Connection, collect
 from tracklake.quality_reports.verdicts import LIMITS, rank_rules, rank_verdicts
@@ -73,6 +74,8 @@ def build_report(
         ThresholdError: provenance["thresholds"] names a threshold that the rules do not have.
     """
     quality = collect(connection, provenance, rules=rules, scores=scores)
+    if (reconstruction := collect_reconstruction(connection, rules)) is not None:
+        quality["reconstruction"] = reconstruction
     if (drives := collect_drives(connection, drive_scores, published_drive_scores)) is not None:
         quality["drives"] = drives
     others = {**render_files(quality), SPLITS_PAGE: render_splits(quality)}
@@ -94,6 +97,8 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
         .get_template("report.html.j2")
         .render(
             **{**quality, "rules": rank_rules(quality["rules"]), "drives": drives},
+            reconstructed=quality.get("reconstruction"),
+            describe_reconstruction=describe_reconstruction,
             has_tracks=bool(quality["subsets"]) or not drives,
             describe_drive=describe_drive,
             banner=describe_origins(quality),

@@ -1,7 +1,7 @@
 """Pages of single subsets: facts, findings, time-space diagrams, flow, worst examples, scores."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import polars as pl
@@ -16,6 +16,7 @@ from tracklake.quality_reports.plots import distributions as plots
 from tracklake.quality_reports.plots.flow import draw_flow, draw_fundamental
 from tracklake.quality_reports.plots.plan_views import SHOWN, Road, draw_plan_views
 from tracklake.quality_reports.plots.rasters import colour_values
+from tracklake.quality_reports.plots.reconstruction import draw_reconstruction
 from tracklake.quality_reports.plots.time_space import (
     COLOURS,
     draw_scale,
@@ -23,6 +24,7 @@ from tracklake.quality_reports.plots.time_space import (
     pack_diagrams,
     write_data,
 )
+from tracklake.quality_reports.reconstruction import collect_reconstruction, describe_reconstruction
 from tracklake.quality_reports.rules.registry import RULES, Rule
 from tracklake.quality_reports.summaries import (
     Connection,
@@ -49,6 +51,9 @@ TABLES = (
     "sample_drops",
 )
 """Tables that one statement each, subset_<name>.sql, gives for all subsets at once."""
+
+COMPARED: tuple[Literal["rules", "unkept_bounds", "skips"], ...] = ("rules", "unkept_bounds", "skips")
+"""Lists of figures about reconstructed tracks that subsets' pages show."""
 
 Key: TypeAlias = tuple[str, str]
 """Dataset and subset."""
@@ -77,6 +82,7 @@ def render_pages(
     judged = judge(figures["subsets"], figures["subset_scores"], figures["rules"], figures["completeness"])
     verdicts = {(row["dataset"], row["subset"]): row for row in judged}
     tables = _query_tables(connection, figures["subsets"], declared)
+    reconstructed = _describe_reconstructed(connection, rules)
     for subset in figures["subsets"]:
         own = {name: rows.get(_get_key(subset), []) for name, rows in tables.items()}
         content = {**_select_figures(figures, subset), **_draw_subset(connection, subset, declared, own)}
@@ -87,9 +93,28 @@ def render_pages(
                 verdict=verdicts[_get_key(subset)],
                 provenance=figures["provenance"],
                 banner=describe_synthetic({subset["subset"]: subset["origin"]}),
+                reconstructed=reconstructed.get(_get_key(subset)),
                 **content,
             ),
         )
+
+
+def _describe_reconstructed(connection: Connection, rules: Sequence[Rule]) -> dict[Key, Row]:
+    """Describe the reconstructed tracks of every subset that has some, and draw a vehicle of each."""
+    if (figures := collect_reconstruction(connection, rules)) is None:
+        return {}
+    shown = query_frame(connection, "subset_reconstructed").partition_by("dataset", "subset", as_dict=True)
+    described: dict[Key, Row] = {}
+    for row in figures["subsets"]:
+        key, track = _get_key(row), shown[_get_key(row)]
+        compared: Row = {name: [own for own in figures[name] if _get_key(own) == key] for name in COMPARED}
+        described[key] = {
+            "conclusion": describe_reconstruction(row),
+            "vehicle": track.select("vehicle_id", "moved", "most_moved_m").row(0, named=True),
+            "plot": Markup(draw_reconstruction(track)),
+            **compared,
+        }
+    return described
 
 
 def _select_figures(figures: SubsetFigures, subset: SubsetFacts) -> Row:

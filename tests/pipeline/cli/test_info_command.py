@@ -63,7 +63,7 @@ def test_a_changed_setting_names_itself_and_what_waits_for_it(command, lake):
     assert set(stale["validate"].values()) == {reason}
     assert set(stale["samples"].values()) == {"waits for validate"}
     assert stale["tensors"] == {"tensors": "waits for validate, samples, split"}
-    waits = "waits for validate, samples, split, tensors, score"
+    waits = "waits for validate, revalidate, samples, split, tensors, score"
     assert {*stale["pages"].values(), *stale["report"].values()} <= {waits, f"{waits}, pages, drive_pages"}, (
         "they show all stages"
     )

@@ -2,9 +2,10 @@
 
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 from stage_runs import plan_stage
 
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import ALL_STEPS, RunRequest, explain_not_reconstructed
 from tracklake.pipeline.settings import SettingError, Settings
 from tracklake.pipeline.stages.readers import LakeReader
@@ -58,6 +59,17 @@ def test_reconstructed_tracks_are_the_recorded_ones_with_other_positions(subset)
     assert subset.read_tracks(NEW, "x_m", "gap_m").equals(clean.select("x_m", "gap_m"))
 
 
+@pytest.mark.parametrize("name", ["highd/02-lower", "ngsim/us-101-20050615-093000"])
+def test_sql_gives_the_same_tracks(lake, reader, name):
+    dataset, subset = name.split("/")
+    with connect(lake.root) as connection:
+        found = connection.sql(f"FROM clean_tracks('{subset}')").pl()
+    clean = reader.open_subset(dataset, subset).read_tracks(NEW)
+    shared = [column for column in found.columns if column in TRACKS.columns]
+    assert len(shared) == 14
+    assert_frame_equal(found.select(shared), clean.select(shared), check_dtypes=False, abs_tol=1e-9)
+
+
 def test_filtered_tracks_have_the_recorded_entries(subset):
     recorded, filtered = subset.table(TRACKS), subset.read_tracks(Settings(tracks_from="filtered"))
     assert filtered.select(KEY).equals(recorded.select(KEY))
@@ -72,6 +84,14 @@ def test_reconstructed_tracks_are_judged_by_the_rules(reader, subset):
     assert before - after
     unchecked = reader.table(RECONSTRUCTED_SUBSET_SCORES)["rules_unchecked"].to_list()
     assert all("headway_mismatch" in rules for rules in unchecked), "headways were recorded, not reconstructed"
+
+
+def test_the_report_shows_both(lake):
+    overview = (lake.root / "reports" / "index.html").read_text(encoding="utf-8")
+    page = (lake.root / "reports" / "subsets" / "02-lower.html").read_text(encoding="utf-8")
+    assert 'id="reconstruction"' in overview
+    assert "Speed and acceleration of one vehicle, recorded and reconstructed" in page
+    assert "Conclusion: noise" in page
 
 
 def test_samples_of_reconstructed_tracks_wait_for_them(lake):
