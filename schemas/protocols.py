@@ -19,8 +19,9 @@ HEADLINES: Mapping[Headline, str] = {
 
 
 RECORDED: TracksFrom = "recorded"
+FILTERED_TRACKS: TracksFrom = "filtered"
 RECONSTRUCTED_TRACKS: TracksFrom = "reconstructed"
-"""Names of the tracks as recorded, and of those with reconstructed positions."""
+"""Names of the tracks as recorded, and of those with filtered and with reconstructed positions."""
 
 LAST_LANES = {"us-101": 6}
 """Highest lane by site in the script of convolutional social pooling, where lanes with higher numbers count as it."""

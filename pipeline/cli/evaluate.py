@@ -14,20 +14,25 @@ from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
 from tracklake.pipeline.cli.score_tables import show_evaluations
+from tracklake.pipeline.cli.smoothing_gain import describe_causality, measure_gain, open_histories, show_gain
 from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
+from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import BASELINE, finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
+from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
 from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
 from tracklake.training.evaluation.published import published_rows
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.prediction import NotFiniteError
+from tracklake.training.runs.forecasters import open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
 
 FOLDER = "evaluations"
@@ -59,6 +64,13 @@ NearestOption = Annotated[
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Write the table to this .csv, .json or .parquet instead of into the lake.")
 ]
+GainOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--gain/--no-gain",
+        help="Score by recorded, filtered and reconstructed histories, too [default: if tracks_from is reconstructed].",
+    ),
+]
 EveryTickOption = Annotated[
     bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
 ]
@@ -74,6 +86,7 @@ def evaluate(
     nearest: NearestOption = None,
     out: OutOption = None,
     every_tick: EveryTickOption = False,
+    gain: GainOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -105,8 +118,13 @@ def evaluate(
         if comparable:
             table = pl.concat([table, published_rows(settings.get_protocol().name, comparable)])
         table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
+        gains = None
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])
+            tracks_from = found[0].protocol.tracks_from
+            terminal.print_line(describe_causality(tracks_from), style="dim")
+            if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:
+                gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
         if target is not None:
             _write_table(target, table)
             terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")
@@ -115,7 +133,8 @@ def evaluate(
                 "note: the lake keeps the table of the options' defaults; --out writes this one", style="dim"
             )
         rows = table.to_dicts()
-        terminal.print_json({"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target})
+        shown = {"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target}
+        terminal.print_json(shown | ({} if gains is None else {"smoothing_gain": gains.to_dicts()}))
 
 
 def _evaluate_all(
@@ -141,6 +160,19 @@ def _evaluate_all(
                 raise
             terminal.print_problem(str(error), label="skipped")
     return found
+
+
+def _compare_histories(
+    terminal: Terminal, settings: Settings, names: Iterable[str], tensors: Path, part: str, nearest: int
+) -> pl.DataFrame:
+    """Score models with histories of every kind of tracks, and show what smoothing gains."""
+    folder = TensorFolder.open(tensors)
+    reader = LakeReader(settings.lake, load(settings.lake))
+    inputs = open_histories(settings, reader, folder, part, nearest)
+    models = [open_forecaster(name, folder, settings.lake / MODELS, frozenset({part})) for name in names]
+    gains = measure_gain(models, inputs)
+    show_gain(terminal, gains, inputs)
+    return gains
 
 
 def _write_table(target: Path, table: pl.DataFrame) -> None:

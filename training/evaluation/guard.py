@@ -11,7 +11,7 @@ The check does not find a model that
 - reads the files again (a `TensorFolder.open` of the same path, a memory map): the files stay as they are;
 - finds out, in the folder that it holds, which vehicles are a sample, a neighbor (in which cell) or in a scene later;
 - uses what the index tells of whole recordings: the rightmost lane, the centre, sizes;
-- sees the future at moments that are not checked.
+- sees the future at moments that are not checked, or in positions that were smoothed with it (reconstructed tracks).
 """
 
 import copy
