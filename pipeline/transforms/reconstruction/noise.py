@@ -2,8 +2,8 @@
 
 Leaving single points out (generalised cross-validation) takes a tracker's noise for motion, because it is correlated
 over about half a second. So blocks of BLOCK_S are left out, and the error of the smoothed track at the middle of each
-block, which no recorded neighbour shares its noise with, is compared for a range of weights (Burman, Chow and Nolan
-1994, A cross-validatory method for dependent data).
+block, with which hardly any recorded entry shares its noise, is compared for a range of weights (Burman, Chow and
+Nolan 1994, A cross-validatory method for dependent data).
 
 Noise that is correlated over longer than a block, as that of NGSIM is, looks like motion in this test. There the
 weight is the least with which the smoothed jerk is not denser than that of drivers (JERK_DENSITY).
@@ -16,7 +16,7 @@ import numpy as np
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series, make_penalty, select_pieces, smooth
 from tracklake.schemas.arrays import Flags, Floats, Integers
 
-BLOCK_S, PERIOD_S = 1.1, 4.4
+BLOCK_S, PERIOD_S = 2.1, 5.4
 """Length of the blocks that are left out, and time from one to the next, in s."""
 SHIFTS = 4
 """Ways to lay the blocks, so that each part of a track is left out once."""
@@ -28,9 +28,9 @@ LEAST_HZ = {"x_m": 0.15, "y_m": 0.25}
 about 4 s (Thiemann, Treiber and Kesting 2008), and a lower frequency would cut them off."""
 STEPS = 9
 """Weights that are compared."""
-JERK_DENSITY = 0.5
+JERK_DENSITY = 0.3
 """Power density of drivers' jerk up to the cut-off frequency, in (m/s3)2/Hz: that of I-80 as re-extracted by Coifman
-and Li (2017), whose errors are smaller than 1 cm over a second; simulated traffic has 0.03 to 0.4."""
+and Li (2017), 0.2 to 0.4; simulated traffic has 0.02 to 0.3."""
 SAMPLE_POINTS = 60_000
 """Points of the pieces that the estimates are made from."""
 CLIP = 4.0

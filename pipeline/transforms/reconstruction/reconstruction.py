@@ -15,6 +15,7 @@ from tracklake.pipeline.transforms.reconstruction.bounds import (
     measure_motion,
 )
 from tracklake.pipeline.transforms.reconstruction.config import DEFAULT_CLASS, ReconstructionConfig
+from tracklake.pipeline.transforms.reconstruction.jumps import find_displacements
 from tracklake.pipeline.transforms.reconstruction.lateral import bound_lateral, find_lane_changes
 from tracklake.pipeline.transforms.reconstruction.motion import Problem, bound_motion
 from tracklake.pipeline.transforms.reconstruction.noise import LEAST_HZ, Noise, estimate_noise
@@ -114,9 +115,10 @@ def _smooth_axis(pieces: Pieces, series: Series, column: str, config: Reconstruc
     set_noise, set_weight = (
         (config.noise_x_m, config.weight_x_s6) if column == "x_m" else (config.noise_y_m, config.weight_y_s6)
     )
-    noise = estimate_noise(series, recorded, pieces.recorded, set_noise, set_weight, LEAST_HZ[column])
+    positions = recorded - find_displacements(series, recorded, pieces.recorded) if column == "x_m" else recorded
+    noise = estimate_noise(series, positions, pieces.recorded, set_noise, set_weight, LEAST_HZ[column])
     penalty = make_penalty(series, noise.weight_s6)
-    x, weights = smooth_robustly(penalty, recorded, pieces.recorded.astype(np.float64), noise.noise_m)
+    x, weights = smooth_robustly(penalty, positions, pieces.recorded.astype(np.float64), noise.noise_m)
     return Axis(recorded, noise, Problem(series, x, penalty, weights), x)
 
 

