@@ -51,6 +51,7 @@ from tracklake.schemas.quality_tracks import (
     SubsetFacts,
     SubsetScores,
     SubsetStarts,
+    SubsetTraffic,
 )
 from tracklake.schemas.split_leakage import QUANTITIES
 from tracklake.schemas.start_assessments import ESTIMATORS
@@ -83,6 +84,7 @@ class SubsetFigures(TypedDict):
     rules: list[RuleFindings]
     per_second: list[SpeedsPerSecond]
     subset_scores: list[SubsetScores]
+    traffic: list[SubsetTraffic]
     starts: list[SubsetStarts]
     positions: list[StartPosition]
     samples: list[SubsetSamples]
@@ -211,6 +213,7 @@ def collect(
         "recordings": recordings,
         "subset_scores": scored,
         "published": {"source": SOURCE, "figures": published, "left_out": left_out},
+        "traffic": _query_rows(connection, "traffic", SubsetTraffic),
         "starts": _collect_starts(connection),
         "samples": {
             "subsets": _query_rows(connection, "samples", SubsetSamples),
@@ -241,6 +244,7 @@ def collect_subsets(
         "rules": collect_rules(connection, rules, provenance.get("thresholds") or {}),
         "per_second": _query_rows(connection, "speeds_per_second", SpeedsPerSecond),
         "subset_scores": _query_rows(connection, "subset_scores", SubsetScores),
+        "traffic": _query_rows(connection, "traffic", SubsetTraffic),
         "starts": _query_rows(connection, "starts", SubsetStarts),
         "positions": _query_rows(connection, "start_positions", StartPosition),
         "samples": _query_rows(connection, "samples", SubsetSamples),

@@ -26,6 +26,7 @@ from tracklake.schemas.quality_tracks import (
     Subset,
     SubsetFacts,
     SubsetScores,
+    SubsetTraffic,
     Verdict,
 )
 
@@ -286,6 +287,12 @@ class ShownSettings(TypedDict, total=False):
     max_backward_share: Annotated[float, "a subset with a larger share of vehicles driving backwards is excluded"]
     on_ramp_lanes: Annotated[dict[str, list[int]], "lanes that are on-ramps, by site"]
     car_following_min_s: Annotated[float, "car_following: shortest episode"]
+    lane_change_lateral_mps: Annotated[float, "lane_change_events: lateral speed at which the motion begins and ends"]
+    safety_thresholds: Annotated[dict[str, float], "safety: thresholds by measure that are no defaults"]
+    detector_spacing_m: Annotated[float, "virtual_detectors: distance between detectors"]
+    detector_interval_s: Annotated[float, "virtual_detectors: length of an interval"]
+    edie_cell_m: Annotated[float, "edie: length of a cell along the road"]
+    edie_cell_s: Annotated[float, "edie: length of a cell in time"]
     reconstruct: Annotated[bool, "true: `tracklake run` reconstructs tracks"]
     reconstruct_noise_m: Annotated[float | None, "noise of recorded positions along the road; null: estimated"]
     reconstruct_lateral_noise_m: Annotated[float | None, "the same across the road"]
@@ -365,6 +372,7 @@ class Quality(TypedDict):
     recordings: list[RecordingFacts]
     subset_scores: list[SubsetScores]
     published: Published
+    traffic: NotRequired[list[SubsetTraffic]]
     starts: Starts
     samples: Samples
     splits: Splits

@@ -50,6 +50,11 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         "Figures of other publications, for comparison; listed whether or not the recordings are in the lake.",
         ("published",),
     ),
+    (
+        "Car following and safety",
+        "Of freeways for which `tracklake traffic` has run. Thresholds are settings ([settings.md](settings.md)).",
+        ("traffic",),
+    ),
     ("Where tracks start", "", ("starts",)),
     ("Samples and splits", "", ("samples", "splits")),
     ("Source files", "", ("completeness", "ingestion")),

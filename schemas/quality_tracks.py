@@ -269,6 +269,23 @@ class Published(TypedDict):
     left_out: list[IncomparableRecording]
 
 
+class SubsetTraffic(TypedDict):
+    """Car following, lane changes and critical situations of one subset."""
+
+    dataset: Dataset
+    subset: Subset
+    episodes: Annotated[int, "episodes of car following"]
+    following_s: Annotated[float, "length of all episodes together"]
+    median_episode_s: Annotated[float | None, "length of an episode, median"]
+    cut_ins: Annotated[int, "episodes that begin by a vehicle that cuts in"]
+    lane_changes: Annotated[int, "lane changes, without flicker"]
+    median_lane_change_s: Annotated[float | None, "length of a lane change of which both ends were seen, median"]
+    ttc_exposed_s: Annotated[float, "time for which the time to collision is below its threshold"]
+    drac_exposed_s: Annotated[float, "time for which the deceleration to avoid a crash is above its threshold"]
+    headway_exposed_s: Annotated[float, "time for which the time headway is below its threshold"]
+    encroachments: Annotated[int, "post-encroachment times of lane changes below the threshold"]
+
+
 class SubsetStarts(TypedDict):
     """Track starts of one subset."""
 

@@ -164,7 +164,7 @@ STAGE = Stage(
     scope="lake",
     after=(),  # the report shows what there is
     settings=(_describe_settings,),
-    version=8,
+    version=9,
     build=build,
     extra_inputs=_find_inputs,
 )

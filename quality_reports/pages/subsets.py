@@ -47,7 +47,7 @@ FEWEST = 15
 MOST_ROWS = 10
 """Most rows of a table of single vehicles."""
 TABLES = (
-    *("extent", "worst", "flow", "speeds", "speed_histogram", "lane_changes", "windows", "vehicle_scores"),
+    *("extent", "worst", "flow", "edie", "speeds", "speed_histogram", "lane_changes", "windows", "vehicle_scores"),
     "sample_drops",
 )
 """Tables that one statement each, subset_<name>.sql, gives for all subsets at once."""
@@ -132,6 +132,7 @@ def _select_figures(figures: SubsetFigures, subset: SubsetFacts) -> Row:
             for rule in rank_rules(figures["rules"])
             for row in of_subset(rule["subsets"])
         ],
+        "traffic": next(iter(of_subset(figures["traffic"])), None),
         "starts": starts[0] if starts else None,
         "start_positions": Markup(plots.draw_start_positions(positions, starts)) if positions and starts else None,
         "samples": of_subset(figures["samples"]),
@@ -234,7 +235,9 @@ def _draw_plots(tables: Mapping[str, list[Row]]) -> dict[str, Any]:
         "legend": Markup(draw_scale(top_mps)),
         # Without a section of some length there is neither flow nor density.
         "flow": Markup(draw_flow(intervals)) if _is_measured(intervals) else None,
-        "fundamental": Markup(draw_fundamental(intervals, top_mps)) if _is_measured(intervals) else None,
+        "fundamental": Markup(draw_fundamental(tables["edie"] or intervals, top_mps))
+        if _is_measured(intervals)
+        else None,
         "speed_histogram": Markup(plots.draw_speed_histogram(tables["speed_histogram"], [])),
     }
 

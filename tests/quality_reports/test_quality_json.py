@@ -126,6 +126,7 @@ def test_few_lists_are_empty_everywhere(found):
         "provenance.thresholds",
         "provenance.thresholds_elsewhere",
         "provenance.settings.on_ramp_lanes",
+        "provenance.settings.safety_thresholds",
     }
 
 
