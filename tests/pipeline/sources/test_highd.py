@@ -67,6 +67,21 @@ def test_golden_numbers_of_the_upper_carriageway(tmp_path):
     check_accounts(canonical, entries_from=TRACKS_FILE)
 
 
+def test_sizes_that_vary_within_a_track_are_known(tmp_path):
+    files = write_recording(tmp_path)
+    tracks = tmp_path / "01_tracks.csv"
+    rows = pl.read_csv(tracks)
+    first = (pl.col("id") == 1) & (pl.col("frame") == 2)
+    rows.with_columns(
+        width=pl.when(first).then(pl.col("width") + 0.25).otherwise("width"),
+        height=pl.when(first).then(pl.col("height") - 0.1).otherwise("height"),
+    ).write_csv(tracks)
+    vehicles = by_name(read_highd(files))["01-upper"].vehicles
+    assert vehicles["length_range_m"].to_list() == close([0.25, 0])
+    assert vehicles["width_range_m"].to_list() == close([0.1, 0])
+    assert vehicles["length_m"].to_list() == close([4, vehicles["length_m"][1]])
+
+
 def test_golden_numbers_of_the_lower_carriageway(tmp_path):
     subset = by_name(read_highd(write_recording(tmp_path, end="\r\n")))["01-lower"]
     tracks = subset.tracks

@@ -212,6 +212,30 @@ def test_lanes_flicker_where_declared_and_nobody_is_beside():
     assert damage(only(lane_flickers=2), tracks=full)[1].defects == []
 
 
+def test_errors_of_tracking_stand_where_declared():
+    plan = only(hard_brakings=1, sideways_speeds=1, size_changes=1, early_ends=2, second_tracks=1)
+    before, done = damage(plan)
+    found = {defect.name: defect for defect in done.defects}
+    assert sorted(defect.name for defect in done.defects) == sorted(["early_end", *found])
+    braking, sliding, longer = (found[name] for name in ("hard_braking", "sideways_speed", "size_change"))
+    assert set(rows_of(done.tracks, braking)["accel"]) == {braking.value}
+    assert (done.tracks["accel"] < -8).sum() == braking.entries
+    assert rows_of(done.tracks, sliding)["lateral_speed"].to_list() == [sliding.value] == [4.0]
+    assert (done.tracks["lateral_speed"] != 0).sum() == 1
+    assert rows_of(done.tracks, longer)["length"].to_list() == pytest.approx([4.5 + longer.value] * longer.entries)
+    assert (done.tracks["length"] != 4.5).sum() == longer.entries
+    for defect in (defect for defect in done.defects if defect.name == "early_end"):
+        track = done.tracks.filter(vehicle=defect.vehicle)
+        assert (track["frame"][-1], track["x"][-1]) == (defect.first_frame - 1, defect.value)
+        assert before.filter(vehicle=defect.vehicle)["frame"][-1] == defect.last_frame
+    second = found["second_track"]
+    assert second.vehicle == 41, "there are 40 vehicles"
+    copy = done.tracks.filter(vehicle=41)
+    original = done.tracks.filter(vehicle=int(second.value)).filter(pl.col("frame") <= second.last_frame)
+    assert copy.height == second.entries == original.height
+    assert (copy["x"] - original["x"]).to_list() == pytest.approx([-0.3] * copy.height)
+
+
 def test_too_short_tracks_are_skipped():
     tracks = platoon().filter(pl.col("frame") <= 4)
     _, done = damage(Plan(backward_share=0.5), tracks=tracks)

@@ -93,6 +93,46 @@ def test_reversals_at_25_hz_are_counted_on_ticks():
     assert column(accelerations(values, HALF_TICKS), "jerk_reversals")[-1] == 1
 
 
+def test_a_reversal_of_jerk_is_an_entry_whose_sign_is_another_than_the_last():
+    # Jerks: none, +, -, 0, -, +: the change from - over 0 to - is none.
+    scene = accelerations([0.0, 1.0, 0.0, 0.0, -1.0, 0.0])
+    assert column(scene, "jerk_reverses") == [None, False, True, False, False, True]
+    gap = accelerations([0.0, 1.0, 0.0, 0.0, -1.0, 0.0], missing=(3,))
+    assert column(gap, "jerk_reverses") == [None, False, None, False, True]
+    assert column(accelerations([0.0, 1.0], Surface(rate_hz=12.0)), "jerk_reverses") == [None, None]
+
+
+def test_lateral_acceleration_is_the_change_of_the_lateral_speed_in_a_tenth_of_a_second():
+    entries = driver(1, range(1, 6), x=0.0, lateral=0.0)
+    change(entries, 1, [3], lateral=0.5)
+    change(entries, 1, [5], lateral=-0.2)
+    assert column(scene_of(entries), "lateral_accel_mps2") == [None, 0.0, 5.0, -5.0, -2.0]
+    # At 25 Hz 0.1 s before is between the second and the third frame before: 0.0 - (0.5 + 0.0) / 2 in the fifth.
+    assert column(scene_of(entries, HALF_TICKS), "lateral_accel_mps2") == [None, None, None, 0.0, -4.5]
+
+
+def test_headings_are_compared_with_the_direction_of_both_speeds():
+    entries = driver(1, range(1, 4), x=0.0, speed=10.0, lateral=0.0)
+    change(entries, 1, [1], lateral=10.0)
+    change(entries, 1, [2], heading=-0.25)
+    errors = column(scene_of(entries), "heading_error_rad")
+    assert errors == [round(math.pi / 4, 4), 0.25, 0.0]
+    without = scene_of(entries)
+    tracks = without.tracks.with_columns(heading_rad=pl.lit(None, pl.Float32))
+    assert column(type(without)(tracks, without.vehicles, 10.0), "heading_error_rad") == [None] * 3
+
+
+def test_two_tracks_in_one_place_are_counted_over_all_their_frames():
+    entries = driver(1, range(1, 9), x=100.0) | driver(2, range(1, 9), x=101.0) | driver(3, range(1, 9), x=104.0)
+    change(entries, 2, [3, 4], ahead=2.0)
+    # 4 m of 5 m are shared by 1 and 2; in frames 3 and 4 it is 2 m, and 4 m by 2 and 3, who share 2 m else.
+    one, two = [0.6] * 2 + [0.0] * 2 + [0.6] * 4, [0.6] * 2 + [0.2] * 2 + [0.6] * 4
+    assert column(scene_of(entries), "double_track_s") == [*one, *two, *[0.0] * 2, 0.2, 0.2, *[0.0] * 4]
+    # A small box is nearly all inside a large one: 2 m of 2.5 m by 1.8 m of 2 m.
+    entries = driver(1, range(1, 2), x=100.0, length=10.0) | driver(2, range(1, 2), x=100.5, y=2.2, length=2.5)
+    assert column(scene_of(entries), "double_track_s") == [0.1, 0.1]
+
+
 def test_lane_stays_are_between_the_same_lane_and_seen_from_both_sides():
     entries = driver(1, range(1, 11), x=0.0)
     change(entries, 1, [3, 4, 5], lane=2)

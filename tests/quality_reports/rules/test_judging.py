@@ -243,6 +243,13 @@ def test_what_a_source_lacks_leaves_rules_unchecked_rather_than_unbroken():
     assert set(judged.findings["rule"]) == {"negative_headway", "overlap", "speed_mismatch"}
 
 
+def test_headings_that_a_source_lacks_leave_one_rule_unchecked_and_overlaps_judged():
+    whole = scene_of(platoon(), ROAD)
+    tracks = whole.tracks.with_columns(heading_rad=pl.lit(None, pl.Float32))
+    judged = judge(Scene(tracks, whole.vehicles, 10.0, ROAD.markings))
+    assert [rule.name for rule in judged.unchecked] == ["heading_motion_mismatch"]
+
+
 def test_vehicles_of_unknown_size_leave_the_rules_about_size_unchecked():
     whole = scene_of(platoon(), ROAD)
     blank = whole.vehicles.with_columns(
