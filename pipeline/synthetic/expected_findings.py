@@ -12,7 +12,7 @@ from tracklake.pipeline.synthetic.scenery import Entry, Key, Scenery, Surface
 
 HIGH_ACCELERATION_MPS2 = 3.05
 HARD_DECELERATION_MPS2 = 8.0
-ACCELERATION_BOUNDS = {"car": (5.0, 0.1, 2.0), "truck": (2.5, 0.06, 1.0), "motorcycle": (7.0, 0.1, 3.0)}
+ACCELERATION_BOUNDS = {"car": (5.0, 0.09, 2.0), "truck": (2.7, 0.06, 1.0), "motorcycle": (7.2, 0.1, 3.0)}
 """Acceleration at rest in m/s2, its fall per m/s, and the least bound in m/s2."""
 LATERAL_ACCELERATION_MPS2 = 3.0
 HEADING_ERROR_RAD = 0.1

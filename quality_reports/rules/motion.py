@@ -44,9 +44,9 @@ HARD_DECELERATION = Rule(
 )
 
 ACCELERATION_BOUNDS: dict[str, tuple[float, float, float]] = {
-    "car": (5.0, 0.1, 2.0),
-    "truck": (2.5, 0.06, 1.0),
-    "motorcycle": (7.0, 0.1, 3.0),
+    "car": (5.0, 0.09, 2.0),
+    "truck": (2.7, 0.06, 1.0),
+    "motorcycle": (7.2, 0.1, 3.0),
 }
 """Greatest acceleration at rest in m/s², its fall in m/s² per m/s, and its least value in m/s², by class."""
 
@@ -80,7 +80,7 @@ ACCELERATION_BOUND = Rule(
     thresholds=_make_acceleration_limits(),
     meaning="the recorded acceleration exceeds what vehicles of the class reach at the recorded speed: a bound at rest "
     "that falls linearly with speed down to a least value. Vehicles of unknown class are taken for cars. The worst "
-    "value is by how much; reconstructed tracks keep the same bounds",
+    "value is by how much",
     source=f"{DESIGN}; accelerations that fall linearly with speed: {RAKHA}",
     breaks=lambda limits: _measure_acceleration_excess(limits) > 0,
     value=_measure_acceleration_excess,
@@ -89,7 +89,7 @@ ACCELERATION_BOUND = Rule(
     case=Case(
         {
             "speed_mps": (0.0, 20.0, 20.0, 40.0, 20.0),
-            "accel_mps2": (5.0, 3.0, 3.01, 2.01, 1.31),
+            "accel_mps2": (5.0, 3.2, 3.21, 2.01, 1.51),
             "class": ("car", "car", "car", None, "truck"),
         },
         breaks=(2, 3, 4),

@@ -256,7 +256,7 @@ def test_the_slow_loop_counts_by_hand():
         "negative_headway": (2, 1, 2),
         "negative_headway_recorded": (1, 1, 1),
         "high_acceleration": (2, 1, 2),
-        # At 10 m/s a car may reach 4 m/s2.
+        # At 10 m/s a car may reach 4.1 m/s2.
         "acceleration_bound": (1, 1, 1),
         "low_constant_speed": (2, 1, 2),
         "backward": (1, 1, 1),

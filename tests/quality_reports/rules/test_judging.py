@@ -123,7 +123,7 @@ def test_defects_of_tracking_are_found_entry_for_entry_and_nothing_else():
     judged = judge(scene_of(entries, ROAD), rules=[rule for rule in JUDGED if rule.name in TRACKED])
     runs = judged.findings.select("rule", "vehicle_id", "first_frame", "last_frame", "worst").rows()
     expected = [
-        ("acceleration_bound", 2, 5, 5, 0.5),  # 5 m/s2 - 0.1 1/s * 20 m/s
+        ("acceleration_bound", 2, 5, 5, 0.3),  # 5 m/s2 - 0.09 1/s * 20 m/s
         # Cross sections lie at 0, 100, ... and 400 m: 8 crosses 200 but not 300 m, 9 crosses 400 but not 300 m.
         ("cross_section_flow", 8, 19, 19, 71.0),
         ("cross_section_flow", 9, 20, 20, 31.0),

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from pandera.errors import SchemaErrors
 
+from tracklake.pipeline.transforms.reconstruction.config import BOUNDS
 from tracklake.quality_reports.rules.derived import DERIVED
 from tracklake.quality_reports.rules.registry import (
     RULES,
@@ -120,9 +121,9 @@ BOUNDARIES = [
     (
         "acceleration_bound",
         {
-            # A car's bound is 5 m/s2 at rest and backwards, 3 at 20 m/s and 2 from 30 m/s on; a truck's 1 from 25 on.
+            # A car's bound is 5 m/s2 at rest and backwards, 3.2 at 20 m/s and 2 from 33 on; a truck's 1.2 at 25.
             "speed_mps": [0.0, -1.0, -1.0, 20.0, 20.0, 30.0, 45.0, 45.0, 25.0, 60.0, 10.0, 0.0],
-            "accel_mps2": [5.0, 5.0, 5.01, 3.0, 3.01, 2.0, 2.0, 2.01, 1.0, 1.01, 6.0, None],
+            "accel_mps2": [5.0, 5.0, 5.01, 3.2, 3.21, 2.3, 2.0, 2.01, 1.2, 1.01, 6.2, None],
             "motion_class": [*["car"] * 8, "truck", "truck", "motorcycle", "car"],
         },
         [2, 4, 7, 9],
@@ -254,6 +255,20 @@ def test_as_pandera_checks_sound_entries_and_nulls_pass():
 def test_as_pandera_checks_take_thresholds():
     frame = entries(accel_mps2=[3.2], speed_mps=[10.0], speed_10hz_mps=[10.0])
     assert as_schema(thresholds={"high_acceleration_mps2": 3.5}).validate(frame, lazy=True).equals(frame)
+
+
+@pytest.mark.parametrize("kind", BOUNDS)
+def test_accelerations_that_reconstructed_tracks_may_have_break_no_bound(kind):
+    speeds = [step / 2 for step in range(140)]
+    greatest = [float(bound) for bound in _find_reconstructed_bounds(kind, speeds)]
+    frame = entries(speed_mps=speeds, accel_mps2=greatest, motion_class=[kind] * len(speeds))
+    assert not any(broken(frame, "acceleration_bound"))
+
+
+def _find_reconstructed_bounds(kind: str, speeds: list[float]) -> list[float]:
+    bounds = BOUNDS[kind]
+    falls = [bounds.accel_fall_per_s * max(speed - bounds.full_accel_until_mps, 0) for speed in speeds]
+    return [max(bounds.accel_mps2 - fall, bounds.least_accel_mps2) for fall in falls]
 
 
 def test_the_documentation_follows_from_the_declaration():
