@@ -17,7 +17,7 @@ from tracklake.pipeline.synthetic import (
     write_sample,
 )
 from tracklake.pipeline.synthetic.scenarios import DRIVES
-from tracklake.schemas.errors import explain_file_errors
+from tracklake.schemas.errors import UsageError, explain_file_errors
 from tracklake.schemas.extras import find_missing
 
 SAMPLE = "sample"
@@ -25,8 +25,17 @@ SAMPLE = "sample"
 
 
 def provide_sample(lake: Path, minutes: float | None, seed: int | None, terminal: Terminal) -> Path:
-    """Return the folder of the generated sample, generated first where it is missing or options ask for another."""
+    """Return the folder of the generated sample, generated first where it is missing or options ask for another.
+
+    Raises:
+        UsageError: the lake is to be in that very folder.
+    """
     out = lake.parent / SAMPLE
+    if out.resolve() == lake.resolve():
+        raise UsageError(
+            f"--lake {lake}: the generated sample itself goes to this folder. Name another one for the lake, such as "
+            f"--lake {lake.parent / 'lake'}."
+        )
     if minutes is None and seed is None and (out / "truth.parquet").exists():
         terminal.print_line(f"the generated sample in {out}", style="dim")
         return out

@@ -148,3 +148,11 @@ def test_a_reader_that_has_seen_enough_ends_the_output_quietly(command, lake):
     )
     assert done.stdout.startswith("dataset,subset,vehicle_id")
     assert "Broken pipe" not in done.stderr
+
+
+def test_a_lake_in_the_samples_own_folder_is_refused_before_anything_is_generated(tmp_path, monkeypatch, command):
+    monkeypatch.setattr(generated_sample, "write_generated", lambda *_: pytest.fail("generated"))
+    done = command.here("run", "--lake", str(tmp_path / "sample"))
+    assert done.code == 2
+    assert "the generated sample itself goes to this folder" in done.err
+    assert not (tmp_path / "sample").exists()
