@@ -32,6 +32,8 @@ COLUMNS = {
     "regime": (pl.String, f"one of {', '.join(REGIMES)}; empty where the acceleration is unknown"),
 }
 """Type and meaning of every exported column, by name."""
+DECIMALS = 4
+"""Decimals of exported numbers: tracks have single precision in speeds and millimetres in recorded positions."""
 
 
 def expand_episodes(scene: Scene, episodes: pl.DataFrame, vehicles: pl.DataFrame) -> pl.DataFrame:
@@ -73,4 +75,5 @@ def expand_episodes(scene: Scene, episodes: pl.DataFrame, vehicles: pl.DataFrame
     for side, prefix in (("follower_id", ""), ("leader_id", "leader_")):
         facts = vehicles.select(pl.col("vehicle_id").alias(side), pl.col("class", "length_m").name.prefix(prefix))
         rows = rows.join(facts, on=side, how="left", maintain_order="left")
-    return rows.select(pl.col(name).cast(dtype) for name, (dtype, _) in COLUMNS.items() if name in rows.columns)
+    chosen = rows.select(pl.col(name).cast(dtype) for name, (dtype, _) in COLUMNS.items() if name in rows.columns)
+    return chosen.with_columns(pl.col(pl.Float64).round(DECIMALS))
