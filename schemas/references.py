@@ -124,7 +124,7 @@ BAR_SHALOM = Reference(
     "Bar-Shalom, Li and Kirubarajan (2001)",
     "Bar-Shalom, Y., Li, X. R., Kirubarajan, T. (2001). Estimation with Applications to Tracking and Navigation. "
     "Wiley, section 6.2.2.",
-    "the model kalman-cv",
+    "the model kalman-cv, filtered tracks",
     doi="10.1002/0471221279",
 )
 SCHUBERT = Reference(
