@@ -33,7 +33,8 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Derive the tables of a subset; those of an arterial are empty."""
     if reader.facts["freeway"]:
         derived = _derive(open_scene(reader, settings), settings)
-        return StageResult(_complete(derived, reader.partition))
+        notes = _explain_empty(derived, reader.subset, reader.facts["entries"])
+        return StageResult(_complete(derived, reader.partition), notes=notes)
     left_out: Derived = {table: (table.empty(), {"arterial": reader.facts["entries"]}) for table in DERIVED_TABLES}
     return StageResult(_complete(left_out, reader.partition))
 
@@ -57,6 +58,16 @@ def _derive(scene: Scene, settings: Settings) -> Derived:
         ),
         EDIE: measure_cells(scene, cell_m=settings.edie_cell_m, cell_s=settings.edie_cell_s),
     }
+
+
+def _explain_empty(derived: Derived, subset: str, entries: int) -> list[str]:
+    """Return a note for each reason that leaves tables of a subset without rows since most of its entries lack it."""
+    empty: dict[str, list[str]] = {}
+    for table, (rows, skipped) in derived.items():
+        reason, number = max(skipped.items(), key=lambda item: item[1])
+        if rows.is_empty() and number > entries / 2:
+            empty.setdefault(f"{number:,} {SKIPPED[reason]}", []).append(table.name)
+    return [f"{subset}: no rows in {', '.join(names)}: {reason}" for reason, names in empty.items()]
 
 
 def _complete(derived: Derived, partition: Mapping[str, str]) -> dict[Table, pl.DataFrame]:
