@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from unittest import mock
 
+import duckdb
 import pytest
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
@@ -293,6 +294,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # A server costs a tenth of a processor while it waits: the files that need it come last.
     served = {item.path for item in items if "prefect_server" in getattr(item, "fixturenames", ())}
     items.sort(key=lambda item: item.path in served)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_duckdb_thread() -> Iterator[None]:
+    """Give each connection of the tests' process one thread, as Polars has: on small tables a second only costs."""
+    connect = duckdb.connect
+
+    def connect_with_one(*arguments: object, config: dict | None = None, **named: object) -> duckdb.DuckDBPyConnection:
+        return connect(*arguments, config={"threads": 1, **(config or {})}, **named)
+
+    with mock.patch.object(duckdb, "connect", connect_with_one):
+        yield
 
 
 def pytest_collection_finish() -> None:

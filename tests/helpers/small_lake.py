@@ -12,7 +12,18 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.lake import Commit, LakeFile, Writer, connect, load, open_for_writing, write_folder, write_table
+from tracklake.pipeline.lake import (
+    Commit,
+    LakeFile,
+    Manifest,
+    Writer,
+    catalog,
+    connect,
+    load,
+    open_for_writing,
+    write_folder,
+    write_table,
+)
 from tracklake.schemas import REJECTS, SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
 
@@ -224,6 +235,7 @@ def _die_at(step: int) -> None:
 
 
 def _obey(root: Path) -> None:
+    catalog.build_catalog(root, Manifest(lake_id=""))  # what a process does once, its children need not do again
     for line in sys.stdin:
         order, number, *step = line.split()
         child = os.fork()

@@ -70,7 +70,7 @@ def test_a_changed_setting_names_itself_and_what_waits_for_it(command, lake):
     assert {"ingest", "repair", "assess"} & {*stale} == set()
 
 
-@pytest.mark.usefixtures("plain_flows")
+@pytest.mark.usefixtures("plain_flows", "empty_charts")
 def test_what_is_new_changed_damaged_or_gone_is_said(command, tmp_path):
     raw, root = tmp_path / "raw", tmp_path / "lake"
     raw.mkdir()

@@ -317,9 +317,10 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, written):
 def test_an_earlier_sample_is_replaced_whole(tmp_path):
     out = tmp_path / "raw"
     out.mkdir()
-    write_sample(out, formats=("ngsim-csv",), minutes=0.1)
     reported = []
-    write_sample(out, formats=("ngsim-text",), minutes=0.1, progress=reported.append)
+    with simulate_once():
+        write_sample(out, formats=("ngsim-csv",), minutes=MINUTES, seed=SEED)
+        write_sample(out, formats=("ngsim-text",), minutes=MINUTES, seed=SEED, progress=reported.append)
     files = ["README.md", "trajectories-us-101-0930.txt", "true_tracks.parquet", "truth.parquet"]
     assert sorted(path.name for path in out.iterdir()) == files
     assert [path.name for path in tmp_path.iterdir()] == ["raw"]

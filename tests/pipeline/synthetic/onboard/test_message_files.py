@@ -84,7 +84,7 @@ MESSAGES = st.lists(
 
 @pytest.mark.parametrize("form", WRITERS)
 @given(rows=MESSAGES)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_what_is_written_is_read_to_the_resolution_of_the_format(tmp_path_factory, form, rows):
     write, read, recognise = WRITERS[form]
     given_rows = make_messages(*({**row, "received_us": row["utc_us"] + 40_000} for row in rows))
