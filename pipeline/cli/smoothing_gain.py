@@ -70,21 +70,25 @@ def open_histories(settings: Settings, reader: LakeReader, folder: TensorFolder,
         except StageError as missing:
             notes.append(f"no reconstructed histories: {missing}")
             continue
-        histories[kind], lacking = (folder, 0) if kind == own else replace_histories(reader, folder, kind)
+        histories[kind], lacking = (folder, 0) if kind == own else replace_histories(reader, folder, kind, part)
         if lacking:
             notes.append(f"{lacking:,} rows have no {kind} position, and keep the {own} one")
     return GainInputs(folder, histories, part, nearest, tuple(notes))
 
 
-def replace_histories(reader: LakeReader, folder: TensorFolder, kind: TracksFrom) -> tuple[TensorFolder, int]:
-    """Return tensors with the positions of other tracks, and the number of rows that those lack."""
+def replace_histories(
+    reader: LakeReader, folder: TensorFolder, kind: TracksFrom, part: str
+) -> tuple[TensorFolder, int]:
+    """Return tensors with other tracks' positions in a part's subsets, and the number of rows that those lack."""
     first, lengths = folder.run_first_row[:-1], np.diff(folder.run_first_row)
     rows = np.arange(len(folder.position_m))
     positions = locate_rows(folder, rows).copy()
     ticks = np.repeat(folder.run_first_tick - first, lengths) + rows
     keys = join_key(np.repeat(folder.run_vehicle_id, lengths), ticks)
-    lacking = 0
+    lacking, wanted = 0, folder.subsets_of(part)
     for number, named in enumerate(folder.index["subsets"]):
+        if f"{named['dataset']}/{named['subset']}" not in wanted:
+            continue
         run = np.flatnonzero(folder.run_subset == number)
         inside, _ = expand_ranges(first[run], lengths[run])
         subset = reader.open_subset(named["dataset"], named["subset"])

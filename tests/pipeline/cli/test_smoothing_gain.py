@@ -92,20 +92,24 @@ def test_positions_of_other_tracks_stand_at_their_vehicles_and_ticks(lake):
     manifest = load(lake.root)
     reader = LakeReader(lake.root, manifest)
     folder = TensorFolder.open(tensor_folder(lake.root, manifest, settings))
-    same, lacking = replace_histories(reader, folder, "recorded")
+    same, lacking = replace_histories(reader, folder, "recorded", "eval")
     assert lacking == 0
     assert np.array_equal(same.position_m, folder.position_m)
-    filtered, _ = replace_histories(reader, folder, "filtered")
-    named = folder.index["subsets"][0]
-    subset = reader.open_subset(named["dataset"], named["subset"])
+    filtered, _ = replace_histories(reader, folder, "filtered", "eval")
+    names = [f"{own['dataset']}/{own['subset']}" for own in folder.index["subsets"]]
+    number = names.index(min(folder.subsets_of("eval")))
+    subset = reader.open_subset(*names[number].split("/"))
     tracks = subset.read_tracks_from("filtered", "vehicle_id", "frame", "x_m", "y_m")
     at = {(vehicle, frame): (x, y) for vehicle, frame, x, y in tracks.iter_rows()}
     ratio = subset.facts["frame_rate_hz"] / folder.protocol.rate_hz
-    for row in range(0, int(np.searchsorted(folder.run_subset, 1)), 3):
-        first = int(folder.run_first_row[row])
-        frame = subset.facts["first_frame"] + int(folder.run_first_tick[row]) * ratio
-        expected = at[int(folder.run_vehicle_id[row]), round(frame)]
-        assert filtered.position_m[first] == pytest.approx(expected, abs=1e-3)
+    for run in np.flatnonzero(folder.run_subset == number):
+        for row in range(folder.run_first_row[run], folder.run_first_row[run + 1], 5):
+            tick = int(folder.run_first_tick[run]) + row - int(folder.run_first_row[run])
+            expected = at[int(folder.run_vehicle_id[run]), subset.facts["first_frame"] + round(tick * ratio)]
+            assert filtered.position_m[row] == pytest.approx(expected, abs=1e-3)
+    other = np.isin(folder.run_subset, [names.index(own) for own in {*names} - folder.subsets_of("eval")])
+    kept = np.repeat(other, np.diff(folder.run_first_row))
+    assert np.array_equal(filtered.position_m[kept], folder.position_m[kept])
     assert (filtered.position_m != folder.position_m).any()
 
 

@@ -191,6 +191,8 @@ def test_messages_say_what_to_do(lake, tmp_path, command):
     shown = command.here("export", "sumo-fcd", "--lake", lake, "--out", out, "--subset", "ngsim/us-101-0750")
     assert shown.code == 0, shown.err
     assert "gaps in tracks: replay.xml has a track's further parts" in shown.out
+    with pytest.raises(ExportError, match="holds no freeway recordings"):
+        export_sumo_fcd(Settings(lake=ingest(tmp_path / "empty", tmp_path, {})), tmp_path / "none")
     again = command.here("export", "sumo-fcd", "--lake", lake, "--out", out, "--subset", "01-lower")
     assert again.code == 1
     assert "--force" in again.err
