@@ -14,6 +14,7 @@ from tracklake.quality_reports.rules.rule import (
     Threshold,
     recorded,
 )
+from tracklake.schemas.motion_bounds import BOUNDS
 
 HIGH_ACCELERATION = Rule(
     name="high_acceleration",
@@ -43,28 +44,23 @@ HARD_DECELERATION = Rule(
     case=Case({"accel_mps2": (-8.0, -8.01, None)}, breaks=(1,)),
 )
 
-ACCELERATION_BOUNDS: dict[str, tuple[float, float, float]] = {
-    "car": (5.0, 0.09, 2.0),
-    "truck": (2.7, 0.06, 1.0),
-    "motorcycle": (7.2, 0.1, 3.0),
-}
-"""Greatest acceleration at rest in m/s², its fall in m/s² per m/s, and its least value in m/s², by class."""
-
 
 def _make_acceleration_limits() -> tuple[Threshold, ...]:
     """Make the thresholds of every class."""
     named = (("at_rest_mps2", "m/s2"), ("fall_per_s", "1/s"), ("least_mps2", "m/s2"))
     return tuple(
         Threshold(f"acceleration_bound_{kind}_{name}", value, unit)
-        for kind, values in ACCELERATION_BOUNDS.items()
-        for (name, unit), value in zip(named, values, strict=True)
+        for kind, own in BOUNDS.items()
+        for (name, unit), value in zip(
+            named, (own.accel_at_rest_mps2, own.accel_fall_per_s, own.least_accel_mps2), strict=True
+        )
     )
 
 
 def _measure_acceleration_excess(limits: Limits) -> pl.Expr:
     """Measure how far the recorded acceleration exceeds the bound at the recorded speed, m/s², to 0.001."""
     speed, bound = pl.col("speed_mps").cast(pl.Float64).clip(lower_bound=0), pl.lit(None, pl.Float64)
-    for kind in ACCELERATION_BOUNDS:
+    for kind in BOUNDS:
         at_rest, fall, least = (
             limits[f"acceleration_bound_{kind}_{name}"] for name in ("at_rest_mps2", "fall_per_s", "least_mps2")
         )

@@ -29,7 +29,7 @@ def limit_motion(bounds: Sequence[MotionBounds], kind: Integers, speed_mps: Floa
     def pick(name: str) -> Floats:
         return np.array([getattr(one, name) for one in bounds])[kind]
 
-    fallen = pick("accel_mps2") - pick("accel_fall_per_s") * np.maximum(speed_mps - pick("full_accel_until_mps"), 0)
+    fallen = pick("accel_at_rest_mps2") - pick("accel_fall_per_s") * np.maximum(speed_mps, 0)
     return Limits(np.maximum(fallen, pick("least_accel_mps2")), pick("braking_mps2"), pick("jerk_mps3"))
 
 

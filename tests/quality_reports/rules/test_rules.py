@@ -3,11 +3,12 @@
 What a rule needs of tests comes from its declaration (test_rule_cases.py); what stands here is of DESIGN's sixteen.
 """
 
+import numpy as np
 import polars as pl
 import pytest
 from pandera.errors import SchemaErrors
 
-from tracklake.pipeline.transforms.reconstruction.config import BOUNDS
+from tracklake.pipeline.transforms.reconstruction.bounds import limit_motion
 from tracklake.quality_reports.rules.derived import DERIVED
 from tracklake.quality_reports.rules.registry import (
     RULES,
@@ -20,6 +21,7 @@ from tracklake.quality_reports.rules.registry import (
 )
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import SEVERITIES
+from tracklake.schemas.motion_bounds import BOUNDS
 
 NAMES = [
     "negative_headway", "negative_headway_recorded", "high_acceleration", "low_constant_speed", "backward",
@@ -260,15 +262,9 @@ def test_as_pandera_checks_take_thresholds():
 @pytest.mark.parametrize("kind", BOUNDS)
 def test_accelerations_that_reconstructed_tracks_may_have_break_no_bound(kind):
     speeds = [step / 2 for step in range(140)]
-    greatest = [float(bound) for bound in _find_reconstructed_bounds(kind, speeds)]
+    greatest = limit_motion([BOUNDS[kind]], np.zeros(140, int), np.array(speeds)).accel_mps2.tolist()
     frame = entries(speed_mps=speeds, accel_mps2=greatest, motion_class=[kind] * len(speeds))
     assert not any(broken(frame, "acceleration_bound"))
-
-
-def _find_reconstructed_bounds(kind: str, speeds: list[float]) -> list[float]:
-    bounds = BOUNDS[kind]
-    falls = [bounds.accel_fall_per_s * max(speed - bounds.full_accel_until_mps, 0) for speed in speeds]
-    return [max(bounds.accel_mps2 - fall, bounds.least_accel_mps2) for fall in falls]
 
 
 def test_the_documentation_follows_from_the_declaration():
