@@ -68,7 +68,7 @@ GainOption = Annotated[
     bool | None,
     typer.Option(
         "--gain/--no-gain",
-        help="Score by recorded, filtered and reconstructed histories, too [default: if tracks_from is reconstructed].",
+        help="Score by recorded, filtered and reconstructed histories; the default where tracks_from is reconstructed.",
     ),
 ]
 EveryTickOption = Annotated[
