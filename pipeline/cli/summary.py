@@ -11,6 +11,7 @@ from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
 from tracklake.quality_reports.drives import describe_drive, describe_drives
+from tracklake.quality_reports.reconstruction import collect_reconstruction, describe_reconstruction
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.start_assessments import ESTIMATORS
@@ -61,6 +62,8 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         "quality": f"{_format_count(head['vehicles_with_errors'])} vehicles with errors; " + late,
         "samples": "none" if head["samples"] is None else f"{head['samples']:,}{_describe_balance(quality)}",
     }
+    reconstructed = quality["reconstruction"]["datasets"] if "reconstruction" in quality else []
+    lines |= {f"reconstructed ({row['dataset']})": describe_reconstruction(row) for row in reconstructed}
     if drives and not head["subsets"]:
         lines = {"rows": lines["rows"]}  # the others are of recordings from above
     if drives:
@@ -125,6 +128,14 @@ def _describe_balance(quality: dict[str, Any]) -> str:
         if row["vehicle_share"] is not None and row["split"] not in others
     ]
     return f"; split by vehicles: {', '.join(parts)}" if parts else ""
+
+
+def show_reconstruction(terminal: Terminal, root: Path) -> None:
+    """Print how noisy the tracks of each dataset were, how far they were moved and what could not be kept."""
+    with connect(root) as connection:
+        figures = collect_reconstruction(connection)
+    for row in figures["datasets"] if figures else ():
+        terminal.print_line(f"{row['dataset']}: {describe_reconstruction(row)}")
 
 
 def show_assessment(terminal: Terminal, root: Path) -> list[dict[str, Any]]:

@@ -115,8 +115,9 @@ def _explain_job(job: Job, commit: Commit | None) -> str:
         return OTHERWISE
     had, has = before.get("commits", {}), now.get("commits", {})  # pages and the report show what these made
     others = {key.partition("/")[0] for key in {**had, **has} if had.get(key) != has.get(key)}
-    made_again = [name for name in (INGEST, *STAGE_BY_NAME) if name in (*names, *others)]
-    settings = [name for name in names if name not in (*made_again, "commits")]
+    stages = (INGEST, *STAGE_BY_NAME)
+    made_again = [name for name in stages if name in others or (name in names and name in before and name in now)]
+    settings = [name for name in names if name not in (*stages, "commits")]
     parts = [f"{', '.join(made_again)} was made again"] if made_again else []
     changes = [text for name in settings for text in _list_changes(name, before.get(name), now.get(name))]
     if changes:

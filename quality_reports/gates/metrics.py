@@ -52,6 +52,8 @@ RULE_FIGURES = {
 }
 """Meanings and units of the metrics of each rule, `RULE.NAME`."""
 
+RECONSTRUCTION = "`tracklake reconstruct` of a freeway"
+"""What has to have run before figures of reconstructed tracks are known."""
 FUSION = "`tracklake run`, which fuses and checks drives"
 """What has to have run before findings and errors of drives are known."""
 
@@ -76,6 +78,17 @@ METRICS: tuple[Metric, ...] = (
     Metric("late_share", "late starts / starts that were judged", SHARE, needs="`tracklake repair` of a freeway"),
     Metric("samples", "prediction origins", needs="`tracklake samples` of a freeway"),
     Metric("kept_share", "samples / (samples + dropped)", SHARE, needs="`tracklake samples` of a freeway"),
+    Metric(
+        "noise_x_m", "noise of recorded positions along the road; of several the greatest", "m", needs=RECONSTRUCTION
+    ),
+    Metric("moved_share", "reconstructed entries that moved more than 0.5 m", SHARE, needs=RECONSTRUCTION),
+    Metric("bounds_not_kept", "runs of reconstructed entries that break a bound", needs=RECONSTRUCTION),
+    Metric(
+        "reconstructed_error_share",
+        "share of the reconstructed tracks' entries that break a rule of severity error",
+        SHARE,
+        needs=RECONSTRUCTION,
+    ),
     Metric("subsets", "subsets in the lake", scopes=OF_RECORDINGS, needs="a recording"),
     Metric("recordings", "recordings in the lake", scopes=("dataset", "lake"), needs="a recording"),
     Metric("vehicles", "tracks", needs="a recording"),

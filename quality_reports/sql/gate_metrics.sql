@@ -7,12 +7,20 @@ WITH drawn AS (
 ),
 facts AS (
     SELECT
-        subsets.dataset, recording, subsets.subset, site, origin, subsets.entries, vehicles, flow_vphpl, excluded,
-        1 - share_without_error AS error_share, 1 - share_without_warning AS warning_share,
-        1 - vehicles_without_error AS vehicle_error_share, 1 - vehicles_without_warning AS vehicle_warning_share,
-        speed_rms_mps, accel_rms_mps2, spacing_rms_m, worst_jerk_mps3, len(rules_unchecked) AS unchecked_rules,
-        freeway, eligible, late, samples, on_clock
+        subsets.dataset, recording, subsets.subset, site, origin, subsets.entries, subsets.vehicles, flow_vphpl, excluded,
+        1 - subset_scores.share_without_error AS error_share, 1 - subset_scores.share_without_warning AS warning_share,
+        1 - subset_scores.vehicles_without_error AS vehicle_error_share,
+        1 - subset_scores.vehicles_without_warning AS vehicle_warning_share,
+        subset_scores.speed_rms_mps, subset_scores.accel_rms_mps2, subset_scores.spacing_rms_m,
+        subset_scores.worst_jerk_mps3, len(subset_scores.rules_unchecked) AS unchecked_rules,
+        freeway, eligible, late, samples, on_clock,
+        noise_x_m, quality.entries AS moved_entries, moved_over_half_m_share,
+        CASE WHEN vehicles_reconstructed > 0 THEN bounds_not_kept END AS bounds_not_kept,
+        CASE WHEN vehicles_reconstructed > 0 THEN "after".entries END AS entries_after, "after".share_without_error
+            AS share_after
     FROM subsets
+    LEFT JOIN reconstruction_quality AS quality USING (dataset, subset)
+    LEFT JOIN reconstructed_subset_scores AS "after" USING (dataset, subset)
     LEFT JOIN subset_scores USING (dataset, subset)
     LEFT JOIN start_cutoffs USING (dataset, subset)
     LEFT JOIN drawn USING (dataset, subset)
@@ -39,7 +47,10 @@ of_subsets AS (
             THEN round(sum(late) / nullif(sum(eligible), 0), 9) END AS late_share,
         CASE WHEN count(samples) = count(*) FILTER (freeway) THEN sum(samples)::BIGINT END AS samples,
         CASE WHEN count(samples) = count(*) FILTER (freeway)
-            THEN round(sum(samples) / nullif(sum(on_clock), 0), 9) END AS kept_share
+            THEN round(sum(samples) / nullif(sum(on_clock), 0), 9) END AS kept_share,
+        max(noise_x_m) AS noise_x_m, sum(bounds_not_kept)::BIGINT AS bounds_not_kept,
+        round(sum(moved_entries * moved_over_half_m_share) / nullif(sum(moved_entries), 0), 9) AS moved_share,
+        round(sum(entries_after * (1 - share_after)) / sum(entries_after), 9) AS reconstructed_error_share
     FROM facts
     GROUP BY GROUPING SETS ((), (dataset), (dataset, recording), (dataset, recording, subset))
 ),

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tracklake.quality_reports.pages.report import build_report
 from tracklake.quality_reports.reconstruction import collect_reconstruction, describe_reconstruction
 
 UPPER, LOWER, STREET = (("highd", "01-upper"), ("highd", "01-lower"), ("ngsim", "street"))
@@ -114,3 +115,10 @@ def test_a_sentence_says_what_to_conclude(lake):
         "of the entries fill gaps; 1 bound could not be kept; 3 of 6 vehicles have an error as recorded, 1 as "
         "reconstructed"
     )
+
+
+def test_samples_of_other_tracks_are_marked(open_lake, small_lake):
+    lake = open_lake(**small_lake)
+    marked = build_report(lake, {"settings": {"tracks_from": "reconstructed"}}).html
+    assert "<strong>Of reconstructed tracks</strong>" in marked
+    assert "<strong>Of recorded" not in build_report(lake, {"settings": {"tracks_from": "recorded"}}).html

@@ -94,6 +94,16 @@ def test_the_report_shows_both(lake):
     assert "Conclusion: noise" in page
 
 
+def test_the_command_and_gates_say_how_far_tracks_were_moved(lake, command):
+    done = command.here("reconstruct", "--lake", lake.root)
+    assert done.code == 0, done.err
+    assert "highd: noise 0." in done.out + done.err
+    gates = [f"{name} >= 0" for name in ("noise_x_m", "moved_share", "bounds_not_kept", "reconstructed_error_share")]
+    checked = command.here("check", "--lake", lake.root, *(part for gate in gates for part in ("--fail-on", gate)))
+    assert checked.code == 4, checked.err
+    assert "not checked" not in checked.out
+
+
 def test_samples_of_reconstructed_tracks_wait_for_them(lake):
     jobs = plan_stage(lake.root, "samples", NEW)
     before = plan_stage(lake.root, "samples", Settings())
