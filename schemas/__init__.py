@@ -53,7 +53,7 @@ from tracklake.schemas.traffic import VIRTUAL_DETECTORS as VIRTUAL_DETECTORS
 from tracklake.schemas.vehicles import VEHICLE_STARTS as VEHICLE_STARTS
 from tracklake.schemas.vehicles import VEHICLES as VEHICLES
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Version of the tables below; it grows when an older lake can no longer be read."""
 
 TABLES: tuple[Table, ...] = (
