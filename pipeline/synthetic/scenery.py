@@ -214,8 +214,15 @@ class Scenery:
 
     def size_range(self, vehicle: int, side: int) -> float | None:
         """Compute how much the length (0) or width (1) varies in a vehicle's rows, in m; None = unknown."""
-        sizes = [box[side] for box in self.boxes.get(vehicle, ())]
-        return round(max(sizes) - min(sizes), 3) if sizes else None
+        found = self._size_ranges.get(vehicle)
+        return None if found is None else found[side]
+
+    @cached_property
+    def _size_ranges(self) -> dict[int, list[float]]:
+        return {
+            vehicle: [round(max(sizes) - min(sizes), 3) for sizes in zip(*boxes, strict=True)]
+            for vehicle, boxes in self.boxes.items()
+        }
 
     def appears(self, key: Key) -> bool:
         """Test whether an entry is the first of a track that begins in a main lane a second into the recording."""
