@@ -22,7 +22,7 @@ CREEP_MPS = 2e-6
 """Least speed that programs use, in m/s, so that rounding moves nothing backward: 2 mm in a quarter of an hour."""
 BATCH_POINTS = 20_000
 """Points of the programs that are solved together; more would not fit a processor's cache."""
-ROUNDS = 3
+ROUNDS = 5
 """Times that a piece is solved, since the greatest acceleration depends on the speed that comes out."""
 
 
@@ -48,12 +48,19 @@ class Problem:
             return
         batch = (np.cumsum(self.series.size[pieces]) - 1) // BATCH_POINTS
         for number in np.unique(batch):
-            points, series = select_pieces(self.series, pieces[batch == number])
-            bands = self.penalty[:, points]
-            bands[0] += self.weights[points]
-            way, solved = solve_programs(bands, make_rows(series, points), series.first, series.size)
-            done = np.repeat(solved, series.size)
-            x[points[done]] = (self.smoothed[points] + way)[done]
+            self._solve_together(pieces[batch == number], x, make_rows)
+
+    def _solve_together(self, pieces: Integers, x: Floats, make_rows: Callable[[Series, Integers], list[Rows]]) -> None:
+        """Solve the programs of some pieces at once, and those without a solution again by themselves."""
+        points, series = select_pieces(self.series, pieces)
+        bands = self.penalty[:, points]
+        bands[0] += self.weights[points]
+        way, solved = solve_programs(bands, make_rows(series, points), series.first, series.size)
+        done = np.repeat(solved, series.size)
+        x[points[done]] = (self.smoothed[points] + way)[done]
+        if len(pieces) > 1:
+            for piece in pieces[~solved]:
+                self._solve_together(np.array([piece]), x, make_rows)
 
 
 def bound_motion(problem: Problem, bounds: Sequence[MotionBounds], kind: Integers) -> tuple[Floats, Limits]:
