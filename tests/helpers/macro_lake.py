@@ -11,6 +11,7 @@ from tracklake.schemas import BSM, SUBSETS, SURROUNDING, SURROUNDING_TRUTH, TRAC
 
 CALLS = {
     "around_ego": "{subset}, 2.55",
+    "clean_tracks": "{subset}",
     "detector_counts": "{subset}, 20, 1",
     "drive_errors": "{subset}",
     "edie_cells": "{subset}, 20, 1",

@@ -6,11 +6,15 @@
 --
 -- subset: its name
 --
--- dataset, subset, vehicle_id, frame, time_s, lane, leader_id, follower_id: as in tracks
--- x_m, y_m, speed_mps, accel_mps2, lateral_speed_mps: reconstructed
+-- dataset, subset, vehicle_id, frame, time_s: as in tracks
+-- x_m, y_m: reconstructed
+-- lane: as in tracks
+-- speed_mps, accel_mps2, lateral_speed_mps: reconstructed
+-- leader_id, follower_id: as in tracks
 -- gap_m: from these positions; recorded where the leader has no entry
--- moved_m, constrained: as in reconstructed; null where the entry is as recorded
+-- moved_m: as in reconstructed; null where the entry is as recorded
 -- imputed: whether the entry fills a gap
+-- constrained: as in reconstructed; null where the entry is as recorded
 CREATE MACRO clean_tracks(subset) AS TABLE
 WITH joined AS (
     SELECT
@@ -77,7 +81,7 @@ LEFT JOIN entry AS ahead
     AND ahead.subset = entry.subset
     AND ahead.vehicle_id = entry.leader_id
     AND ahead.frame = entry.frame
-LEFT JOIN main.vehicles AS vehicle
+LEFT JOIN (SELECT * FROM main.vehicles AS vehicle WHERE vehicle.subset = subset) AS vehicle
     ON vehicle.dataset = entry.dataset
     AND vehicle.subset = entry.subset
     AND vehicle.vehicle_id = entry.leader_id
