@@ -176,9 +176,9 @@ def count_swaps(judged: pl.DataFrame) -> tuple[int, int, int]:
     return rows.height, rows.filter(pl.col("owner") != own).height, lasting.filter(changed).height
 
 
-def bound(values: list[float], random: np.random.Generator) -> str:
+def bound(values: list[float | None], random: np.random.Generator) -> str:
     """Return the median of per-drive values with its 95 % interval by the bootstrap."""
-    known: Floats = np.array([value for value in values if np.isfinite(value)])
+    known: Floats = np.array([value for value in values if value is not None])
     if not known.size:
         return "-"
     drawn = np.median(random.choice(known, (2000, known.size)), axis=1)
@@ -194,7 +194,7 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
         "messages, LiDAR": replace(base, camera=None),
         "messages, LiDAR, camera": base,
     }
-    errors: dict[tuple[str, int], list[float]] = {}
+    errors: dict[tuple[str, int], list[float | None]] = {}
     heads = "the vehicle ahead", "rows with LiDAR", "swaps", "with camera", "identities changed", "with camera"
     yield "| " + " | ".join(heads) + " |"
     yield "| --- | --- | --- | --- | --- | --- |"
@@ -211,8 +211,9 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
                 if config.lidar is not None:
                     late = late.filter("from_lidar")
                 for band, (low, high) in enumerate(BANDS_M):
-                    values = late.filter(pl.col("distance_m").is_between(low, high, closed="left"))["error_m"]
-                    errors.setdefault((variant, band), []).append(float(values.median() or np.nan))  # type: ignore[arg-type]  # a number
+                    near = late.filter(pl.col("distance_m").is_between(low, high, closed="left"))
+                    middle: list[float | None] = near.select(pl.median("error_m")).to_series().to_list()
+                    errors.setdefault((variant, band), []).extend(middle)
         lidar, camera = (counts[variant] for variant in list(variants)[1:])
         yield f"| {name} | {lidar[0]:,} | {lidar[1]:,} | {camera[1]:,} | {lidar[2]:,} | {camera[2]:,} |"
     random = np.random.default_rng(0)

@@ -122,6 +122,6 @@ STAGE = Stage(
     scope="drive",
     after=(INGEST,),
     settings=("onboard_lidar", "onboard_camera"),
-    version=4,
+    version=5,
     build=build,
 )

@@ -141,7 +141,7 @@ def measure_centres(points, predicted):
         "candidates": candidates,
     }
     return LidarMeasurement(
-        Measured(row, points[:, :2], covariance, order, np.zeros(count, int), size), clusters, association
+        Measured(row, points[:, :2], covariance, order, np.zeros(count), size), clusters, association
     )
 
 

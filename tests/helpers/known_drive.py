@@ -37,9 +37,9 @@ M_PER_DEG_EAST, M_PER_DEG_NORTH = 111_319.490_793, 110_574.275_822
 """Metres per degree at latitude 0 and longitude 0, on WGS-84."""
 TICKS = 60
 WAYS = {1: (30.0, 0.0, 0.0), 2: (-10.0, 0.5, -3.5), 1_000_000: (15.0, 0.0, 3.5)}
-"""By vehicle: m ahead at tick 0, m more per tick, m to the right."""
+"""Ways of the vehicles by id: m ahead of the ego at tick 0, m more per tick, and m to its right."""
 SENT_TOO_FAR = {1: (0.0, 1.0), 2: (1.0, 0.0)}
-"""By station: errors of its messages, m ahead and to the right."""
+"""Constant errors of the messages by station: m ahead and m to the right."""
 LOST = range(20, 30)
 
 

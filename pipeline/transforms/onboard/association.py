@@ -11,7 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.pipeline.transforms.onboard.boxes import Boxes, Returns, locate_boxes, make_no_boxes, pick_boxes
+from tracklake.pipeline.transforms.onboard.boxes import (
+    Boxes,
+    Returns,
+    compute_lean,
+    expect_boxes,
+    join_boxes,
+    locate_boxes,
+    make_no_boxes,
+    measure_depth,
+    pick_boxes,
+)
 from tracklake.pipeline.transforms.onboard.clusters import (
     HIDING_M,
     Scan,
@@ -35,8 +45,6 @@ HEADING_SD_RAD, NEW_HEADING_SD_RAD = 0.03, 0.08
 """Standard deviation of a predicted heading, and of the ego's axis as the heading of a new vehicle, in rad."""
 ROUNDS = 3
 """Times that parted clusters are offered again."""
-MARGIN_M, GREATEST_MARGIN_M = 0.35, 1.0
-"""Distance outside a measured box within which returns are still the vehicle's, in m, before its standard deviation."""
 NEAR_BOX_M = 1.5
 """A cluster closer than this to a measured vehicle is a part of it or hangs on it, and no new vehicle, in m."""
 LEAST_RETURNS = 3
@@ -104,7 +112,7 @@ def measure_by_lidar(
         centre_m=np.concatenate([boxes.centre_m, new_boxes.centre_m]) + origin,
         covariance_m2=np.concatenate([boxes.covariance_m2, new_boxes.covariance_m2]),
         cluster=cluster,
-        side=np.concatenate([boxes.side, new_boxes.side]),
+        lean=np.concatenate([compute_lean(boxes), compute_lean(new_boxes)]),
         size_m=np.concatenate([boxes.size_m, new_boxes.size_m]),
     )
     number = np.full(vehicles, -1)
@@ -117,7 +125,7 @@ def measure_by_lidar(
         describe_clusters(points, label[joined], count),
         {
             "cluster": cluster.astype(np.int32),
-            "side": measured.side,
+            "side": np.concatenate([boxes.side, new_boxes.side]),
             "distance_m": np.concatenate([np.hypot(*offset.T), unknown]).astype(np.float32),
             "gate": np.concatenate([gate, unknown]).astype(np.float32),
             "candidates": np.concatenate([choice.candidates[found], np.zeros(new.size)]).astype(np.int32),
@@ -141,11 +149,15 @@ def _choose(scan: Scan, predicted: Predicted, choice: _Choice) -> None:
         pair = chosen[_find_pairs(vehicle[chosen], segment[chosen], row, column)]
         # A small cluster within the box of another vehicle with a larger one is a part of that vehicle.
         returns = np.bincount(choice.segment[choice.vehicle < 0])[column]
-        inside = _measure_depth(mean[pair], pick_boxes(boxes, pair), predicted.heading_rad[row]) <= 0
+        inside = measure_depth(mean[pair], pick_boxes(boxes, pair), predicted.heading_rad[row]) <= 0
         own = ~(inside & (returns > returns[:, None])).any(1)
         row, column, pair = row[own], column[own], pair[own]
         choice.main[row] = column
-        parted = _absorb(scan, choice, row, pick_boxes(boxes, pair), predicted.heading_rad[row])
+        others = np.setdiff1d(waiting, row)
+        others = others[~np.isnan(predicted.size_m[others, 0])]
+        rivals = expect_boxes(predicted.centre_m[others], predicted.covariance_m2[others], predicted.size_m[others])
+        heading = predicted.heading_rad[np.concatenate([row, others])]
+        parted = _absorb(scan, choice, row, join_boxes(pick_boxes(boxes, pair), rivals), heading)
         if not parted:
             return
 
@@ -253,7 +265,7 @@ def _find_parts(vehicle: Integers, mean: Floats, boxes: Boxes, heading: Floats, 
 
     The side of a vehicle far ahead gives returns metres apart: clusters that are parts of the one with its rear.
     """
-    inside = _measure_depth(mean, boxes, heading) <= 0
+    inside = measure_depth(mean, boxes, heading) <= 0
     distance = np.hypot(*mean.T)
     inside &= (vehicle[:, None] == vehicle) & gated & (distance[:, None] > distance)
     return np.asarray(inside.any(1))
@@ -270,35 +282,28 @@ def _find_pairs(vehicle: Integers, segment: Integers, row: Integers, column: Int
 def _absorb(scan: Scan, choice: _Choice, row: Integers, boxes: Boxes, heading: Floats) -> bool:
     """Give vehicles the free returns within their boxes, and cluster again what their clusters hold beyond.
 
+    Args:
+        scan: returns.
+        choice: what has been decided; written.
+        row: (K,) vehicles that chose a cluster.
+        boxes: theirs, and those of vehicles that have not chosen yet: what lies in these remains free.
+        heading: headings of the boxes.
+
     Returns:
         Whether such returns remain.
     """
     free = np.flatnonzero(choice.vehicle < 0)
-    depth = _measure_depth(scan.place_m[free], boxes, heading)
-    owner = depth.argmin(1)
-    inside = depth[np.arange(free.size), owner] <= 0
+    place = scan.place_m[free]
+    off = np.maximum(measure_depth(place, boxes, heading, 0.0), 0) + boxes.end_sd_m.max((1, 2))
+    off = np.where(measure_depth(place, boxes, heading) <= 0, off, np.inf)
+    owner = off.argmin(1)
+    inside = np.isfinite(off[np.arange(free.size), owner]) & (owner < row.size)
     choice.vehicle[free[inside]] = row[owner[inside]]
     touched = np.unique(np.concatenate([choice.segment[free[inside]], choice.main[row]]))
     rest = free[~inside & np.isin(choice.segment[free], touched)]
     if rest.size:
         choice.segment[rest] = choice.segment.max() + 1 + cluster_returns(scan, rest)
     return bool(rest.size)
-
-
-def _measure_depth(place: Floats, boxes: Boxes, heading: Floats, margin_m: float | None = None) -> Floats:
-    """Return how far (N, 2) places lie outside each of K boxes with a margin, in m; negative inside. (N, K)."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    axes = np.stack([[cos, sin], [-sin, cos]])  # (2, 2, K): along and across, x and y
-    middle = np.einsum("aik,ki->ak", axes, boxes.centre_m)
-    along, across = (place @ axes[axis] - middle[axis] for axis in (0, 1))
-    if margin_m is None:
-        spread = np.sqrt(np.linalg.eigvalsh(boxes.covariance_m2)[:, 1])
-        margin = np.minimum(MARGIN_M + spread, GREATEST_MARGIN_M)
-    else:
-        margin = np.full(heading.size, margin_m)
-    half = boxes.size_m / 2 + margin[:, None] + boxes.size_sd_m
-    result: Floats = np.maximum(np.abs(along) - half[:, 0], np.abs(across) - half[:, 1])
-    return result
 
 
 def _locate_chosen(scan: Scan, predicted: Predicted, choice: _Choice) -> tuple[Integers, Boxes, Floats]:
@@ -337,7 +342,7 @@ def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tup
     owner = cluster_returns(scan, free)
     boxes, mean = _locate_new(scan, free, owner, whole=False)
     straight = np.zeros(len(mean))
-    inside = _measure_depth(mean, boxes, straight) <= 0
+    inside = measure_depth(mean, boxes, straight) <= 0
     # (child, parent): clusters are numbered from the nearest on, and a parent must not be a child itself.
     inside = np.tril(inside, -1)
     inside &= ~inside.any(1)
@@ -347,7 +352,7 @@ def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tup
     boxes, mean = _locate_new(scan, free, owner, whole=True)
     vehicle = _is_vehicle(boxes, mean, np.bincount(owner))
     if known.side.size:
-        vehicle &= (_measure_depth(mean, known, heading, NEAR_BOX_M) > 0).all(1)
+        vehicle &= (measure_depth(mean, known, heading, NEAR_BOX_M) > 0).all(1)
     group[free] = owner
     new = np.flatnonzero(vehicle)
     return group, new, pick_boxes(boxes, new)
@@ -382,7 +387,7 @@ def _is_vehicle(boxes: Boxes, mean: Floats, returns: Integers) -> Flags:
     if barrier.any():
         line = pick_boxes(boxes, np.flatnonzero(barrier))
         line.size_m[:, 0] += 2 * BARRIER_GAP_M
-        fits &= (_measure_depth(mean, line, np.zeros(line.side.size), 0.0) > 0).all(1)
+        fits &= (measure_depth(mean, line, np.zeros(line.side.size), 0.0) > 0).all(1)
     return np.asarray(fits & (returns >= LEAST_RETURNS) & (np.abs(mean[:, 1]) <= ROADSIDE_M))
 
 

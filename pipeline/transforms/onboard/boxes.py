@@ -27,6 +27,9 @@ SHAPE_M = 0.04
 """Standard deviation of a real vehicle's outline around its box, in m."""
 FACE_DEPTH_M = 0.3
 """Depth behind the least coordinate within which returns are on a face, in m."""
+CORNER_M = 0.12
+"""Distance from the face along a vehicle beyond which a return of the near corner is on the face across it, in m: three
+standard deviations of the outline. Returns of one face lie nearer to it."""
 KNOWN_SIZE_SD_M = (0.05, 0.03)
 """Standard deviation of length and width from messages, in m."""
 CAR_SIZE_M, CAR_SIZE_SD_M = (4.6, 1.85), (0.5, 0.12)
@@ -37,6 +40,8 @@ TRUCK_HEIGHT_M, TRUCK_WIDTH_M = 2.4, 2.25
 """A vehicle of unknown size is taken for a truck from this height or visible width on, in m."""
 UNSEEN_M2 = 1e4
 """Variance of an edge that returns do not tell, in m2."""
+MARGIN_M = 0.35
+"""Distance outside a measured box within which returns are still the vehicle's, in m, before its standard deviation."""
 WIDER = 3.0
 """Greatest surprise by a cluster that is wider than the vehicle."""
 REAR, FRONT, LEFT, RIGHT = range(4)
@@ -72,8 +77,9 @@ class Boxes:
     """(K, 2, 2)."""
     size_m: Floats
     """(K, 2) length and width, best estimate."""
-    size_sd_m: Floats
-    """(K, 2) their standard deviations."""
+    end_sd_m: Floats
+    """(K, 2, 2) standard deviations of the low and the high end of the box, along and across the vehicle: the end that
+    the scanner sees is exact where the size is unknown, and only the other one is not."""
     seen_m: Floats
     """(K, 2) extents of the returns along and across the vehicle."""
     height_m: Floats
@@ -116,10 +122,12 @@ def locate_boxes(returns: Returns, heading_rad: Floats, heading_sd_rad: Floats, 
     within = (place <= corner[owner] + size[owner] + 3 * np.sqrt(size_variance)[owner] + FACE_DEPTH_M).all(1)
     faces = _find_faces(place, corner, owner, within, size[:, 0])
     edges = _measure_edges(place, corner, owner, faces, hidden, size, returns)
-    centre, variance, best_size, best_sd, surprise = _combine(edges, size, size_variance)
-    variance = variance + (heading_sd_rad[:, None] * size[:, ::-1] / 2) ** 2
+    centre, variance, best_size, end_variance, surprise = _combine(edges, size, size_variance)
     roof = np.bincount(owner[~returns.on_top], minlength=count) == 0
-    variance[:, 0] += roof * size[:, 0] ** 2 / 12
+    more = (heading_sd_rad[:, None] * size[:, ::-1] / 2) ** 2
+    more[:, 0] += roof * size[:, 0] ** 2 / 12
+    variance = variance + more
+    end_sd = np.sqrt(end_variance + more[..., None])
     across = np.bincount(owner[faces.across], minlength=count)
     along = np.bincount(owner[faces.along], minlength=count)
     seen = np.column_stack([_span(place[:, axis], owner, within, count) for axis in (0, 1)])
@@ -130,7 +138,7 @@ def locate_boxes(returns: Returns, heading_rad: Floats, heading_sd_rad: Floats, 
         centre_m=np.einsum("ki,kij->kj", centre * sign, axes),
         covariance_m2=np.einsum("kia,ki,kib->kab", axes, variance, axes),
         size_m=best_size,
-        size_sd_m=best_sd,
+        end_sd_m=np.where(sign[..., None] < 0, end_sd[..., ::-1], end_sd),
         seen_m=seen,
         height_m=top,
         surprise=surprise,
@@ -180,7 +188,7 @@ def _find_faces(place: Floats, corner: Floats, owner: Integers, within: Flags, l
     across = within & first & (~second | beyond) & (inside[:, 0] < FACE_DEPTH_M)
     depth = FACE_DEPTH_M + 0.02 * length
     along = within & second & (~first | ~beyond & (inside[:, 0] >= FACE_DEPTH_M)) & (inside[:, 1] < depth[owner])
-    sure = across & (~second | (inside[:, 1] > FACE_DEPTH_M))
+    sure = across & (~second | (inside[:, 1] > CORNER_M))
     return _Faces(seen[:, 0], seen[:, 1], across, along, sure)
 
 
@@ -261,7 +269,7 @@ def _combine(
     """Combine the edges of each axis.
 
     Returns:
-        Centres, their variances, sizes, their standard deviations, (K, 2) each; (K,) `surprise` of Boxes.
+        Centres, their variances, sizes, (K, 2) each; variances of both ends, (K, 2, 2); (K,) `surprise` of Boxes.
     """
     low_at, high_at = (np.column_stack([edges[0][end].at_m, edges[1][end].at_m]) for end in (0, 1))
     low, high = (np.column_stack([edges[0][end].variance_m2, edges[1][end].variance_m2]) for end in (0, 1))
@@ -272,10 +280,28 @@ def _combine(
     variance = ((low + size_variance / 4) * (high + size_variance / 4) - (size_variance / 4) ** 2) / total
     excess = high_at - low_at - size
     best = size + excess * size_variance / total
-    best_sd = np.sqrt(size_variance * (low + high) / total)
+    ends = np.stack([low * (high + size_variance), high * (low + size_variance)], -1) / total[..., None]
     surprise = excess[:, 1] ** 2 / total[:, 1]
     # A cluster of two vehicles is wider than one: that alone does not exclude it.
-    return centre, variance, best, best_sd, np.where(excess[:, 1] > 0, np.minimum(surprise, WIDER), surprise)
+    return centre, variance, best, ends, np.where(excess[:, 1] > 0, np.minimum(surprise, WIDER), surprise)
+
+
+def compute_lean(boxes: Boxes) -> Floats:
+    """Return `lean` of Measured."""
+    rear, front = np.square(boxes.end_sd_m[:, 0]).T
+    lean: Floats = (front - rear) / (front + rear)
+    return lean
+
+
+def measure_depth(place: Floats, boxes: Boxes, heading: Floats, margin_m: float | None = None) -> Floats:
+    """Return how far (N, 2) places lie outside each of K boxes with a margin, in m; negative inside. (N, K)."""
+    margin = MARGIN_M + boxes.end_sd_m if margin_m is None else np.full_like(boxes.end_sd_m, margin_m)
+    cos, sin = np.cos(heading), np.sin(heading)
+    axes = np.stack([[cos, sin], [-sin, cos]])  # (2, 2, K): along and across, x and y
+    off = np.einsum("na,iak->nki", place, axes) - np.einsum("ka,iak->ki", boxes.centre_m, axes)
+    ends = boxes.size_m[..., None] / 2 + margin  # (K, 2, 2)
+    result: Floats = np.maximum(-off - ends[..., 0], off - ends[..., 1]).max(-1)
+    return result
 
 
 def pick_boxes(boxes: Boxes, rows: Integers) -> Boxes:
@@ -284,7 +310,30 @@ def pick_boxes(boxes: Boxes, rows: Integers) -> Boxes:
     return Boxes(**{name: values[rows] for name, values in fields.items()})  # type: ignore[arg-type]  # all are arrays
 
 
+def join_boxes(first: Boxes, second: Boxes) -> Boxes:
+    """Return the boxes of both, one after the other."""
+    pairs = {name: (values, vars(second)[name]) for name, values in vars(first).items()}
+    return Boxes(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+def expect_boxes(centre_m: Floats, covariance_m2: Floats, size_m: Floats) -> Boxes:
+    """Return boxes of K vehicles of known size where they are expected; nothing is seen of them."""
+    sd = np.sqrt(np.linalg.eigvalsh(covariance_m2)[:, 1])
+    nothing = np.zeros(len(sd))
+    return Boxes(
+        centre_m=centre_m,
+        covariance_m2=covariance_m2,
+        size_m=size_m,
+        end_sd_m=np.broadcast_to(sd[:, None, None], (len(sd), 2, 2)),
+        seen_m=np.zeros_like(size_m),
+        height_m=nothing,
+        surprise=nothing,
+        side=np.zeros(len(sd), np.int64),
+    )
+
+
 def make_no_boxes() -> Boxes:
     """Return boxes of no vehicles."""
     pair = np.empty((0, 2))
-    return Boxes(pair, np.empty((0, 2, 2)), pair, pair, pair, np.empty(0), np.empty(0), np.empty(0, np.int64))
+    square = np.empty((0, 2, 2))
+    return Boxes(pair, square, pair, square, pair, np.empty(0), np.empty(0), np.empty(0, np.int64))

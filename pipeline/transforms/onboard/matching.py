@@ -3,15 +3,16 @@
 Messages may be off by more than a lane, so a cluster at the place that they name can be another vehicle's, and their
 own vehicle may be hidden. Clusters are therefore not assigned to stations whose place is uncertain: they become
 tracks of LiDAR alone, and stations and tracks are compared as a whole (track-to-track association; Bar-Shalom, Li and
-Kirubarajan 2001). All messages are off by the error of the ego's own position alike: the assignment is sought together
-with that common shift, and made only where the next best one is clearly worse.
+Kirubarajan 2001). All messages are off alike by the errors of the ego's own position and heading: stations that LiDAR
+sees tell them, the assignment is sought together with what remains unknown of the former, and it is made only where the
+next best one is clearly worse.
 """
 
 import numpy as np
 
-from tracklake.pipeline.transforms.onboard.boxes import CAR_SIZE_M
+from tracklake.pipeline.transforms.onboard.boxes import CAR_SIZE_M, TRUCK_HEIGHT_M
 from tracklake.pipeline.transforms.onboard.kalman import OFFSET, POSITION, VELOCITY
-from tracklake.pipeline.transforms.onboard.tracks import TENTATIVE, Tracks
+from tracklake.pipeline.transforms.onboard.tracks import TENTATIVE, Tracks, lengthen
 from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.perception import FIRST_LIDAR_ID
 
@@ -20,6 +21,8 @@ LOOSE_M2 = 1.0
 NEAR, UNSEEN = 13.8, 9.0
 """Squared Mahalanobis distances: of two places (1 in 1,000), and of a place and velocity that is as likely as that the
 station is hidden and the track is of a vehicle that sends nothing, at 1 vehicle per 175 m2 of which half are hidden."""
+TALL_WIDTH_M = 1.95
+"""Width that all vehicles have that are taller than TRUCK_HEIGHT_M, in m: vans are 2.0 m wide, trucks 2.5 m."""
 CLEAR = 3.0
 """Squared Mahalanobis distance by which the next best assignment must be worse."""
 MOST_SHIFTS = 60
@@ -56,12 +59,14 @@ def guess_velocities(tracks: Tracks, place_m: Floats, usual_mps: Floats) -> Floa
     return guess
 
 
-def match_stations(tracks: Tracks, heard: Flags) -> Integers:
+def match_stations(tracks: Tracks, heard: Flags, ego_m: Floats, heading_sd_rad: float) -> Integers:
     """Return (N, 2) rows of LiDAR tracks and stations that are clearly one vehicle by the present states.
 
     Args:
         tracks: tracks of a tick.
         heard: (V,) whether a message arrived lately.
+        ego_m: (2,) place of the ego.
+        heading_sd_rad: standard deviation of the ego's heading.
     """
     lidar = np.flatnonzero(tracks.vehicle_id >= FIRST_LIDAR_ID)
     lidar = lidar[~_find_doubles(tracks, lidar)]
@@ -69,21 +74,25 @@ def match_stations(tracks: Tracks, heard: Flags) -> Integers:
     none = np.empty((0, 2), dtype=np.int64)
     if not lidar.size or not stations.size:
         return none
-    away, total = _compare(tracks, lidar, stations)
-    near = _square(away[..., :2], total[..., :2, :2]) < NEAR
-    lidar, stations = lidar[near.any(1)], stations[near.any(0)]
+    state, covariance, effect, spread = _expect_offsets(tracks, stations, ego_m, heading_sd_rad)
+    away = tracks.state[lidar, None, :4] - state
+    away[..., :2] += np.swapaxes(compute_size_shift(tracks, lidar, stations), 0, 1)
+    total = tracks.covariance[lidar, None, :4, :4] + covariance
+    total[..., [0, 1], [0, 1]] += 0.2**2
+    fits = ~((tracks.size_m[lidar, 2] > TRUCK_HEIGHT_M)[:, None] & (tracks.size_m[stations, 1] < TALL_WIDTH_M))
+    common = effect @ spread @ np.swapaxes(effect, 1, 2)
+    near = fits & (_square(away[..., :2], total[..., :2, :2] + common) < NEAR)
+    lidar, stations, effect = lidar[near.any(1)], stations[near.any(0)], effect[near.any(0)]
     if not lidar.size:
         return none
-    away, total = away[near.any(1)][:, near.any(0)], total[near.any(1)][:, near.any(0)]
-    common_m2 = float(np.median(tracks.offset_m[stations]) ** 2) / 2
-    known_m, rest_m2 = _find_common_shift(tracks, common_m2)
-    own_m2 = tracks.covariance[stations][:, [0, 1], [0, 1]]  # less than the shift's where LiDAR saw the station before
-    total[..., [0, 1], [0, 1]] -= np.minimum(common_m2, 0.4 * own_m2)[None]
-    pairs, cost = _try_shifts(away, total, known_m, rest_m2)
-    best = int(np.argmin(cost))
-    rivals = np.where(pairs == pairs[best], np.inf, cost[:, None]).min(0)  # the best that has another partner, (S,)
-    good = np.flatnonzero((pairs[best] >= 0) & (rivals - cost[best] >= CLEAR))
-    return np.stack((lidar[pairs[best, good]], stations[good]), 1)
+    away, total, fits = (each[near.any(1)][:, near.any(0)] for each in (away, total, fits))
+    pairs, cost = _try_shifts(away, total, fits, effect, spread)
+    best = pairs[int(np.argmin(cost))]
+    taken = (pairs[:, :, None] == best).any(1)  # (K, S): whether some station has the track that is the best for each
+    rival = (pairs != best) & ((pairs >= 0) | taken)
+    rivals = np.where(rival, cost[:, None], np.inf).min(0)
+    good = np.flatnonzero((best >= 0) & (rivals - cost.min() >= CLEAR))
+    return np.stack((lidar[best[good]], stations[good]), 1)
 
 
 def _find_doubles(tracks: Tracks, lidar: Integers) -> Flags:
@@ -100,60 +109,107 @@ def _find_doubles(tracks: Tracks, lidar: Integers) -> Flags:
     return doubles
 
 
-def _compare(tracks: Tracks, lidar: Integers, stations: Integers) -> tuple[Floats, Floats]:
-    """Return (L, S, 4) differences of places and velocities, LiDAR minus station, and their (L, S, 4, 4) covariances.
-
-    Where LiDAR has seen the rear only, the centre follows from the length, which the station knows.
-    """
-    away = tracks.state[lidar, None, :4] - tracks.state[None, stations, :4]
-    away[..., :2] += compute_size_shift(tracks, lidar, stations)
-    total = tracks.covariance[lidar, None, :4, :4] + tracks.covariance[None, stations, :4, :4]
-    total[..., [0, 1], [0, 1]] += 0.2**2
-    return away, total
-
-
 def compute_size_shift(tracks: Tracks, lidar: Integers, stations: Integers) -> Floats:
-    """Return by how much (L, S, 2) centres that LiDAR found move, in m, if the vehicles have the stations' lengths."""
+    """Return by how much (S, L, 2) centres that LiDAR found move, in m, if the vehicles have the stations' lengths."""
     sent, used = tracks.size_m[stations, 0], tracks.size_m[lidar, 0]
-    longer = np.nan_to_num(sent[None, :] - used[:, None]) * tracks.sized[stations][None, :] / 2
-    sign = np.select([tracks.side[lidar] == 0, tracks.side[lidar] == 1], [1.0, -1.0], 0.0)[:, None]
-    heading = tracks.heading_rad[stations][None, :]
-    shift: Floats = (longer * sign)[..., None] * np.stack((np.cos(heading), np.sin(heading)), -1)
-    return shift
+    longer = np.nan_to_num(sent[:, None] - used) * tracks.sized[stations][:, None]
+    return lengthen(tracks, lidar, longer)
 
 
-def _find_common_shift(tracks: Tracks, common_m2: float) -> tuple[Floats, float]:
-    """Return the shift that stations' messages have in common, by those that LiDAR sees, and its variance."""
-    settled = is_station(tracks) & ~is_loose(tracks)
-    offsets = tracks.state[settled, OFFSET]
-    count = len(offsets)
-    return offsets.sum(0) / (count + 1), common_m2 / (count + 1)
+def _expect_offsets(
+    tracks: Tracks, stations: Integers, ego_m: Floats, heading_sd_rad: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Correct stations by what the offsets of the messages of settled stations have in common.
 
-
-def _try_shifts(away: Floats, total: Floats, known_m: Floats, rest_m2: float) -> tuple[Integers, Floats]:
-    """Assign stations to LiDAR tracks under each of several common shifts.
+    An offset is a shift c by the error of the ego's place, plus a turn about the ego by the error of its heading, plus
+    the own error of the station's receiver. Bayesian regression over the settled stations tells shift and turn. What
+    LiDAR has shown of a station's offset before counts on.
 
     Returns:
-        (K, S) LiDAR track of each station, -1 for none, and the (K,) costs: squared Mahalanobis distances, those of the
-        shifts included; a station without a track costs UNSEEN.
+        (S, 4) places and velocities, their (S, 4, 4) covariances but for what remains unknown of shift and turn, the
+        (S, 2, 3) effect of these on the offsets, and their (3, 3) covariance.
+    """
+
+    def observe(rows: Integers) -> Floats:
+        away = tracks.state[rows, POSITION] - ego_m
+        turns = np.stack((-away[:, 1], away[:, 0]), 1)[..., None]
+        return np.concatenate((np.broadcast_to(np.eye(2), (len(rows), 2, 2)), turns), 2)
+
+    settled = np.flatnonzero(is_station(tracks) & ~is_loose(tracks))
+    ego_m2 = float(np.median(tracks.own_m[stations])) ** 2
+    matrix = observe(settled)
+    weight = 1 / (tracks.own_m[settled] ** 2 + tracks.covariance[settled][:, [6, 7], [6, 7]].mean(1))
+    information = np.diag([1 / ego_m2, 1 / ego_m2, 1 / max(heading_sd_rad, 1e-4) ** 2])
+    information = information + np.einsum("nai,naj,n->ij", matrix, matrix, weight)
+    spread = np.linalg.inv(information)
+    common = spread @ np.einsum("nai,na,n->i", matrix, tracks.state[settled, OFFSET], weight)
+    matrix = observe(stations)
+    prior = tracks.own_m[stations, None, None] ** 2 * np.eye(2)
+    expected = matrix @ common
+    before = tracks.covariance[stations, OFFSET, OFFSET]
+    learned = np.linalg.inv(before) - np.eye(2) / tracks.offset_m[stations, None, None] ** 2
+    after = np.linalg.inv(np.linalg.inv(prior) + learned)
+    offset = tracks.state[stations, OFFSET]
+    change = np.linalg.solve(before, offset[..., None]) + np.linalg.solve(prior, expected[..., None])
+    change = after @ change - offset[..., None]
+    gain = np.swapaxes(np.linalg.solve(before, tracks.covariance[stations, OFFSET, :4]), 1, 2)
+    state = tracks.state[stations, :4] + (gain @ change)[..., 0]
+    covariance = tracks.covariance[stations, :4, :4] - gain @ (before - after) @ np.swapaxes(gain, 1, 2)
+    return state, covariance, matrix, spread
+
+
+def _try_shifts(away: Floats, total: Floats, fits: Flags, effect: Floats, spread: Floats) -> tuple[Integers, Floats]:
+    """Assign stations to LiDAR tracks under each of several common shifts.
+
+    Args:
+        away: (L, S, 4) differences of places and velocities, LiDAR minus station.
+        total: (L, S, 4, 4) their covariances, without those of shift and turn.
+        fits: (L, S) whether the sizes allow that it is one vehicle.
+        effect: (S, 2, 3) effect of shift and turn on the offsets.
+        spread: (3, 3) covariance of shift and turn.
+
+    Returns:
+        (K, S) LiDAR track of each station, -1 for none, and the (K,) costs: the likeliest assignment under each of the
+        shifts, and the best of them without each of its pairs.
     """
     from scipy.optimize import linear_sum_assignment
 
     stations = away.shape[1]
-    shifts = np.concatenate((known_m[None], -away[..., :2].reshape(-1, 2)))
-    prior = ((shifts - known_m) ** 2).sum(1) / rest_m2
-    chosen = np.argsort(prior, kind="stable")[:MOST_SHIFTS]
-    shifts, cost = shifts[chosen], prior[chosen]
+    shifts = np.concatenate((np.zeros((1, 2)), -away[..., :2].reshape(-1, 2)))
+    shifts = shifts[np.argsort((shifts**2).sum(1), kind="stable")[:MOST_SHIFTS]]
     moved = np.broadcast_to(away, (len(shifts), *away.shape)).copy()
     moved[..., :2] += shifts[:, None, None]
-    distance = np.minimum(_square(moved, np.broadcast_to(total, (len(shifts), *total.shape))), UNSEEN)
+    turned = total.copy()
+    turned[..., :2, :2] += effect[..., 2:] @ np.swapaxes(effect[..., 2:], 1, 2) * spread[2, 2]
+    distance = np.minimum(_square(moved, np.broadcast_to(turned, (len(shifts), *total.shape))), UNSEEN)
+    distance[:, ~fits] = UNSEEN
     pairs = np.full((len(shifts), stations), -1)
     for number, square in enumerate(distance):
         rows, columns = linear_sum_assignment(square)
         good = square[rows, columns] < UNSEEN
         pairs[number, columns[good]] = rows[good]
-        cost[number] += square[rows[good], columns[good]].sum() + UNSEEN * (stations - good.sum())
-    return pairs, cost
+    precision = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    best = pairs[_weigh(pairs, away, precision, effect, spread).argmin()]
+    without = np.where(np.eye(stations, dtype=bool), -1, best)
+    pairs = np.concatenate((pairs, without))
+    return pairs, _weigh(pairs, away, precision, effect, spread)
+
+
+def _weigh(pairs: Integers, away: Floats, precision: Floats, effect: Floats, spread: Floats) -> Floats:
+    """Return the (K,) costs of K assignments: squared Mahalanobis distances under the shift and turn that fit best.
+
+    Those of shift and turn themselves are included; a station without a track costs UNSEEN.
+    """
+    assigned = pairs >= 0
+    columns = np.arange(pairs.shape[1])
+    off = away[pairs, columns] * assigned[..., None]  # (K, S, 4)
+    inverse = precision[pairs, columns] * assigned[..., None, None]
+    pull = (inverse @ off[..., None])[..., 0]
+    stiffness = np.einsum("sai,ksab,sbj->kij", effect, inverse[..., :2, :2], effect) + np.linalg.inv(spread)
+    total = np.einsum("sai,ksa->ki", effect, pull[..., :2])
+    gained = (total * np.linalg.solve(stiffness, total[..., None])[..., 0]).sum(1)
+    cost: Floats = (off * pull).sum((1, 2)) - gained + UNSEEN * (~assigned).sum(1)
+    return cost
 
 
 def find_contradicted(tracks: Tracks) -> Flags:
@@ -168,7 +224,7 @@ def merge_stations(tracks: Tracks, pairs: Integers) -> Tracks:
     lidar, station = pairs.T
     diagonal = np.arange(len(lidar))
     tracks.state[lidar, POSITION] += compute_size_shift(tracks, lidar, station)[diagonal, diagonal]
-    for name in ("vehicle_id", "offset_m", "steering_angle_deg", "sized", "message_s", "heard"):
+    for name in ("vehicle_id", "offset_m", "own_m", "steering_angle_deg", "sized", "message_s", "heard"):
         getattr(tracks, name)[lidar] = getattr(tracks, name)[station]
     own = tracks.size_m[station]
     tracks.size_m[lidar] = np.where(np.isnan(own), tracks.size_m[lidar], own)

@@ -41,8 +41,9 @@ class Measured:
     """(M, 2, 2) covariance of `centre_m`: range noise, spacing of the beams, unknown size and side."""
     cluster: Integers
     """(M,) number of the cluster that its returns are from; the one with most of them where there are several."""
-    side: Integers
-    """(M,) index of SIDES: the side of the vehicle that most tells the position."""
+    lean: Floats
+    """(M,) by how much the centre moves ahead per half metre that the vehicle is longer: 1 where the rear is exact and
+    the front follows from the length, -1 where the front is exact, 0 where both are."""
     size_m: Floats
     """(M, 2) length and width that the centre was computed with: as predicted, else as seen, else usual ones."""
 

@@ -39,10 +39,12 @@ from tracklake.pipeline.transforms.onboard.measurements import (
 from tracklake.pipeline.transforms.onboard.relative import RelativeMessages, place_messages
 from tracklake.pipeline.transforms.onboard.track_tables import TickLog, write_tables
 from tracklake.pipeline.transforms.onboard.tracks import (
+    OWN_SHARE,
     SLOW_MPS,
     TENTATIVE,
     Tracks,
     compute_offset_m,
+    lengthen,
     make_no_tracks,
     make_tracks,
     start_from_lidar,
@@ -179,7 +181,9 @@ class Tracker:
                 fresh.accuracy_m, np.hypot(*fresh.centre_m.T), float(self._ego.heading_sigma_rad[tick])
             )
             state, covariance = start_from_messages(fresh, place_m[new], yaw, offset_m)
-            self._add(make_tracks(self._number(len(offset_m)), fresh.vehicle_id, state, covariance, offset_m))
+            heard = make_tracks(self._number(len(offset_m)), fresh.vehicle_id, state, covariance, offset_m)
+            heard.own_m = OWN_SHARE * fresh.accuracy_m
+            self._add(heard)
         tracks = self._tracks
         order = np.argsort(tracks.vehicle_id, kind="stable")
         rows = order[np.searchsorted(tracks.vehicle_id, messages.vehicle_id, sorter=order)]
@@ -211,9 +215,13 @@ class Tracker:
         covariance_m2 = turn_covariance(measured.covariance_m2, yaw)
         known = np.flatnonzero(measured.row >= 0)
         rows = asked[measured.row[known]]
-        update_by_places(tracks, rows, place_m[known] + tracks.state[rows, VELOCITY] * back_s, covariance_m2[known])
+        tracks.seen[rows], tracks.lean[rows] = tick, measured.lean[known]
+        before_m = tracks.size_m[rows, 0]
         self._note_sizes(rows, measured, known, found.clusters)
-        tracks.seen[rows], tracks.side[rows] = tick, measured.side[known]
+        length_m = tracks.size_m[rows, 0]  # of the boxes whose centres are in the state, and now what is measured
+        tracks.state[rows, POSITION] += lengthen(tracks, rows, np.nan_to_num(length_m - before_m))
+        place_m[known] += lengthen(tracks, rows, length_m - measured.size_m[known, 0])
+        update_by_places(tracks, rows, place_m[known] + tracks.state[rows, VELOCITY] * back_s, covariance_m2[known])
         tracks.hits[rows] += 1
         log.note_clusters(tracks.chain[rows], {name: values[known] for name, values in found.association.items()})
         new = np.flatnonzero(measured.row < 0)
@@ -222,7 +230,7 @@ class Tracker:
         state, covariance = start_from_lidar(place_m[new] + velocity * back_s, covariance_m2[new], velocity, yaw)
         offset_m = np.sqrt(covariance[:, 6, 6])
         born = make_tracks(self._number(len(new)), np.full(len(new), TENTATIVE), state, covariance, offset_m)
-        born.seen[:], born.scans[:], born.hits[:], born.side[:] = tick, 1, 1, measured.side[new]
+        born.seen[:], born.scans[:], born.hits[:], born.lean[:] = tick, 1, 1, measured.lean[new]
         self._add(born)
         tracks = self._tracks
         self._note_sizes(np.arange(len(tracks.chain) - len(new), len(tracks.chain)), measured, new, found.clusters)
@@ -280,7 +288,9 @@ class Tracker:
         if tick % TICKS_PER_MERGE_CHECK:
             return
         recent = (tracks.heard >= 0) & (tick - tracks.heard <= TICK_RATE_HZ)
-        rows, stations = match_stations(tracks, recent).T
+        rows, stations = match_stations(
+            tracks, recent, self._ego.odometry_m[tick], float(self._ego.heading_sigma_rad[tick])
+        ).T
         rivalry = np.zeros_like(tracks.rivalry)
         rivalry[rows] = np.where(tracks.rival[rows] == tracks.vehicle_id[stations], tracks.rivalry[rows] + 1, 1)
         tracks.rivalry = rivalry

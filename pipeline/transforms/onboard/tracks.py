@@ -50,6 +50,7 @@ class Tracks:
         vehicle_id: (V,) station, id from FIRST_LIDAR_ID on, or TENTATIVE.
         state: (V, 9) with covariance (V, 9, 9).
         offset_m: (V,) standard deviation of the offset of messages.
+        own_m: (V,) standard deviation of the part of it that is due to the vehicle's own receiver.
         heading_rad: (V,) in the frame of odometry; the last one holds at a standstill.
         size_m: (V, 3) length, width and height; NaN unknown.
         sized: (V,) whether length and width came in messages.
@@ -57,7 +58,7 @@ class Tracks:
         heard: (V,) tick of its last message; -1 none yet.
         seen: (V,) last tick at which LiDAR measured it; -1 never.
         scans: (V,) LiDAR scans since its birth, and the hits among them.
-        side: (V,) index of SIDES that LiDAR saw last; -1 none.
+        lean: (V,) by how much the centre moves ahead per half metre that the vehicle is longer, by its last LiDAR hit.
         rival: (V,) station that a LiDAR track is taken for, and how often in a row.
         strikes: (V,) messages in a row that contradict the state.
     """
@@ -67,6 +68,7 @@ class Tracks:
     state: Floats
     covariance: Floats
     offset_m: Floats
+    own_m: Floats
     heading_rad: Floats
     steering_angle_deg: Floats
     size_m: Floats
@@ -78,7 +80,7 @@ class Tracks:
     hits: Integers
     rival: Integers
     rivalry: Integers
-    side: Integers
+    lean: Floats
     strikes: Integers
 
     def take(self, rows: Integers | Flags) -> "Tracks":
@@ -101,6 +103,7 @@ def make_tracks(chain: Integers, vehicle_id: Integers, state: Floats, covariance
         state=state,
         covariance=covariance,
         offset_m=offset_m,
+        own_m=np.full(count, OWN_SHARE * USUAL_ACCURACY_M),
         heading_rad=np.arctan2(state[:, 3], state[:, 2]),
         steering_angle_deg=np.full(count, np.nan),
         size_m=np.full((count, 3), np.nan),
@@ -112,7 +115,7 @@ def make_tracks(chain: Integers, vehicle_id: Integers, state: Floats, covariance
         hits=np.zeros(count, dtype=np.int64),
         rival=never.copy(),
         rivalry=np.zeros(count, dtype=np.int64),
-        side=never.copy(),
+        lean=np.zeros(count),
         strikes=np.zeros(count, dtype=np.int64),
     )
 
@@ -232,6 +235,13 @@ def update_by_places(tracks: Tracks, rows: Integers, place_m: Floats, covariance
     tracks.state[rows], tracks.covariance[rows], _ = update(
         tracks.state[rows], tracks.covariance[rows], place_m, observation, covariance_m2, limit=OUTLIER_CLUSTER
     )
+
+
+def lengthen(tracks: Tracks, rows: Integers, longer_m: Floats) -> Floats:
+    """Return by how much (..., N, 2) the centres of the tracks `rows` move, in m, if they are longer by (..., N)."""
+    heading = tracks.heading_rad[rows]
+    shift: Floats = (tracks.lean[rows] * longer_m / 2)[..., None] * np.stack((np.cos(heading), np.sin(heading)), -1)
+    return shift
 
 
 def update_by_camera(

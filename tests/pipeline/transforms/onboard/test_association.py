@@ -33,10 +33,11 @@ def predict(boxes: list[CarBox], error_m: Floats | float = 0.0, sd_m: float = 1.
 def measure_one(box: CarBox, *, sends: bool = True, seed: int = 0, error_m: float = 0.0) -> tuple[Floats, Floats, str]:
     """Measure one vehicle alone: the error of its centre, the standard deviations, and the side."""
     points, _ = cast_rays([box], noise_m=NOISE_M, seed=seed)
-    measured = measure_by_lidar(points, predict([box], error_m, sends=sends)).measured
+    found = measure_by_lidar(points, predict([box], error_m, sends=sends))
+    measured = found.measured
     assert measured.row.tolist() == [0]
     error = measured.centre_m[0] - (box.x_m, box.y_m)
-    return error, np.sqrt(np.diagonal(measured.covariance_m2[0])), SIDES[measured.side[0]]
+    return error, np.sqrt(np.diagonal(measured.covariance_m2[0])), SIDES[found.association["side"][0]]
 
 
 @pytest.mark.parametrize("distance_m", [20.0, 50.0, 80.0])
@@ -114,6 +115,54 @@ def test_what_cannot_be_a_vehicle_is_a_cluster_and_no_measurement() -> None:
     found = measure_by_lidar(np.vstack([points, [[15.0, -3.0, 1.0]]]), predict([]))
     assert found.measured.row.size == 0
     assert found.clusters["cluster"].size >= 4
+
+
+def test_truck_of_unknown_length_leaves_the_returns_of_the_car_behind_it() -> None:
+    """Only the front of the truck is uncertain: it takes no returns before its rear, 3 m ahead of a car's front."""
+    boxes = [CarBox(25.0, -3.75), truck(37.0, -3.7)]
+    points, hit = cast_rays(boxes, noise_m=NOISE_M)
+    guess = predict(boxes, 0.2, 0.5)
+    guess.vehicle_id[1], guess.size_m[1] = FIRST_LIDAR_ID, np.nan
+    found = measure_by_lidar(points, guess)
+    assert found.measured.row.tolist() == [0, 1]
+    returns = found.clusters["returns"][found.measured.cluster]
+    assert returns.tolist() == np.bincount(hit).tolist()
+
+
+@pytest.mark.parametrize(("box", "lean"), [(truck(50.0, 0.0), 1.0), (truck(-50.0, 0.0), -1.0)])
+def test_centre_leans_on_the_end_that_is_seen(box: CarBox, lean: float) -> None:
+    """A longer truck whose rear is seen has its centre farther ahead, one whose front is seen farther back."""
+    points, _ = cast_rays([box], noise_m=NOISE_M)
+    measured = measure_by_lidar(points, predict([box], sends=False)).measured
+    assert measured.lean[0] == pytest.approx(lean, abs=0.01)
+    end = measured.centre_m[0, 0] - lean * measured.size_m[0, 0] / 2
+    assert end == pytest.approx(box.x_m - lean * box.length_m / 2, abs=0.15)
+
+
+def test_strip_of_a_rear_that_a_truck_leaves_free_tells_where_the_rear_is() -> None:
+    """Two returns are 0.2 m apart across and as deep; on the car's side, beams that far apart would be 5 m apart."""
+    boxes = [CarBox(66.0, -3.6), truck(30.0, -3.0)]
+    points, hit = cast_rays(boxes, noise_m=NOISE_M)
+    rear = (hit == 0) & (points[:, 0] < 64.0)
+    assert rear.sum() == 2
+    assert 0.1 < np.ptp(points[rear, 1]) < 0.3
+    found = measure_by_lidar(points[rear | (hit == 1)], predict(boxes, 0.5)).measured
+    assert found.row.tolist() == [0, 1]
+    assert abs(found.centre_m[0, 0] - 66.0) < 0.3
+
+
+def test_certain_vehicle_keeps_its_returns_from_an_uncertain_one_in_its_cluster() -> None:
+    """Two trucks in the next lanes, 0.7 m between them, give one cluster; of one, neither length nor place is known."""
+    boxes = [truck(-49.2, 3.6), truck(-49.4, 0.38)]
+    points, _ = cast_rays(boxes, noise_m=NOISE_M)
+    guess = predict(boxes, 0.0, 0.15)
+    guess.vehicle_id[1], guess.size_m[1], guess.covariance_m2[1] = FIRST_LIDAR_ID, np.nan, np.diag([14.0, 0.3])
+    guess.centre_m[1] += (-0.6, -0.02)
+    found = measure_by_lidar(points, guess)
+    own = found.clusters["least_y_m"][found.measured.cluster[found.measured.row == 0]]
+    assert own.min() > 2.0
+    other = found.clusters["most_y_m"][found.measured.cluster[found.measured.row == 1]]
+    assert other.max() < 2.0
 
 
 def test_two_cars_in_one_cluster_are_parted() -> None:

@@ -17,11 +17,11 @@ from tracklake.schemas.perception import FIRST_LIDAR_ID
 SMOOTHED = ("smoothed_x_m", "smoothed_y_m")
 
 
-def fuse(scene, *, lidar=True, silent=(), keep=None, **options):
+def fuse(scene, *, lidar=True, silent=(), keep=None, measure=measure_centres, **options):
     bsm, states = scene.make_messages(**options)
     bsm = bsm.filter(~pl.col("vehicle_id").is_in(list(silent)))
     bsm = bsm if keep is None else bsm.filter(keep)
-    sensors = Sensors(scans=scene.scan(), measure=measure_centres) if lidar else Sensors()
+    sensors = Sensors(scans=scene.scan(), measure=measure) if lidar else Sensors()
     return fuse_drive(bsm, states, scene.ticks, sensors)
 
 
@@ -142,8 +142,43 @@ def test_second_lidar_track_upon_a_station_is_no_hidden_neighbor(place_m, matche
     covariance[1, [0, 1], [0, 1]] = 4.0
     tracks = make_tracks(np.arange(3), np.array([1, 2, FIRST_LIDAR_ID]), state, covariance, np.full(3, 2.0))
     tracks.size_m[:2, :2] = 4.5, 1.8
-    found = match_stations(tracks, np.array([True, True, False]))
+    found = match_stations(tracks, np.array([True, True, False]), np.zeros(2), 0.02)
     assert found.tolist() == ([[2, 1]] if matches else [])
+
+
+@pytest.mark.parametrize(
+    ("height_m", "width_m", "matches"), [(1.5, 1.85, True), (2.9, 1.85, False), (2.9, 2.0, True), (2.9, 2.5, True)]
+)
+def test_truck_that_lidar_sees_is_no_station_that_sends_the_width_of_a_car(height_m, width_m, matches):
+    """A hidden car's messages fit the truck beside it; a van is as tall, and 2.0 m wide."""
+    state = np.zeros((2, 9))
+    state[:, :2], state[:, 2] = [(-59, 0), (-60, 2)], 25
+    covariance = np.tile(np.diag([0.01] * 2 + [0.25] * 5 + [4.0] * 2), (2, 1, 1))
+    covariance[0, [0, 1], [0, 1]] = 4.0
+    tracks = make_tracks(np.arange(2), np.array([1, FIRST_LIDAR_ID]), state, covariance, np.full(2, 2.0))
+    tracks.size_m[0, :2], tracks.size_m[1] = (4.8, width_m), (4.8, 1.85, height_m)
+    found = match_stations(tracks, np.array([True, False]), np.zeros(2), 0.02)
+    assert found.tolist() == ([[1, 0]] if matches else [])
+
+
+def test_rear_of_a_truck_stands_still_while_its_length_is_found():
+    """The front is hidden in three of four scans: 12 m (usual) or 16 m (true) are measured from the same rear."""
+    scene = drive([0, 38], [0, 0], [20, 20], seconds=6)
+    turns = iter(range(60))
+
+    def measure(points, predicted):
+        found = measure_centres(points, predicted)
+        length_m = 16.0 if next(turns) % 4 == 3 else 12.0
+        found.measured.lean[:] = 1.0
+        found.measured.size_m[:] = length_m, 2.5
+        found.measured.centre_m[:, 0] += length_m / 2 - 8.0
+        found.measured.covariance_m2[:, 0, 0] = (0.1 if length_m == 16.0 else 2.0) ** 2
+        return found
+
+    rows = fuse(scene, silent=(1,), measure=measure).tables[SURROUNDING]
+    rear_m = (rows["rel_x_m"] - rows["box_length_m"] / 2).to_numpy()
+    assert rows["vehicle_id"].n_unique() == 1
+    assert np.abs(rear_m - 30.0).max() < 0.5
 
 
 def test_lane_change_and_overtaking_keep_their_vehicles():
