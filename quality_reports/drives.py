@@ -79,7 +79,11 @@ def read_drive(connection: Connection, drive: str) -> DriveRows:
 
 
 def collect_drives(
-    connection: Connection, scores: Sequence[Mapping[str, Any]] = (), published: Sequence[Mapping[str, Any]] = ()
+    connection: Connection,
+    scores: Sequence[Mapping[str, Any]] = (),
+    published: Sequence[Mapping[str, Any]] = (),
+    *,
+    only: str | None = None,
 ) -> Drives | None:
     """Gather the report's numbers about drives; None where the lake holds none.
 
@@ -87,8 +91,9 @@ def collect_drives(
         connection: connection to a lake.
         scores: runs on drives: model, rows of one horizon each, warnings.
         published: rows of published figures, shown beside scores.
+        only: name of the drive whose errors and losses are wanted; None: of all.
     """
-    facts = query(connection, "drives")
+    facts = [row for row in query(connection, "drives") if only in (None, row["drive"])]
     if not facts:
         return None
     units = {rule.name: rule.unit for rule in DRIVE_RULES}

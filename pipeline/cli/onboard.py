@@ -23,7 +23,7 @@ from tracklake.schemas.files import write_file
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.protocols import V2V
 from tracklake.training.onboard.collisions import score_warnings
-from tracklake.training.onboard.maneuvers import ManeuverForest, fit_forest
+from tracklake.training.onboard.maneuvers import CORRELATED, ManeuverForest, fit_forest
 from tracklake.training.onboard.models import CTRV, MODELS, NETWORKS, Forecaster, find_network
 from tracklake.training.onboard.samples import Parts, build_samples, split_samples
 from tracklake.training.onboard.scores import count_confusion, learn_curve, list_published, score_forest, score_model
@@ -120,6 +120,7 @@ def evaluate(
             "maneuvers": [asdict(row) for row in score_forest(forest, parts.eval)] if forest else [],
             "examples": forest.examples if forest else 0,
             "correlations": [asdict(row) for row in forest.coefficients] if forest else [],
+            "correlation_matrix": {"names": CORRELATED, "values": forest.matrix.round(4).tolist()} if forest else {},
             "confusion": cells,
             "learning_curve": [asdict(row) for row in learn_curve(parts, 0)] if learning_curve and forest else [],
         }

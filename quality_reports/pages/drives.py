@@ -30,7 +30,7 @@ def render_drive(
         provenance: facts that the page shows; see `quality_reports.summaries.collect`.
         thresholds: thresholds that the drive's findings used, where they are no defaults.
     """
-    collected = collect_drives(connection)
+    collected = collect_drives(connection, only=drive)
     assert collected is not None
     figures = select_drive(collected, drive)
     (facts,) = figures["drives"]

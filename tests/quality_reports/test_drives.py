@@ -17,6 +17,11 @@ def collected(opened):
     return collect_drives(opened)
 
 
+def test_figures_of_one_drive_are_those_among_all(opened, collected):
+    assert collect_drives(opened, only="drive-1") == collected
+    assert collect_drives(opened, only="drive-2") is None
+
+
 def test_a_lake_without_drives_has_no_figures_of_them(open_lake):
     assert collect_drives(open_lake()) is None
 

@@ -191,7 +191,7 @@ def choose_features(
         All candidates from the strongest to the weakest, equally strong ones in the order of `names`.
     """
     codes = np.arange(len(LATERAL_MANEUVERS))
-    values, classes = _standardise_columns(feature), _standardise_columns(maneuver[:, None] == codes)
+    values, classes = standardise_columns(feature), standardise_columns(maneuver[:, None] == codes)
     coefficient, between = np.clip(values.T @ classes, -1, 1), np.minimum(np.abs(values.T @ values), 1)
     strength = np.abs(coefficient).max(axis=1)
     chosen: list[int] = []
@@ -209,7 +209,7 @@ def choose_features(
     return table
 
 
-def _standardise_columns(numbers: npt.NDArray[Any]) -> Floats:
+def standardise_columns(numbers: npt.NDArray[Any]) -> Floats:
     """Scale columns (B, P) to mean 0 and length 1; columns that do not vary become zeros."""
     columns = numbers.astype(np.float64)
     if not len(columns):

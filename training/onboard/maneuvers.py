@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from tracklake.schemas.arrays import Bytes, Integers, Singles
+from tracklake.schemas.arrays import Bytes, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import V2V
 from tracklake.training.lane_changes.cells import Codes, find_columns, find_rows, measure_rows
 from tracklake.training.lane_changes.examples import KEEP, LEFT, RIGHT, draw_balanced
-from tracklake.training.lane_changes.features import Coefficient, choose_features
+from tracklake.training.lane_changes.features import Coefficient, choose_features, standardise_columns
 from tracklake.training.onboard.models import predict_straight
 from tracklake.training.onboard.samples import FEATURE_NUMBER, FEATURES, Samples, augment_samples
 
 NAMES = (*FEATURES, *(f"change of {name}" for name in FEATURES))
 """Descriptions of a sample: each feature now, and now minus at the history's beginning."""
+CORRELATED = (*NAMES, *LATERAL_MANEUVERS)
+"""Rows and columns of the correlation matrix."""
 TREES, LEAF = 100, 5
 """Number of trees, and least number of examples in a leaf."""
 MOST_EXAMPLES = 10_000
@@ -36,12 +38,14 @@ AT = np.array(V2V.scored_ticks) - 1
 class ManeuverForest:
     """Forest with 1 + T outputs, the maneuver within the horizon and the column at each scored tick.
 
-    `chosen` are positions in NAMES, `coefficients` those of all features with the maneuvers on the training part.
+    `chosen` are positions in NAMES, `coefficients` those of all features with the maneuvers on the training part, and
+    `matrix` those of all of CORRELATED with each other.
     """
 
     classifier: Any  # scikit-learn's RandomForestClassifier, whose import takes a second
     chosen: Integers
     coefficients: list[Coefficient]
+    matrix: Floats
     examples: int
 
     def count_votes(self, samples: Samples) -> Integers:
@@ -72,6 +76,14 @@ def correlate_features(samples: Samples) -> list[Coefficient]:
     return choose_features(described, samples.maneuver, least=LEAST_CORRELATION, most=MOST_CORRELATION, names=NAMES)
 
 
+def correlate_pairs(samples: Samples) -> Floats:
+    """Correlate all descriptions and maneuvers with each other: (27, 27), as CORRELATED; 0 where one does not vary."""
+    maneuvers = samples.maneuver[:, None] == np.arange(len(LATERAL_MANEUVERS))
+    values = standardise_columns(np.column_stack([describe_samples(samples), maneuvers]))
+    matrix: Floats = np.clip(values.T @ values, -1, 1)
+    return matrix
+
+
 def fit_forest(samples: Samples, seed: int, examples: int = MOST_EXAMPLES) -> ManeuverForest:
     """Fit a forest on samples of the training part: drawn evenly from the four groups, mirrored and shifted.
 
@@ -98,7 +110,7 @@ def fit_forest(samples: Samples, seed: int, examples: int = MOST_EXAMPLES) -> Ma
         n_estimators=TREES, criterion="entropy", min_samples_leaf=LEAF, random_state=seed, n_jobs=1
     )
     classifier.fit(describe_samples(larger)[:, chosen], np.column_stack([larger.maneuver, ahead]))
-    return ManeuverForest(classifier, chosen, table, len(drawn))
+    return ManeuverForest(classifier, chosen, table, correlate_pairs(drawn), len(drawn))
 
 
 def find_cells(samples: Samples, place_m: Singles) -> Codes:

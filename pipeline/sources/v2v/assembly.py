@@ -21,7 +21,12 @@ RATE_HZ = 10
 """Messages that a vehicle sends in a second."""
 COUNTS = 128
 """Numbers of the counter, after which it starts again."""
+MAX_SILENCE_US = 86_400_000_000
+"""Silence of a log in microseconds, a day, beyond which a few messages alone have a wrong time."""
+FEW_MESSAGES = 10
+"""Number of messages, of a second of one vehicle, below which they are no drive of their own."""
 UNDATED, REPEATED, SAME_MOMENT = "no date", "duplicate message", "another message of the sender has this moment"
+FAR = "a day or more from the other messages of the drive"
 """Reasons to drop a message."""
 
 
@@ -53,9 +58,9 @@ def date_messages(messages: pl.DataFrame) -> pl.DataFrame:
         messages: rows of MESSAGE_SCHEMA and FILE, of one receiver.
 
     Returns:
-        the same rows with SENDER, its number `sent_by`, `is_repeated`, `clock_step_us` and `is_timed` (whether the
-        sender's clock tells when a message was generated). `utc_us` is that moment, less the clock's steps against the
-        receiver's, else the moment of reception; null where nothing tells.
+        the same rows with SENDER, its number `sent_by`, `is_repeated`, `is_far` (whether its time must be wrong),
+        `clock_step_us` and `is_timed` (whether the sender's clock tells when a message was generated). `utc_us` is that
+        moment, less the clock's steps against the receiver's, else the moment of reception; null where nothing tells.
     """
     messages = _find_devices(messages)
     dated = messages.with_columns(
@@ -69,11 +74,24 @@ def date_messages(messages: pl.DataFrame) -> pl.DataFrame:
     dated = dated.with_columns(_find_repeated(dated))
     comparable = dated.filter("is_timed", ~pl.col("is_repeated"), ~pl.col("own"), pl.col("received_us").is_not_null())
     stepped = find_clock_steps(comparable.select("row", "sent_by", "utc_us", "received_us", FILE, LINE))
-    return (
-        dated.join(stepped.select("row", "clock_step_us", moved_us="utc_us"), on="row", how="left")
-        .with_columns(pl.coalesce("moved_us", "utc_us").alias("utc_us"))
-        .drop("moved_us", "row")
+    moved = dated.join(stepped.select("row", "clock_step_us", moved_us="utc_us"), on="row", how="left").with_columns(
+        pl.coalesce("moved_us", "utc_us").alias("utc_us")
     )
+    return moved.with_columns(_find_far(moved)).drop("moved_us", "row")
+
+
+def _find_far(moved: pl.DataFrame) -> pl.Series:
+    """Mark messages, a few together, that a silence of a day or more parts from the others: their time is wrong.
+
+    One of them would stretch the drive over years. Logs of several days, each with more messages, are left as they are.
+    """
+    moment = pl.col("utc_us")
+    ordered = moved.select("row", "utc_us").drop_nulls().sort("utc_us")
+    size = pl.len().over((moment.diff() >= MAX_SILENCE_US).fill_null(value=False).cum_sum())
+    far = ordered.with_columns(size=size).filter(
+        pl.col("size") < FEW_MESSAGES, pl.col("size").max() >= FEW_MESSAGES
+    )  # fmt: skip
+    return moved["row"].is_in(far["row"].implode()).alias("is_far")
 
 
 def _find_devices(messages: pl.DataFrame) -> pl.DataFrame:
@@ -119,7 +137,8 @@ def assemble_messages(messages: pl.DataFrame, start_us: int, impossible: pl.Data
         start_us: the drive's start, in microseconds since 1970; no later than the least `utc_us` and `received_us`.
         impossible: senders of messages that the readers refused (SENDER_SCHEMA), to be counted by vehicle.
     """
-    dropped = pl.when(pl.col("utc_us").is_null()).then(pl.lit(UNDATED)).when("is_repeated").then(pl.lit(REPEATED))
+    reasons = {UNDATED: pl.col("utc_us").is_null(), FAR: pl.col("is_far"), REPEATED: pl.col("is_repeated")}
+    dropped = pl.coalesce(pl.when(applies).then(pl.lit(reason)) for reason, applies in reasons.items())
     ordered = messages.with_columns(dropped.alias("reason")).sort("reason", "sent_by", "utc_us", FILE, LINE)
     same = [pl.col(name).eq_missing(pl.col(name).shift(1)) for name in ("reason", "sent_by", "utc_us")]
     ordered = ordered.with_columns(
@@ -196,9 +215,7 @@ def _count_lost() -> pl.Expr:
 
 def _count_dropped(dropped: pl.DataFrame, impossible: pl.DataFrame | None, vehicles: pl.DataFrame) -> pl.DataFrame:
     """Count dropped messages by vehicle: `duplicates` and `invalid`; senders of no kept message count nowhere."""
-    repeated = dropped.filter(pl.col("reason") != UNDATED).select(SENDER, invalid=pl.lit(value=False))
-    undated = dropped.filter(pl.col("reason") == UNDATED).select(SENDER, invalid=pl.lit(value=True))
-    parts = [repeated, undated]
+    parts = [dropped.select(*SENDER, invalid=pl.col("reason").is_in([UNDATED, FAR]))]
     if impossible is not None:
         parts.append(impossible.select(*_name_senders(), invalid=pl.lit(value=True)))
     found = pl.concat(parts).join(vehicles, on=SENDER, nulls_equal=True)

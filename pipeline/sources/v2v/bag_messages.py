@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from tracklake.pipeline.sources.v2v.bag_definitions import DETECTION_ARRAY, LAYOUTS, name_layout
 from tracklake.pipeline.sources.v2v.bag_records import Record, RosMessage, decode
 from tracklake.pipeline.sources.v2v.mounts import make_rotation, read_transforms
+from tracklake.pipeline.sources.v2v.pilot_json import recognise_pilot_json
 from tracklake.pipeline.sources.v2v.point_clouds import POINT_CLOUD, read_points
 
 MAX_STAMP_ERROR_US = 60_000_000
@@ -17,8 +18,8 @@ LATITUDES, LONGITUDES = (-84.0, 80.0), (-180.0, 180.0)
 """Bounds of positions in degrees, as for messages."""
 UNKNOWN = -1.0
 """First element of a covariance in sensor_msgs/Imu that says the quantity was not measured."""
-V2V_TEXT = re.compile(r"\s*(\{.*(coreData|BSMcoreData|BSM)\b|[0-9A-Fa-f\s]*0014[0-9A-Fa-f\s]+$)", re.DOTALL)
-"""Texts that are passed on as V2V messages: JSON with the core of one, or hex."""
+JSON_CORE, HEX_DIGITS = re.compile(r"(coreData|BSMcoreData|BSM)\b"), re.compile(r"[0-9A-Fa-f\s]+")
+"""Patterns of what JSON with a V2V message contains, and of hex digits; no text takes them more than linear time."""
 ORIGIN_TOPIC, ORIGIN_WORD = "/tracklake/origin", "synthetic"
 """Topic of the message that marks a generated bag, and the first word of its text."""
 
@@ -151,8 +152,12 @@ def _read_transforms(message: RosMessage, record: Record) -> list[Item]:
 def _read_text(message: RosMessage, record: Record) -> list[Item]:
     if record.topic == ORIGIN_TOPIC:
         return [Item("origin", record.bag_us, (message.data.startswith(ORIGIN_WORD),))]
-    text = message.data if isinstance(message.data, str) else bytes(message.data).hex()
-    return [Item("text", record.bag_us, (" ".join(text.split()),))] if V2V_TEXT.match(text) else []
+    text = (message.data if isinstance(message.data, str) else bytes(message.data).hex()).strip()
+    if text.startswith("{"):
+        is_message = JSON_CORE.search(text) is not None or recognise_pilot_json(text.encode())
+    else:
+        is_message = "0014" in text and HEX_DIGITS.fullmatch(text) is not None
+    return [Item("text", record.bag_us, (" ".join(text.split()),))] if is_message else []
 
 
 def _read_cloud(message: RosMessage, record: Record) -> list[Item]:

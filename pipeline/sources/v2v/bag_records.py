@@ -38,7 +38,7 @@ MAX_METADATA_BYTES = 1 << 22
 ADVICE = {
     ROS1_MAGIC: "`rosbag reindex FILE` keeps what is whole of a bag that was cut short; else copy it again",
     MCAP_MAGIC: "`mcap recover FILE -o WHOLE.mcap` keeps what is whole of one that was cut short; else copy it again",
-    SQLITE_MAGIC: "`sqlite3 FILE .recover` keeps what is whole of one that was cut short; else copy it again",
+    SQLITE_MAGIC: "`sqlite3 FILE .recover | sqlite3 WHOLE.db3` keeps what is whole of it; else copy it again",
 }
 """What to do about a damaged bag, by the first bytes of its file."""
 

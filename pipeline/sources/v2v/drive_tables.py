@@ -83,7 +83,8 @@ _STATES = [name for name in EGO_STATES.dtypes if name not in ("dataset", "subset
 
 def _find_start(messages: pl.DataFrame, bag: BagContents | None, logs: Logs, recording: str) -> int:
     """Return the least moment that a drive's files state, in microseconds since 1970."""
-    moments = [*messages.select(pl.col("utc_us", "received_us").min()).row(0), *(each.start_us for each in logs.truths)]
+    least = messages.filter(~pl.col("is_far")).select(pl.col("utc_us", "received_us").min())
+    moments = [*least.row(0), *(each.start_us for each in logs.truths)]
     known = [moment for moment in moments if moment is not None] + (_list_moments(bag) if bag is not None else [])
     if not known:
         raise SourceError(

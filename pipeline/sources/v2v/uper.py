@@ -55,10 +55,12 @@ CORE_OCTETS = -(-(SKIPPED_BITS + sum(width for _, width, _ in CORE_DATA)) // 8)
 """Octets that the core data and the bits before them fill."""
 MESSAGE_ID = 0x14
 """Number of a basic safety message among the messages of J2735."""
-LINE_PATTERN = r"^\s*(?:([^,;\s]+)\s*[,;\s]\s*)?(?:0[xX])?([0-9A-Fa-f]+)\s*$"
-"""Pattern of a line of a plain log: a time, if any, and hex digits."""
+LINE_PATTERN = r"^\s*(?:([^,;\s]+)(?:\s*[,;]\s*|\s+))?(?:0[xX])?([0-9A-Fa-f]+)\s*$"
+"""Pattern of a line of a plain log: a time, if any, and hex digits. No text takes it more than linear time."""
 HEADER_PATTERN = re.compile(r"^[A-Za-z_ ]+([,;][A-Za-z_ ]+)?$")
 """Pattern of a first line that names the columns of a plain log."""
+RECOGNISED_LINES = 100
+"""First lines of a file of which one must be a basic safety message."""
 PARSING_THREADS = 2
 """Chunks of lines that are decoded at once."""
 
@@ -155,11 +157,16 @@ def _unpack(core: Bytes) -> dict[str, pl.Series]:
 
 
 def recognise_hex(head: bytes) -> bool:
-    """Recognise a plain log by a basic safety message in its first line, or the second under a header."""
-    lines = head.removeprefix(BOM).decode("utf-8", errors="replace").splitlines()[:2]
-    first = next((line for line in lines if not HEADER_PATTERN.match(line.strip())), "")
-    match = re.match(LINE_PATTERN, first)
-    return match is not None and decode_hex(pl.Series([match.group(2)]))["reason"].is_null().all()
+    """Recognise a plain log by hex digits in its first line, or the second under a header, and a message near it.
+
+    Other messages of J2735 may come before the first basic safety message.
+    """
+    lines = head.removeprefix(BOM).decode("utf-8", errors="replace").splitlines()[:RECOGNISED_LINES]
+    if lines and HEADER_PATTERN.match(lines[0].strip()):
+        del lines[0]
+    if not lines or not re.match(LINE_PATTERN, lines[0]):
+        return False
+    return decode_hex(pl.Series(lines).str.extract(LINE_PATTERN, 2))["reason"].is_null().any()
 
 
 def read_hex(file: RawFile) -> RawMessages:

@@ -55,8 +55,23 @@ class Transmissions:
 
 
 def draw_connected(random: np.random.Generator, vehicle_id: Integers, penetration: float) -> Flags:
-    """Draw which vehicles send messages; at a higher penetration the same ones do, and further ones."""
-    return random.random(int(vehicle_id.max(initial=0)) + 1)[vehicle_id] < penetration
+    """Draw which vehicles send messages; at a higher penetration the same ones do, and further ones.
+
+    A vehicle has the draw of its id's number, so that who else is near changes nothing.
+
+    Args:
+        random: generator by PCG64, at its start.
+        vehicle_id: (V,) ids, rising.
+        penetration: share of the vehicles that send.
+    """
+    draws, skipped = random.bit_generator, np.diff(vehicle_id, prepend=-1) - 1
+    assert isinstance(draws, np.random.PCG64)
+    drawn = np.empty(len(vehicle_id))
+    for vehicle, count in enumerate(skipped.tolist()):  # an array up to the greatest id could take gigabytes
+        draws.advance(count)
+        drawn[vehicle] = random.random()
+    connected: Flags = drawn < penetration
+    return connected
 
 
 def draw_transmissions(

@@ -70,6 +70,10 @@ def test_what_a_program_reads(root):
         for seconds in (0.5, 1.0, 1.5, 2.0)
     }
     assert len(record["correlations"]) == 24
+    names, values = record["correlation_matrix"].values()
+    assert names[-3:] == ["keep", "left", "right"]
+    place = names.index("rel_x_m")
+    assert (len(values), values[place][place]) == (len(names), 1)
     assert record["synthetic_drives"] is True
     for horizons in record["confusion"].values():
         assert [sum(map(sum, cells)) for cells in horizons] == [record["samples"]["eval"]] * 4

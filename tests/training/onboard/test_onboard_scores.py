@@ -10,7 +10,7 @@ from scipy.stats import norm
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.lane_changes.examples import ALL, STRATA
 from tracklake.training.onboard.collisions import compare_overlaps, find_overlaps, score_warnings
-from tracklake.training.onboard.maneuvers import NAMES, find_cells, fit_forest
+from tracklake.training.onboard.maneuvers import CORRELATED, NAMES, correlate_pairs, find_cells, fit_forest
 from tracklake.training.onboard.models import Forecaster, make_forecaster, predict_straight, predict_turns
 from tracklake.training.onboard.samples import build_samples, split_samples
 from tracklake.training.onboard.scores import (
@@ -101,6 +101,19 @@ def test_the_majority_of_the_trees_decides(parts, forest):
     assert {row.feature for row in forest.coefficients} == set(NAMES)
     again = fit_forest(parts.train, seed=0)
     np.testing.assert_array_equal(again.count_votes(parts.eval), votes)
+
+
+def test_the_correlation_matrix_is_that_of_numpy(parts, forest):
+    part = parts.train
+    maneuvers = [part.maneuver == number for number in range(3)]
+    columns = np.column_stack([part.feature[:, -1], part.feature[:, -1] - part.feature[:, 0], *maneuvers]).astype(float)
+    varies = columns.std(axis=0) > 1e-6
+    matrix = correlate_pairs(part)
+    assert matrix.shape == forest.matrix.shape == (27, 27) == (len(CORRELATED), len(CORRELATED))
+    expected = np.corrcoef(columns[:, varies], rowvar=False)
+    np.testing.assert_allclose(matrix[np.ix_(varies, varies)], expected, atol=1e-6)
+    assert not matrix[~varies].any()
+    assert 10 < varies.sum() < 27  # the height of a box does not vary
 
 
 def test_the_forest_gives_the_column_and_the_model_the_row(parts, forest, ctrv):

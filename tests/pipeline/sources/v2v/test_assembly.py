@@ -77,6 +77,23 @@ def test_a_message_without_a_date_is_dropped():
     assert assembled.stations["invalid"].to_list() == [1]
 
 
+def test_a_few_messages_with_a_wrong_year_do_not_stretch_the_drive():
+    day = 864_000  # ticks
+    sent = [send(tick) for tick in range(20)]
+    late = [send(tick, message_count=1) for tick in (400 * day, 400 * day + 1, -3 * day)]
+    assembled = assemble(make_messages(*sent, *late))
+    assert assembled.bsm["time_s"].to_list() == pytest.approx([tick / 10 for tick in range(20)])
+    far = "a day or more from the other messages of the drive"
+    assert sorted(assembled.rejects.rows()) == [(0, line, far) for line in (21, 22, 23)]
+    assert assembled.stations.select("messages", "invalid", "duplicates").rows() == [(20, 3, 0)]
+
+
+def test_logs_of_several_days_and_of_few_messages_are_kept():
+    tuesday = [send(tick) for start in (0, 900_000) for tick in range(start, start + 10)]
+    assert assemble(make_messages(*tuesday)).bsm.height == 20
+    assert assemble(make_messages(send(0), send(900_000))).bsm.height == 2
+
+
 def test_refused_messages_are_counted_by_vehicle():
     refused = make_messages({"temporary_id": "0000000A"}, {"own": True}, {"temporary_id": "0000000B"})
     stations = assemble(make_messages(send(0), send(1)), refused).stations

@@ -218,6 +218,17 @@ def test_an_orientation_that_was_never_set_is_no_heading(tmp_path: Path, w: floa
     assert bag.rejects.is_empty()
 
 
+HEX_IN_JSON = '{"payload": {"data": {"bytes": "001425AB"}}}'
+
+
+@pytest.mark.parametrize("text", [" " * 1_000_000, " " * 1_000_000 + "!", "0014" * 250_000 + "!"])
+def test_long_texts_are_judged_at_once(tmp_path: Path, text: str) -> None:
+    """By backtracking, these took hours."""
+    bag = read_messages(tmp_path, ("/say", "std_msgs/String", 0, MAKE("std_msgs/String", data=text)))
+    assert bag.texts.is_empty()
+    assert "1 std_msgs/msg/String without anything to use" in bag.notes[0]
+
+
 def test_topics_are_chosen_by_type_and_number_and_the_others_named(tmp_path: Path) -> None:
     """A heading in degrees is preferred to one of an orientation; other numbers and texts are not read."""
     number = MAKE("std_msgs/Float64", data=370.0)
@@ -232,11 +243,13 @@ def test_topics_are_chosen_by_type_and_number_and_the_others_named(tmp_path: Pat
         ("/say", "std_msgs/String", 0, MAKE("std_msgs/String", data='{"battery": 12}')),
         ("/v2v", "std_msgs/String", 0, MAKE("std_msgs/String", data=' {"coreData":\n {}} ')),
         ("/v2v", "std_msgs/String", 0, MAKE("std_msgs/String", data="0014 25AB")),
+        ("/v2v", "std_msgs/String", 0, MAKE("std_msgs/String", data=HEX_IN_JSON)),
         ("/tf", TF, 0, make_transforms()),
     )
     assert bag.ego["lat_deg"].to_list() == [40.0, 40.0]
     assert bag.ego["heading_deg"].to_list() == [10.0, 10.0]
-    assert bag.texts.select("received_us", "text").rows() == [(START_US, '{"coreData": {}}'), (START_US, "0014 25AB")]
+    texts = ['{"coreData": {}}', "0014 25AB", HEX_IN_JSON]
+    assert bag.texts.select("received_us", "text").rows() == [(START_US, text) for text in texts]
     assert bag.notes == (
         "a.bag: not read, by type of message: 1 std_msgs/msg/Float64, 1 std_msgs/msg/String without anything to use, "
         "1 tf2_msgs/msg/TFMessage",

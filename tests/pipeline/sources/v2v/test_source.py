@@ -112,6 +112,17 @@ def test_what_is_no_log_of_a_drive_is_skipped_or_named(tmp_path, put):
     assert "BsmP1" in unknown
 
 
+def test_a_message_of_another_year_is_rejected_and_the_drive_keeps_its_clock(tmp_path, put):
+    lines = [write_line(gentime_us=tick * 100_000, count=tick) for tick in range(12)]
+    lines[3] = write_line(gentime_us=31_536_000_000_000, count=3)
+    lines[5] = write_line(gentime_us=630_720_000_000_000, count=5)
+    put("trip/a.csv", *lines)
+    lake = read(tmp_path)
+    assert lake.table("drives").select("seconds", "messages").collect().rows() == [(pytest.approx(1.1), 10)]
+    refused = lake.table("rejects").select("line", "reason").sort("line").collect()
+    assert refused.rows() == [(line, "a day or more from the other messages of the drive") for line in (4, 6)]
+
+
 def test_a_name_of_the_users_is_for_one_drive(tmp_path, put):
     put("trip/a.csv", write_line())
     given = {"digest": Digests(tmp_path / "lake"), "recording": "monday"}

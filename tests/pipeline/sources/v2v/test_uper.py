@@ -144,10 +144,20 @@ def test_every_line_of_a_plain_log_is_accounted_for(tmp_path):
 def test_only_plain_logs_are_recognised():
     assert recognise_hex(FRAME.encode())
     assert recognise_hex(f"time,hex\n1525190663.694,{FRAME}\n".encode())
+    other = "0013050000112233"  # a message 19 of J2735
+    assert recognise_hex(f"{other}\n{other}\n{FRAME}\n".encode())
+    assert not recognise_hex(f"{other}\n".encode())
+    assert not recognise_hex(f"hello, world!\n{FRAME}\n".encode())
     assert not recognise_hex(b"")
     assert not recognise_hex(b"time,hex\n")
     assert not recognise_hex(b"1,2,3\n")
     assert not recognise_hex(b"0015" + FRAME[4:].encode())
+
+
+def test_a_line_of_blanks_is_judged_at_once():
+    assert not recognise_hex(b"a" + b" " * 65_000 + b"!")  # by backtracking, these took minutes
+    assert not recognise_hex(b" " * 65_000 + b"!")
+    assert not recognise_hex(b"A" * 65_000 + b"!")
 
 
 @needs_real_messages

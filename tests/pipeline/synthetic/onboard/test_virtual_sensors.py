@@ -177,3 +177,6 @@ def test_more_penetration_adds_senders():
     assert (few.mean(), many.mean()) == (pytest.approx(0.3, abs=0.05), pytest.approx(0.6, abs=0.05))
     some = radio.draw_connected(np.random.default_rng(9), ids[5:9], 0.3)
     assert (some == few[5:9]).all()  # who else is near changes nothing
+    assert (few == (np.random.default_rng(9).random(2000)[ids] < 0.3)).all()
+    greatest = radio.draw_connected(np.random.default_rng(9), np.array([0, 2**31 - 1]), 0.3)
+    assert greatest[0] == few[0]  # in the memory of two draws
