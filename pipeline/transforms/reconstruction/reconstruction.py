@@ -32,6 +32,11 @@ from tracklake.schemas.reconstruction import (
 )
 
 DEFAULT_CONFIG = ReconstructionConfig()
+OUTLIER = 4.0
+"""Residuals, in standard deviations of the noise, beyond which Huber's distance is linear."""
+LEAST_OUTLIER_M = {"x_m": 1.0, "y_m": 4e-6}
+"""Least such residual by coordinate, in m. Along the road smaller ones can be motion that the penalty cuts off, such as
+hard braking, and noise that is greater for some vehicles, such as those that crawl and are recorded in steps."""
 MOVED_M = 0.001
 """Least distance from the smoothed position, in m, at which an entry counts as moved by the bounds."""
 
@@ -118,7 +123,8 @@ def _smooth_axis(pieces: Pieces, series: Series, column: str, config: Reconstruc
     positions = recorded - find_displacements(series, recorded, pieces.recorded) if column == "x_m" else recorded
     noise = estimate_noise(series, positions, pieces.recorded, set_noise, set_weight, LEAST_HZ[column])
     penalty = make_penalty(series, noise.weight_s6)
-    x, weights = smooth_robustly(penalty, positions, pieces.recorded.astype(np.float64), noise.noise_m)
+    limit_m = max(OUTLIER * noise.noise_m, LEAST_OUTLIER_M[column])
+    x, weights = smooth_robustly(penalty, positions, pieces.recorded.astype(np.float64), limit_m)
     return Axis(recorded, noise, Problem(series, x, penalty, weights), x)
 
 

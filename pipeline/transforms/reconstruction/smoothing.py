@@ -7,7 +7,7 @@ Whittaker (1923) and Eilers (2003, A Perfect Smoother, Analytical Chemistry 75, 
 z are the recorded positions, dt the time between frames. With the weight in s6 the cut-off frequency does not depend
 on the frame rate: the smoother passes the share 1 / (1 + weight (2 pi f)^6) of a motion of frequency f (Hz).
 Huber's weights w (1964, Robust estimation of a location parameter) by iteratively reweighted least squares make the
-distance robust: linear instead of quadratic beyond HUBER standard deviations of the noise.
+distance robust: linear instead of quadratic beyond a limit.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,6 @@ import numpy as np
 from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges
 
 THIRD_DIFFERENCE = (-1.0, 3.0, -3.0, 1.0)
-HUBER = 4.0
-"""Residuals, in standard deviations of the noise, beyond which the distance is linear. Smaller residuals are often
-motion that the penalty cuts off, such as hard braking, and no outliers."""
 ROUNDS = 5
 """Rounds of reweighting."""
 
@@ -92,17 +89,16 @@ def smooth(penalty: Floats, recorded: Floats, weights: Floats) -> Floats:
     return recorded + solve_bands(bands, -multiply_bands(penalty, recorded))
 
 
-def smooth_robustly(penalty: Floats, recorded: Floats, weights: Floats, noise_m: float) -> tuple[Floats, Floats]:
+def smooth_robustly(penalty: Floats, recorded: Floats, weights: Floats, limit_m: float) -> tuple[Floats, Floats]:
     """Smooth with Huber's distance; return the positions and the final weights, (N,) each.
 
     Args:
         penalty: see `make_penalty`.
         recorded: positions.
         weights: 1 where recorded, 0 where a gap is filled.
-        noise_m: standard deviation of the noise.
+        limit_m: residual beyond which the distance is linear.
     """
     x = smooth(penalty, recorded, weights)
-    limit_m = HUBER * max(noise_m, 1e-6)
     robust = weights
     for _ in range(ROUNDS):
         robust = weights * np.minimum(1.0, limit_m / np.maximum(np.abs(recorded - x), limit_m))

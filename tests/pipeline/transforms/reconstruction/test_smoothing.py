@@ -46,11 +46,21 @@ def test_speed_and_acceleration_are_central_differences_that_go_on_as_a_parabola
     np.testing.assert_allclose(accel, np.repeat([1.5, 0.0], 5), atol=1e-10)
 
 
-def test_one_outlier_hardly_moves_the_track():
-    series = Series(np.array([0]), np.array([60]), 10.0)
-    z = np.arange(60) * 2.0
-    z[30] += 5.0
-    x, weights = smooth_robustly(make_penalty(series, 0.01), z, np.ones(60), 0.05)
-    assert abs(x[30] - 60.0) < 0.1
-    assert weights[30] < 0.1
-    assert weights[0] == 1.0
+def test_an_outlier_moves_the_track_no_more_than_a_residual_of_one_metre():
+    penalty, way = make_penalty(Series(np.array([0]), np.array([60]), 10.0), 0.01), np.arange(60) * 2.0
+    outlier = np.where(np.arange(60) == 30, 1.0, 0.0)
+    share = smooth(penalty, way + outlier, np.ones(60))[30] - 60.0  # how far a position that is 1 m off moves the track
+    for off_m in (5.0, 50.0):
+        x, weights = smooth_robustly(penalty, way + off_m * outlier, np.ones(60), 1.0)
+        # The force of the residual is that of 1 m: the rest of the track alone would move by share / (1 - share).
+        assert x[30] - 60.0 == pytest.approx(share / (1 - share), rel=0.02)
+        assert weights[30] == pytest.approx(1.0 / (off_m - share / (1 - share)), rel=0.02)
+        assert weights[0] == 1.0
+
+
+def test_residuals_below_the_limit_count_in_full():
+    penalty, way = make_penalty(Series(np.array([0]), np.array([60]), 10.0), 0.01), np.arange(60) * 2.0
+    z = way + np.where(np.arange(60) == 30, 0.9, 0.0)
+    x, weights = smooth_robustly(penalty, z, np.ones(60), 1.0)
+    np.testing.assert_array_equal(weights, np.ones(60))
+    np.testing.assert_array_equal(x, smooth(penalty, z, np.ones(60)))
