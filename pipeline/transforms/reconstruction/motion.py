@@ -4,16 +4,15 @@ Pieces whose smoothed track breaks a bound are solved again, as quadratic progra
 compact differences, of which the written speeds and accelerations are means (see `differentiate`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from tracklake.pipeline.transforms.reconstruction.bounds import Limits, find_breaks, limit_motion, measure_motion
-from tracklake.pipeline.transforms.reconstruction.config import MotionBounds
+from tracklake.pipeline.transforms.reconstruction.bounds import Limits, find_breaks, measure_motion
 from tracklake.pipeline.transforms.reconstruction.programs import Rows, solve_programs
-from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, select_pieces
+from tracklake.pipeline.transforms.reconstruction.smoothing import Series, select_pieces
 from tracklake.schemas.arrays import Floats, Integers
 
 MARGIN = 0.99
@@ -22,8 +21,8 @@ CREEP_MPS = 2e-6
 """Least speed that programs use, in m/s, so that rounding moves nothing backward: 2 mm in a quarter of an hour."""
 BATCH_POINTS = 20_000
 """Points of the programs that are solved together; more would not fit a processor's cache."""
-ROUNDS = 5
-"""Times that a piece is solved, since the greatest acceleration depends on the speed that comes out."""
+ROUNDS = 10
+"""Most times that a piece is solved, since the greatest acceleration depends on the speed that comes out."""
 
 
 @dataclass(frozen=True)
@@ -63,24 +62,28 @@ class Problem:
                 self._solve_together(np.array([piece]), x, make_rows)
 
 
-def bound_motion(problem: Problem, bounds: Sequence[MotionBounds], kind: Integers) -> tuple[Floats, Limits]:
+def bound_motion(problem: Problem, limit: Callable[[Floats], Limits]) -> tuple[Floats, Limits]:
     """Return positions (N,) within the bounds of motion, and the bounds at their speeds.
 
     Args:
         problem: the smoothed pieces.
-        bounds: bounds of the classes.
-        kind: (N,) place of each point's bounds in `bounds`.
+        limit: positions (N,) to the bounds at their speeds.
     """
-    series, x = problem.series, problem.smoothed.copy()
-    limits = limit_motion(bounds, kind, differentiate(series, x)[0])
+    x = problem.smoothed.copy()
+    limits = limit(x)
     for _ in range(ROUNDS):
-        broken = np.logical_or.reduce(list(find_breaks(measure_motion(series, x), limits).values()))
-        pieces = np.flatnonzero(np.logical_or.reduceat(broken, series.first))
+        pieces = find_broken_pieces(problem.series, x, limits)
         if not pieces.size:
             break
         problem.solve(pieces, x, partial(make_motion_rows, problem, limits))
-        limits = limits.lower_to(limit_motion(bounds, kind, differentiate(series, x)[0]))
+        limits = limits.lower_to(limit(x))
     return x, limits
+
+
+def find_broken_pieces(series: Series, x: Floats, limits: Limits) -> Integers:
+    """Find the pieces with a point that breaks a bound of motion."""
+    broken = np.logical_or.reduce(list(find_breaks(measure_motion(series, x), limits).values()))
+    return np.flatnonzero(np.logical_or.reduceat(broken, series.first))
 
 
 def make_motion_rows(problem: Problem, limits: Limits, series: Series, points: Integers) -> list[Rows]:

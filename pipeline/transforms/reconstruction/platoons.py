@@ -1,5 +1,6 @@
 """Platoon consistency: no vehicle overlaps its leader; the leader is solved before its follower."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -7,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.transforms.reconstruction.bounds import Limits
-from tracklake.pipeline.transforms.reconstruction.motion import Problem, make_motion_rows
+from tracklake.pipeline.transforms.reconstruction.motion import Problem, find_broken_pieces, make_motion_rows
 from tracklake.pipeline.transforms.reconstruction.pieces import Pieces
 from tracklake.pipeline.transforms.reconstruction.programs import Rows
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series
@@ -53,10 +54,13 @@ def find_leaders(pieces: Pieces, vehicles: pl.DataFrame) -> Leaders:
     return Leaders(point, np.where(point >= 0, lengths[place], np.nan))
 
 
-def keep_behind_leaders(problem: Problem, x: Floats, limits: Limits, leaders: Leaders) -> None:
+def keep_behind_leaders(
+    problem: Problem, x: Floats, limits: Limits, limit: Callable[[Floats], Limits], leaders: Leaders
+) -> None:
     """Move followers that overlap their leaders back, in x; a leader that overlaps its own is moved before.
 
-    A recorded leader whose front is behind the follower's is no leader: it does not bound the follower.
+    A recorded leader whose front is behind the follower's is no leader: it does not bound the follower. Followers that
+    are then faster than their bounds were made for are solved again, under those of their speeds (`limit`).
     """
     series = problem.series
     piece = np.repeat(np.arange(len(series.first)), series.size)
@@ -69,6 +73,10 @@ def keep_behind_leaders(problem: Problem, x: Floats, limits: Limits, leaders: Le
         wanted = np.unique(follower[due])
         waiting = np.unique(follower[due & np.isin(leader, wanted)])
         ready = np.setdiff1d(wanted, waiting) if len(waiting) < len(wanted) else wanted
+        if not ready.size:
+            limits = limits.lower_to(limit(x))
+            ready = find_broken_pieces(series, x, limits)
+            ready = ready[(tries[ready] > 0) & (tries[ready] < MOST_TRIES)]
         if not ready.size:
             return
         problem.solve(ready, x, partial(_make_rows, problem, limits, leaders, bounding, x))

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.transforms.reconstruction.bounds import (
+    Limits,
     Runs,
     find_breaks,
     limit_motion,
@@ -142,15 +143,19 @@ def _reconstruct_along(
     )
     kind = place.to_numpy()[pieces.row].astype(np.int64)
     bounds = list(config.bounds.values())
-    x, limits = bound_motion(smoothed.problem, bounds, kind)
+
+    def limit(x: Floats) -> Limits:
+        return limit_motion(bounds, kind, differentiate(series, x)[0])
+
+    x, limits = bound_motion(smoothed.problem, limit)
     leaders = find_leaders(pieces, vehicles)
-    keep_behind_leaders(smoothed.problem, x, limits, leaders)
+    keep_behind_leaders(smoothed.problem, x, limits, limit, leaders)
     unknown = (leaders.point >= 0) & np.isnan(leaders.length_m) & pieces.recorded
     if unknown.any():
         followers = len(np.unique(pieces.tracks["vehicle_id"].to_numpy()[pieces.row[unknown]]))
         skips.append(Skip("no_length", followers, int(unknown.sum()), "overlaps with leaders of unknown length"))
     values = measure_motion(series, x)
-    broken = find_breaks(values, limit_motion(bounds, kind, differentiate(series, x)[0]))
+    broken = find_breaks(values, limit(x))
     values["overlap"] = leaders.measure_gaps(x)
     broken["overlap"] = values["overlap"] < 0
     runs = [list_runs(series, bound, broken[bound], values[bound]) for bound in broken]

@@ -1,5 +1,6 @@
 import numpy as np
 import polars as pl
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recorded import MAX_ID, make_tracks, make_vehicles, run_reconstruction
@@ -207,3 +208,23 @@ def test_the_noise_can_be_set():
     row = done.quality.row(0, named=True)
     assert (row["noise_x_m"], row["noise_y_m"], row["weight_x_s6"]) == (0.2, 0.1, 0.03)
     assert row["noise_is_set"]
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 30.0])
+@pytest.mark.parametrize("kind", ["car", "truck"])
+def test_bounds_are_kept_at_any_frame_rate_beside_a_track_of_nonsense(rate_hz, kind):
+    rng = np.random.default_rng(2)
+    t = np.arange(30 * int(rate_hz)) / rate_hz
+    start = np.cumsum(np.clip(4 * (t - 5), 0, 30)) / rate_hz + rng.normal(0, 0.2, len(t))
+    nonsense = rng.uniform(0, 500, len(t))
+    tracks = make_tracks((1, range(len(t)), start), (2, range(len(t)), nonsense), rate_hz=rate_hz)
+    done = run_reconstruction(tracks, make_vehicles(tracks, kind=kind), rate_hz)
+    assert done.unkept.is_empty()
+    assert (done.entries["speed_mps"] >= 0).all()
+
+
+def test_a_follower_behind_a_leader_keeps_the_acceleration_of_its_speed():
+    t = np.arange(400) / 10
+    tracks = make_tracks((1, range(400), 200 + 3 * t), (2, range(400), 100 + 10 * t, 1))
+    done = run_reconstruction(tracks)
+    assert done.unkept["bound"].unique().to_list() == ["overlap"]
