@@ -7,6 +7,7 @@ import polars as pl
 
 from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA, Layout, read_chunks, read_head
 from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.pipeline.sources.v2v.messages import POSSIBLE_US
 from tracklake.schemas import BSM, SURROUNDING_TRUTH
 from tracklake.schemas.drives import TICK_RATE_HZ
 
@@ -20,6 +21,8 @@ FIELDS: dict[str, pl.DataType] = {
 """Columns of the file: those of `surrounding_truth`, with the id that the vehicle sends instead of the drive's own."""
 TICK_US = 1_000_000 // TICK_RATE_HZ
 """Microseconds from tick to tick."""
+MAX_TICK = 86_400 * TICK_RATE_HZ
+"""Greatest tick of a drive, which lasts a day at most."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ def read_truth(file: RawFile) -> Truth:
     """Read the rows of truth; of two for the same vehicle and tick, the second is rejected.
 
     Raises:
-        SourceError: a column is missing, or the file is damaged.
+        SourceError: a column is missing, the start cannot be, or the file is damaged.
     """
     head = read_head(file).removeprefix(BOM).split(b"\n")
     header = head[1].decode("utf-8", "replace") if len(head) > 1 else ""
@@ -53,11 +56,18 @@ def read_truth(file: RawFile) -> Truth:
             f"{file.name}, line 2: expected the columns {', '.join(FIELDS)}; {', '.join(missing)} missing. Write the "
             "drive again with `tracklake instrument`, or remove the file."
         )
+    start = START.search(head[0])
+    if start and not POSSIBLE_US[0] <= int(start[1]) <= POSSIBLE_US[1]:
+        raise SourceError(
+            f"{file.name}, line 1: start_us={int(start[1])}. Expected microseconds since 1970, of a moment between "
+            "2004 and 2100. Write the drive again with `tracklake instrument`, or remove the file."
+        )
+    bounds = {name: limits for name, limits in SURROUNDING_TRUTH.bounds.items() if name in FIELDS}
     layout = Layout(
         names,
         {name: pl.String() if dtype == pl.Boolean else dtype for name, dtype in FIELDS.items()},
         SURROUNDING_TRUTH.required & set(FIELDS),
-        bounds={name: limits for name, limits in SURROUNDING_TRUTH.bounds.items() if name in FIELDS},
+        bounds=bounds | {"tick": (0, MAX_TICK)},
         choices={"connected": ("true", "false")},
         header_lines=2,
     )
@@ -67,7 +77,6 @@ def read_truth(file: RawFile) -> Truth:
     again = rows.filter(~first).select(
         LINE, reason=pl.lit("duplicate row"), text=pl.format("{}, {}", "truth_id", "tick")
     )
-    start = START.search(head[0])
     return Truth(
         rows.filter(first).with_columns(pl.col("connected").str.to_lowercase() == "true").select(*FIELDS),
         pl.concat([pl.DataFrame(schema=REJECT_SCHEMA), *(chunk.rejects for chunk in chunks), again]).sort(LINE),

@@ -253,7 +253,8 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
         f"{vehicle},{tick},highd,01-upper,{connected},5,-3.5,0,20,,21,0,100,4,1,2,4.5,1.8,,{sent}\n"
         for vehicle, tick, connected, sent in ((30, 0, "true", "9"), (30, 1, "true", "9"), (31, 1, "false", ""))
     ]
-    put("trip/truth.csv", "# tracklake drive truth, start_us=1072915200100000\n", header, *rows, rows[0], "31,x\n")
+    far = rows[0].replace("30,0,", "30,2147483647,")
+    put("trip/truth.csv", "# tracklake drive truth, start_us=1072915200100000\n", header, *rows, rows[0], "31,x\n", far)
     lake = read(tmp_path)
     assert lake.table("drives").collect()["origin"].to_list() == ["synthetic"]
     other = lake.table("stations").filter(~pl.col("own")).collect()["vehicle_id"].item()
@@ -261,7 +262,7 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
     # The file's tick 0 lies one tick after the drive's start.
     assert truth.rows() == [(30, 1, other, True), (30, 2, other, True), (31, 2, None, False)]
     refused = lake.table("rejects").select("line", "reason").collect()
-    assert refused.rows() == [(6, "duplicate row"), (7, "2 fields instead of 20")]
+    assert refused.rows() == [(6, "duplicate row"), (7, "2 fields instead of 20"), (8, "out of range: tick")]
     put("trip/b.csv", write_line(receiver=2))
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"truth\.csv is the truth of one drive, .* 2 receivers"):
@@ -273,6 +274,10 @@ def test_the_truth_of_a_drive_names_vehicles_by_their_messages(tmp_path, put):
         ingest.build(tmp_path / "lake", job)
     for path in (second, second.with_name("a.csv")):
         path.unlink()
+    put("trip/truth.csv", "# tracklake drive truth, start_us=999999999999999999\n", header, *rows)
+    (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
+    with pytest.raises(SourceError, match=r"truth\.csv, line 1: start_us=9{18}\. Expected .* between 2004 and 2100"):
+        ingest.build(tmp_path / "lake", job)
     put("trip/truth.csv", "# tracklake drive truth\n", header, *rows)
     (job,) = ingest.plan(find(tmp_path), _open_new(tmp_path / "lake"))
     with pytest.raises(SourceError, match=r"got none \(trip/truth\.csv\)\. Give all files of the recording"):
