@@ -8,7 +8,7 @@ from tracklake.schemas.scores import SUBSET_SCORES
 
 BOUNDS_KEPT = ("backward", "acceleration", "deceleration", "jerk", "overlap", "lateral_acceleration")
 """Names of the bounds that a reconstructed track keeps."""
-SKIP_REASONS = ("one_entry", "constant_gaps", "no_lanes", "no_length", "arterial", "too_few_entries")
+SKIP_REASONS = ("one_entry", "constant_gaps", "no_lanes", "no_length", "arterial", "too_few_entries", "out_of_range")
 """Why tracks, or parts of the work on them, are left out of the reconstruction."""
 
 RECONSTRUCTED = Table(

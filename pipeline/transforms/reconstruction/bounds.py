@@ -67,6 +67,11 @@ class Runs:
     last: Integers
     worst: Floats
 
+    def leave_out(self, points: Flags) -> "Runs":
+        """Return the runs that do not begin at one of some points (N,)."""
+        kept = ~points[self.first]
+        return replace(self, first=self.first[kept], last=self.last[kept], worst=self.worst[kept])
+
 
 def list_runs(series: Series, bound: str, broken: Flags, values: Floats) -> Runs:
     """List the runs of consecutive points of a piece that break a bound."""

@@ -106,7 +106,9 @@ def reconstruct(
         across, lateral_runs = _reconstruct_across(pieces, series, config, skips)
         runs.append(lateral_runs)
     entries = _list_entries(pieces, series, along, across, facts)
-    unkept = _list_unkept(pieces, runs, facts)
+    outside = _find_outside(pieces, series, entries, skips)
+    entries = entries.filter(~outside)
+    unkept = _list_unkept(pieces, [run.leave_out(outside) for run in runs], facts)
     return Reconstruction(
         entries,
         _summarise(entries, vehicles, along, across, unkept.height, facts, config),
@@ -203,6 +205,21 @@ def _list_entries(pieces: Pieces, series: Series, along: Axis, across: Axis, fac
         }
     )
     return _conform(RECONSTRUCTED, frame, facts)
+
+
+def _find_outside(pieces: Pieces, series: Series, entries: pl.DataFrame, skips: list[Skip]) -> Flags:
+    """Find the points (N,) of pieces that the table's ranges do not admit, as at 400 m/s; `skips` may grow."""
+    ranges = ((name, one.ge, one.le) for name, one in RECONSTRUCTED.columns.items())
+    inside = [pl.col(name).is_between(least, most) for name, least, most in ranges if None not in (least, most)]
+    outside = entries.select(~pl.all_horizontal(inside)).to_series().to_numpy()
+    if not outside.any():
+        return outside
+    outside = np.repeat(np.logical_or.reduceat(outside, series.first), series.size)
+    recorded = outside & pieces.recorded
+    vehicles = len(np.unique(pieces.tracks["vehicle_id"].to_numpy()[pieces.row[recorded]]))
+    left_out = "everything: no motion near the recorded positions lies within the table's ranges"
+    skips.append(Skip("out_of_range", vehicles, int(recorded.sum()), left_out))
+    return outside
 
 
 def _summarise(

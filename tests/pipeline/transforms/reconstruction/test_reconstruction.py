@@ -228,3 +228,12 @@ def test_a_follower_behind_a_leader_keeps_the_acceleration_of_its_speed():
     tracks = make_tracks((1, range(400), 200 + 3 * t), (2, range(400), 100 + 10 * t, 1))
     done = run_reconstruction(tracks)
     assert done.unkept["bound"].unique().to_list() == ["overlap"]
+
+
+def test_a_piece_of_impossible_speed_is_skipped_and_spares_the_others():
+    tracks = make_tracks((1, range(50), 2.0 * np.arange(50)), (2, range(4), [0.0, 100.0, 101.0, 102.0]))
+    done = run_reconstruction(tracks)
+    assert done.entries["vehicle_id"].unique().to_list() == [1]
+    assert done.skips.select("reason", "vehicles", "entries").rows() == [("out_of_range", 1, 4)]
+    assert done.quality.select("vehicles_reconstructed", "entries").row(0) == (1, 50)
+    assert done.unkept.is_empty()
