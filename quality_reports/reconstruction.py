@@ -38,8 +38,8 @@ def describe_reconstruction(row: Mapping[str, Any]) -> str:
     parts = []
     if row["noise_x_m"] is not None:
         source = "set" if row["noise_is_set"] else "estimated"
-        across = "" if row["noise_y_m"] is None else f", {row['noise_y_m']:.2f} m across it"
-        parts.append(f"noise {row['noise_x_m']:.2f} m along the road{across} ({source})")
+        across = "" if row["noise_y_m"] is None else f", {_format_metres(row['noise_y_m'])} across it"
+        parts.append(f"noise {_format_metres(row['noise_x_m'])} along the road{across} ({source})")
     if row["moved_over_half_m_share"] is not None:
         parts.append(f"{_format_percent(row['moved_over_half_m_share'])} of the entries moved more than 0.5 m")
     if row["imputed_entries"]:
@@ -54,6 +54,11 @@ def describe_reconstruction(row: Mapping[str, Any]) -> str:
             f"{before:,} of {row['vehicles']:,} vehicles have an error as recorded, {after:,} as reconstructed"
         )
     return "; ".join(parts)
+
+
+def _format_metres(metres: float) -> str:
+    """Return a length with two decimals; what they would show as zero is under 0.01 m."""
+    return f"{metres:.2f} m" if metres >= 0.01 else "under 0.01 m"
 
 
 def _format_percent(share: float) -> str:

@@ -52,8 +52,8 @@ def instrument(
         list[str] | None,
         typer.Option(
             "--format",
-            help="Messages: wyoming, tampa, hex or bsmp1; sensors: rosbag1 or rosbag2; repeatable [default: wyoming, "
-            "rosbag2].",
+            help="Messages: wyoming, tampa, hex or bsmp1; sensors: rosbag1 or rosbag2; repeatable; default: wyoming "
+            "and rosbag2.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of all noise: same seed, same bytes.")] = 1,

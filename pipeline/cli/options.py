@@ -15,7 +15,7 @@ WorkersOption = Annotated[
 ]
 ProtocolOption = Annotated[
     str | None,
-    typer.Option("--protocol", help="Protocol of samples, split and tensors (docs/protocols.md) [default: csp]."),
+    typer.Option("--protocol", help="Protocol of samples, split and tensors (docs/protocols.md; default: csp)."),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]

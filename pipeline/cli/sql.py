@@ -66,7 +66,7 @@ def sql(
     format: Annotated[
         str | None,
         typer.Option(
-            "--format", help="table, csv, json, jsonl, parquet or arrow [default: the ending of --out, or table]."
+            "--format", help="table, csv, json, jsonl, parquet or arrow; default: the ending of --out, or table."
         ),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,

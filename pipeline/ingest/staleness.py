@@ -10,12 +10,15 @@ from tracklake.pipeline.ingest.discovery import Digests
 from tracklake.pipeline.ingest.ingest import SOURCE_BY_NAME, VERSION
 from tracklake.pipeline.lake import Commit, Manifest
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.settings.fields import DeclaredSettings
 from tracklake.pipeline.stages.planner import Planner, find_recordings
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME, STAGES
 from tracklake.pipeline.stages.stage import INGEST, Job, StageError
 
 MAX_CHANGES = 3
 """Most changed settings that a reason names."""
+DIGESTS = ("protocol",)
+"""Values that are digests of several settings."""
 OTHERWISE = "this version of tracklake makes it otherwise"
 
 
@@ -119,19 +122,27 @@ def _explain_job(job: Job, commit: Commit | None) -> str:
     made_again = [name for name in stages if name in others or (name in names and name in before and name in now)]
     settings = [name for name in names if name not in (*stages, "commits")]
     parts = [f"{', '.join(made_again)} was made again"] if made_again else []
-    changes = [text for name in settings for text in _list_changes(name, before.get(name), now.get(name))]
+    changes = [text for name in settings for text in _list_changes(name, _find(before, name), _find(now, name))]
     if changes:
         more = f" and {len(changes) - MAX_CHANGES} more" if len(changes) > MAX_CHANGES else ""
         parts.append(f"changed: {', '.join(changes[:MAX_CHANGES])}{more}")
     return "; ".join(parts)
 
 
+def _find(values: Mapping[str, Any], name: str) -> object:
+    """Return the value of a setting; one that a job does not name has its default."""
+    declared = DeclaredSettings.model_fields.get(name)
+    return values.get(name, None if declared is None else declared.default)
+
+
 def _list_changes(name: str, before: object, now: object) -> list[str]:
-    """Return what differs in a value: old and new, or the names in it where it is a table of many."""
+    """Return what differs in a value: old and new, or the names in it where it is a table of many or a digest."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         inner = [key for key in {**before, **now} if not _is_same(before.get(key), now.get(key))]
         return [text for key in inner for text in _list_changes(f"{name}.{key}", before.get(key), now.get(key))]
-    is_plain = all(value is None or isinstance(value, str | int | float) for value in (before, now))
+    is_plain = name not in DIGESTS and all(
+        value is None or isinstance(value, str | int | float) for value in (before, now)
+    )
     return [f"{name} from {before} to {now}" if is_plain else name]
 
 

@@ -323,7 +323,7 @@ def explain_left_out(manifest: Manifest) -> list[str]:
     if not arterials:
         return []
     return [
-        f"repair, traffic, samples, split and tensors were left out for {', '.join(arterials)}: those stages are "
-        "defined for freeways, and these are directions of arterial streets; tracks, findings, report and SQL are "
-        "complete"
+        f"reconstruct, repair, traffic, samples, split and tensors were left out for {', '.join(arterials)}: those "
+        "stages are defined for freeways, and these are directions of arterial streets; tracks, findings, report and "
+        "SQL are complete"
     ]

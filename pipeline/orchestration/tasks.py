@@ -218,7 +218,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
             jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(stage.name)
             writer.remove(stale)
             _build_all(writer, stage.name, jobs, request, result)
-        if set(request.steps) & {"repair", "samples", "split", "tensors"}:
+        if set(request.steps) & {"reconstruct", "repair", "traffic", "samples", "split", "tensors"}:
             result.notes += explain_left_out(writer.manifest)
         result.notes += explain_not_reconstructed(request)
         result.notes += explain_not_rebuilt(before, writer.manifest)

@@ -49,9 +49,12 @@ class SettingSource:
     def locate(self, key: Key) -> str:
         """Return where a setting stands: file and line, variable, or `option`."""
         if self.name == ENVIRONMENT:
-            names = (PREFIX + "__".join(part).upper() for part in (key, key[:1]))
-            return next((name for name in names if name in map(str.upper, os.environ)), self.name)
-        return f"{self.name}:{self.lines[key]}" if key in self.lines else self.name
+            variables = sorted(map(str.upper, os.environ))
+            names = [PREFIX + "__".join(part).upper() for part in (key, key[:1])]
+            within = [name for name in variables if name.startswith(f"{names[-1]}__")]
+            return next((name for name in [*names, *within] if name in variables), self.name)
+        line = next((line for own, line in self.lines.items() if own[: len(key)] == key), None)
+        return self.name if line is None else f"{self.name}:{line}"
 
 
 def read_sources(options: Mapping[str, Any]) -> list[SettingSource]:
@@ -226,6 +229,6 @@ def locate_setting(key: Key, sources: Sequence[SettingSource]) -> str | None:
         source.locate(part)
         for part in (key[:2], key[:1])
         for source in reversed(sources)
-        if part in list_keys(source.values)
+        if any(own == part or own[: len(key)] == key for own in list_keys(source.values))
     )
     return next(found, None)

@@ -164,7 +164,7 @@ STAGE = Stage(
     scope="lake",
     after=(),  # the report shows what there is
     settings=(_describe_settings,),
-    version=9,
+    version=10,
     build=build,
     extra_inputs=_find_inputs,
 )

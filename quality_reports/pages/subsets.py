@@ -37,6 +37,7 @@ from tracklake.quality_reports.summaries import (
 from tracklake.quality_reports.verdicts import judge, rank_rules
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.quality_tracks import SubsetFacts
+from tracklake.schemas.traffic import SAFETY_THRESHOLDS
 
 T = TypeVar("T", bound=Mapping[str, Any])
 
@@ -94,6 +95,7 @@ def render_pages(
                 provenance=figures["provenance"],
                 banner=describe_synthetic({subset["subset"]: subset["origin"]}),
                 reconstructed=reconstructed.get(_get_key(subset)),
+                limits=SAFETY_THRESHOLDS,
                 **content,
             ),
         )
@@ -110,7 +112,7 @@ def _describe_reconstructed(connection: Connection, rules: Sequence[Rule]) -> di
         compared: Row = {name: [own for own in figures[name] if _get_key(own) == key] for name in COMPARED}
         described[key] = {
             "conclusion": describe_reconstruction(row),
-            "vehicle": track.select("vehicle_id", "moved", "most_moved_m").row(0, named=True),
+            "vehicle": track.select("vehicle_id", "moved", "most_moved_m", "constrained").row(0, named=True),
             "plot": Markup(draw_reconstruction(track)),
             **compared,
         }

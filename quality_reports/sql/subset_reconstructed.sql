@@ -1,7 +1,9 @@
 -- Of every subset one vehicle, recorded and reconstructed: the one with most entries that moved more than 0.5 m, at 10 Hz
 -- or the source's rate if that is lower; follows is true where no time is missing since the entry before.
 WITH chosen AS (
-    SELECT dataset, subset, vehicle_id, count(*) FILTER (moved_m > 0.5) AS moved, max(moved_m) AS most_moved_m
+    SELECT
+        dataset, subset, vehicle_id, count(*) FILTER (moved_m > 0.5) AS moved, max(moved_m) AS most_moved_m,
+        count(*) FILTER (constrained) AS constrained
     FROM reconstructed
     GROUP BY dataset, subset, vehicle_id
     QUALIFY row_number() OVER (PARTITION BY dataset, subset ORDER BY moved DESC, sum(moved_m) DESC, vehicle_id) = 1

@@ -157,6 +157,14 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, monkeypatch):
     assert refused(protocol="cps") == "setting protocol: no protocol is called cps; did you mean csp?"
 
 
+def test_a_table_that_is_refused_as_a_whole_has_a_place(tmp_path, monkeypatch):
+    message = "setting safety_thresholds: no measure is called ttc; did you mean ttc_s?"
+    (tmp_path / "tracklake.toml").write_text("workers = 2\n[safety_thresholds]\nttc = 1.5\n")
+    assert refused() == f"tracklake.toml:3: {message}"
+    monkeypatch.setenv("TRACKLAKE_SAFETY_THRESHOLDS__TTC", "1.5")
+    assert refused() == f"TRACKLAKE_SAFETY_THRESHOLDS__TTC: {message}"
+
+
 def test_variables_that_are_no_settings_are_named_and_harmless(monkeypatch):
     monkeypatch.setenv("TRACKLAKE_WORKER", "3")
     monkeypatch.setenv("TRACKLAKE_THRESHOLDS__OVERLAP_M", "0.5")

@@ -14,7 +14,7 @@ pytestmark = [
 def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
     done = command.here("run", EXCERPTS / "socrata_head_10000.csv", "--lake", tmp_path / "lake")
     assert done.code == 0, done.err
-    assert "repair, traffic, samples, split and tensors were left out for peachtree-1245-north" in done.out
+    assert "reconstruct, repair, traffic, samples, split and tensors were left out for peachtree-1245-north" in done.out
     assert "10,000 entries" in done.out
     query = "SELECT recording, direction, sum(entries) AS entries FROM subsets GROUP BY ALL ORDER BY ALL"
     rows = json.loads(command.here("sql", query, "--lake", tmp_path / "lake", "--format", "json").out)

@@ -84,6 +84,7 @@ def test_reconstructed_tracks_are_judged_by_the_rules(reader, subset):
     assert before - after
     unchecked = reader.table(RECONSTRUCTED_SUBSET_SCORES)["rules_unchecked"].to_list()
     assert all("headway_mismatch" in rules for rules in unchecked), "headways were recorded, not reconstructed"
+    assert all("duplicate_track" in rules for rules in unchecked), "a second track that is moved apart stays one"
 
 
 def test_the_report_shows_both(lake):

@@ -75,7 +75,7 @@ def test_the_page_shows_both(traffic):
     assert "20 km/h" in diagram
     text = " ".join(re.sub(r"<[^>]+>", "", html).split())
     assert "2 episodes behind one leader, 0.2 min in all, median 6.0 s; 1 begin by a cut-in." in text
-    assert "2 lane changes, median 6.0 s. Exposure beyond the thresholds: time to collision 1.5 s" in text
+    assert "2 lane changes, median 6.0 s. Time beyond the thresholds: 1.5 s with too short a time to coll" in text
 
 
 def test_without_the_stage_the_diagram_is_that_of_intervals(open_lake):
