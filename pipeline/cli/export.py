@@ -140,7 +140,8 @@ def car_following(
             terminal.print_line(f"{subset}: {episodes:,} episodes, {written.entries[subset]:,} entries")
         for licence in written.licences:
             terminal.print_line(f"licence of {licence}", style="dim")
-        terminal.print_line(f"in {written.out / written.file}; what it holds: README.md", style="bold green")
+        tracks = f"{written.tracks_from} tracks"
+        terminal.print_line(f"{tracks}, in {written.out / written.file}; what it holds: README.md", style="bold green")
         terminal.print_json(written.to_dict())
 
 

@@ -162,7 +162,8 @@ def show_gain(terminal: Terminal, scores: pl.DataFrame, inputs: GainInputs) -> N
                 lines.append([f"  {name}", *(format_number(own, 3) for own in rows[column])])
     title = f"RMSE, m, by the tracks of the histories; futures: {inputs.folder.protocol.tracks_from} tracks"
     print_table(terminal, ["", *(f"{ahead:g} s" for ahead in seconds)], lines, title=title, fold=True)
-    for note in (EXPLANATION, *inputs.notes):
+    explained = (EXPLANATION,) if RECONSTRUCTED_TRACKS in inputs.histories else ()
+    for note in (*explained, *inputs.notes):
         terminal.print_line(note, style="dim")
 
 

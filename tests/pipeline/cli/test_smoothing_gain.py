@@ -121,6 +121,7 @@ def test_evaluate_shows_the_same_models_with_all_histories(command, lake, tmp_pa
     shown = command.here(*arguments, "--gain")
     assert shown.code == 0, shown.err
     assert "RMSE, m, by the tracks of the histories; futures: recorded tracks" in shown.out
+    assert "gain from smoothing: RMSE with filtered histories" in shown.out
     answer = json.loads(command.here(*arguments, "--gain", "--json").out)
     by_kind = {}
     for row in answer["smoothing_gain"]:

@@ -107,6 +107,7 @@ def test_messages_say_what_to_do(lake, tmp_path, command):
     done = command.here("export", "car-following", "--lake", lake, "--out", out)
     assert done.code == 0, done.err
     assert "episodes" in done.out
+    assert "recorded tracks, in " in done.out
     again = command.here("export", "car-following", "--lake", lake, "--out", out)
     assert again.code == 1
     assert "--force" in again.err
