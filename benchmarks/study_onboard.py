@@ -15,15 +15,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import polars as pl
 import torch
-from study_onboard_page import DUE, SPREAD, write_page
+from study_onboard_page import DUE, MOST_TURN_DEG, NEAR_M, SPREAD, write_page
+from study_onboard_scores import Judged, score_condition
 
 from tracklake.pipeline.lake.lake import Lake, open_lake
 from tracklake.pipeline.synthetic import write_sample
@@ -31,23 +31,20 @@ from tracklake.pipeline.synthetic.onboard.instrument import instrument_drive
 from tracklake.pipeline.synthetic.onboard.lidar import Lidar
 from tracklake.pipeline.synthetic.onboard.motion import find_drives
 from tracklake.pipeline.synthetic.onboard.sensing import InstrumentConfig, sense_drive
-from tracklake.schemas.arrays import Floats, Singles
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.protocols import V2V
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.onboard import networks
 from tracklake.training.onboard.collisions import NEVER, find_overlaps
 from tracklake.training.onboard.feeds import Feeds, pair_feeds, select_feeds
-from tracklake.training.onboard.models import NETWORKS, Forecaster, make_forecaster, predict_places, predict_turns
+from tracklake.training.onboard.models import NETWORKS, Forecaster, make_forecaster, predict_turns
 from tracklake.training.onboard.samples import FEATURE_NUMBER, Samples, build_samples, describe_truth, split_samples
-from tracklake.training.onboard.scores import bootstrap_mean, measure_samples
 from tracklake.training.onboard.training import run_network, train_network
 from tracklake.training.runs.config import TrainConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 PENETRATIONS = (0.0, 0.1, 0.3, 0.6, 1.0)
 LEARNED = ("stacked-lstm", "lstm-encoder-decoder")
-NEAR_M = 100.0
-"""Distance along the road, either way, within which vehicles are judged."""
 AROUND_TICKS = 40
 """Ticks of the drive before the first and after the last moment at which a warning is due: history, future and 2 s."""
 LEAST_TICKS = 80
@@ -92,6 +89,12 @@ class Condition:
         scanner = Lidar(step_deg=0.4) if self.lidar else None
         return InstrumentConfig(penetration=self.penetration, receiver=self.receiver, lidar=scanner, camera=None)
 
+    @property
+    def others(self) -> dict[str, "Condition"]:
+        """Conditions that lack one thing that this one has, by its name."""
+        without = {"lidar": replace(self, lidar=False), "dgps": replace(self, receiver="plain")}
+        return {name: other for name, other in without.items() if other != self}
+
 
 CONDITIONS = tuple(
     Condition(penetration, lidar, receiver)
@@ -105,7 +108,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=ROOT / "study" / "onboard")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "onboard-view.csv")
     parser.add_argument("--egos", type=int, default=1, help="per subset")
-    parser.add_argument("--due", type=int, default=3, help="egos around which a warning is due")
+    parser.add_argument("--due", type=int, default=6, help="egos around which a warning is due, at most")
     parser.add_argument("--epochs", type=int, default=6)
     options = parser.parse_args()
     began = time.monotonic()
@@ -121,7 +124,9 @@ def main() -> None:
     print(f"{time.monotonic() - began:6.0f} s  {lake.table('drives').collect().height} drives fused", flush=True)
     about = {"training_samples": learned, "epochs": options.epochs}
     about |= {f"searched_{name}": found[name].sum() for name in ("pairs", "due_pairs", "overlapping_pairs")}
-    about |= {"searched_egos": found.height}
+    with_due = found.filter(pl.col("moments") > 0)
+    about |= {"searched_egos": found.height, "searched_egos_due": with_due.height}
+    about |= {"searched_egos_turning": with_due.filter(pl.col("turn_deg") > MOST_TURN_DEG).height}
     rows = [{**row, **about} for row in score_egos(lake, egos, models)]
     pl.DataFrame(rows, infer_schema_length=None).write_csv(options.out, float_precision=4)
     write_page(options.out)
@@ -176,13 +181,15 @@ def spread_egos(lake: Lake, count: int) -> list[Ego]:
 def observe(
     tracks: pl.DataFrame, vehicles: pl.DataFrame, facts: dict[str, str], egos: Sequence[int]
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return `surrounding_truth` and `drives` of egos of a subset, without instruments."""
+    """Return `surrounding_truth` and `drives` of egos of a subset, without instruments, with the egos' largest turn."""
     truths, drives = [], []
     for ego in egos:
         sensed = sense_drive(tracks, vehicles, facts, ego, InstrumentConfig(lidar=None, camera=None))
         length_m, width_m, _ = sensed.motion.size_m[sensed.motion.ego]
         name = f"{facts['subset']}-{ego}"
-        drives.append({"subset": name, "ego_length_m": length_m, "ego_width_m": width_m})
+        yaw_rad = sensed.motion.yaw_rad[:, sensed.motion.ego]
+        turn_deg = np.degrees(np.abs(yaw_rad[V2V.horizon_ticks :] - yaw_rad[: -V2V.horizon_ticks]).max())
+        drives.append({"subset": name, "ego_length_m": length_m, "ego_width_m": width_m, "turn_deg": turn_deg})
         place = {"dataset": pl.lit("v2v"), "subset": pl.lit(name)}
         truths.append(sensed.truth.with_columns(**place, vehicle_id=pl.col("truth_id")))
     return pl.concat(truths), pl.DataFrame(drives)
@@ -221,9 +228,11 @@ def search_subset(tracks: pl.DataFrame, vehicles: pl.DataFrame, facts: dict[str,
     """Count, for each ego, the vehicles near it, those with a warning due by the true futures, and their moments.
 
     Vehicles whose body overlaps the ego's are errors of the recording: they are counted, and no reason to choose it.
+    `turn_deg` is how far the ego turns within the horizon at most.
     """
     drives = find_egos(tracks)
-    samples = build_overhead(*observe(tracks, vehicles, facts, drives["vehicle_id"].to_list()))
+    truth, observed = observe(tracks, vehicles, facts, drives["vehicle_id"].to_list())
+    samples = build_overhead(truth, observed)
     due = find_overlaps(samples, samples.place_m) > NEVER
     gap_m = np.abs(samples.place_m[..., 0]) - (samples.size_m[:, :1] + samples.ego_size_m[:, :1]) / 2
     touches = ((gap_m < 0) & (np.abs(samples.place_m[..., 1]) < NOMINAL_LANE_M / 2)).any(axis=1)
@@ -245,13 +254,18 @@ def search_subset(tracks: pl.DataFrame, vehicles: pl.DataFrame, facts: dict[str,
         pl.col("last").filter(sound).max(),
     )
     about = (pl.lit(value).alias(name) for name, value in facts.items())
-    return drives.join(counts, on="vehicle_id").sort("vehicle_id").select(*about, pl.all())
+    turning = drives.with_columns(observed["turn_deg"]).join(counts, on="vehicle_id")
+    return turning.sort("vehicle_id").select(*about, pl.all())
 
 
 def choose_due(found: pl.DataFrame, count: int) -> list[Ego]:
-    """Choose the egos with the most moments at which a warning is due, and the part of their drive around these."""
+    """Choose the egos with the most moments at which a warning is due, and the part of their drive around these.
+
+    Egos that turn further than MOST_TURN_DEG are left out.
+    """
     order = ("moments", "dataset", "subset", "vehicle_id")
-    most = found.filter(pl.col("moments") > 0).sort(order, descending=[True, False, False, False]).head(count)
+    sound = found.filter(pl.col("moments") > 0, pl.col("turn_deg") <= MOST_TURN_DEG)
+    most = sound.sort(order, descending=[True, False, False, False]).head(count)
     begin = pl.col("first_tick")
     part = (
         pl.max_horizontal(begin, begin + pl.col("first") - AROUND_TICKS),
@@ -318,71 +332,29 @@ def score_egos(lake: Lake, egos: Sequence[Ego], models: list[Forecaster]) -> Ite
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        for group, condition in product((SPREAD, DUE), CONDITIONS):
+        for group in (SPREAD, DUE):
             own = [ego for ego in egos if ego.group == group]
-            yield from ({"group": group, **row} for row in score_condition(lake, condition, own, models, seen))
+            judged: dict[Condition, Judged] = {}
+            for condition in CONDITIONS:
+                feeds = read_feeds(lake, condition, own)
+                others = {name: judged[other] for name, other in condition.others.items()}
+                judged[condition], rows = score_condition(feeds, models, seen, others)
+                about = {"group": group, **describe_feeds(feeds, condition)}
+                yield from ({**about, **row, "seconds": V2V.scored_s[-1]} for row in rows)
     finally:
         torch.set_num_threads(threads)
 
 
-def score_condition(
-    lake: Lake,
-    condition: Condition,
-    egos: Sequence[Ego],
-    models: list[Forecaster],
-    seen: dict[tuple[str, bytes], Singles],
-) -> Iterator[dict[str, object]]:
-    """Score all models on both views of egos under one condition; `seen` keeps predictions of the overhead view."""
-    feeds = read_feeds(lake, condition, egos)
-    overhead, perceived, ghosts = feeds.overhead, feeds.perceived, feeds.ghosts
-    strange = np.array([f"{drive}:{vehicle}" for drive, vehicle in zip(ghosts.subset, ghosts.vehicle_id, strict=True)])
-    missed = np.ones(len(overhead))
-    missed[feeds.shared] = 0.0
-    false = np.repeat((0.0, 1.0), (len(perceived), len(ghosts)))
+def describe_feeds(feeds: Feeds, condition: Condition) -> dict[str, object]:
+    """State a condition, and how many samples and vehicles it is judged by."""
+    overhead = feeds.overhead
     due = find_overlaps(overhead, overhead.place_m) > NEVER
-    about = {"penetration": condition.penetration, "lidar": condition.lidar, "receiver": condition.receiver}
-    about |= {"egos": len(np.unique(overhead.subset)), "vehicles": len(np.unique(overhead.vehicle))}
-    about |= {"samples": len(overhead), "warnings_due": int(due.sum())}
-    about |= {"vehicles_due": len(np.unique(overhead.vehicle[due]))}
-    about |= bound("missed_share", missed, overhead.vehicle)
-    about |= bound("false_share", false, np.append(perceived.vehicle, strange))
-    for model in models:
-        row = {**about, "model": model.name}
-        key = model.name, overhead.feature.tobytes()
-        if key not in seen:
-            seen[key] = predict_places(model.name, model.predict, overhead)
-        places = [seen[key], model.predict(perceived) if len(perceived) else perceived.place_m]
-        warned = np.zeros(len(overhead), bool)
-        warned[feeds.shared] = find_overlaps(perceived, places[1]) > NEVER
-        strange_warned = find_overlaps(ghosts, model.predict(ghosts)) > NEVER if len(ghosts) else np.zeros(0, bool)
-        for feed, own, wrong in (
-            ("overhead", find_overlaps(overhead, places[0]) > NEVER, strange_warned[:0]),
-            ("perceived", warned, strange_warned),
-        ):
-            row |= bound(f"{feed}_missed_warnings", (~own[due]).astype(np.float64), overhead.vehicle[due])
-            strangers = np.append(overhead.vehicle[~due], strange[: len(wrong)])
-            row |= bound(f"{feed}_false_warnings", np.append(own[~due], wrong).astype(np.float64), strangers)
-        shared = overhead.select(feeds.shared)
-        for feed, samples, place_m in (
-            ("overhead", shared, places[0][feeds.shared]),
-            ("perceived", perceived, places[1]),
-        ):
-            measured = measure_samples(model, samples, place_m)
-            row |= bound(f"{feed}_rmse_m", measured["rmse_m"][:, -1], samples.vehicle, squared=True)
-            row |= bound(f"{feed}_nll_nats", measured["nll_nats"][:, -1], samples.vehicle)
-        yield {**row, "n": len(perceived), "seconds": V2V.scored_s[-1]}
-
-
-def bound(
-    name: str, values: Floats, vehicles: npt.NDArray[np.str_], *, squared: bool = False
-) -> dict[str, float | None]:
-    """Return the mean of (B,) values with its 95 % interval over vehicles; the root of all three for squares."""
-    names = (name, f"{name}_low", f"{name}_high")
-    if not len(values):
-        return dict.fromkeys(names)
-    low, high = bootstrap_mean(values[:, None], np.unique(vehicles, return_inverse=True)[1])
-    figures = (float(values.mean()), float(low[0]), float(high[0]))
-    return dict(zip(names, (figure**0.5 if squared else figure for figure in figures), strict=True))
+    return {
+        **{"penetration": condition.penetration, "lidar": condition.lidar, "receiver": condition.receiver},
+        **{"egos": len(np.unique(overhead.subset)), "vehicles": len(np.unique(overhead.vehicle))},
+        **{"samples": len(overhead), "warnings_due": int(due.sum())},
+        **{"vehicles_due": len(np.unique(overhead.vehicle[due])), "n": len(feeds.perceived)},
+    }
 
 
 if __name__ == "__main__":
