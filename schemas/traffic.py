@@ -44,7 +44,7 @@ CAR_FOLLOWING = Table(
             )
             for regime in REGIMES
         },
-        "mean_speed_mps": column(pl.Float64, "mean speed of the follower", unit="m/s"),
+        "mean_speed_mps": column(pl.Float64, "mean speed of the follower, to 1e-6", unit="m/s"),
         "mean_gap_m": column(
             pl.Float64, "mean bumper-to-bumper gap; null where the leader's length is unknown", unit="m", nullable=True
         ),

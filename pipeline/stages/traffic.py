@@ -104,6 +104,6 @@ STAGE = Stage(
         "edie_cell_m",
         "edie_cell_s",
     ),
-    version=2,
+    version=3,
     build=build,
 )

@@ -114,8 +114,9 @@ def _measure(scene: Scene, entries: Integers, episode: Integers) -> pl.DataFrame
                 (pl.col("regime") == number).filter(known).mean().alias(f"{regime}_share")
                 for number, regime in enumerate(REGIMES)
             ),
-            mean_speed_mps=pl.col("speed_mps").mean(),
-            mean_gap_m=pl.col("gap_m").mean(),
+            # Polars may add in another order on other machines, which changes the last digits.
+            mean_speed_mps=pl.col("speed_mps").mean().round(6),
+            mean_gap_m=pl.col("gap_m").mean().round(6),
             least_gap_m=pl.col("gap_m").min(),
             least_ttc_s=pl.col("ttc_s").min(),
         )
