@@ -4,10 +4,14 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 from tracklake.schemas import SCHEMA_VERSION, TABLES, Table
+from tracklake.schemas.comparisons import VEHICLE_ERRORS
+from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 RAW_TABLES = (RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS)
+
+SCORE_TABLES = (EVALUATIONS, VEHICLE_ERRORS)
 
 HEADINGS = ("column", "dtype", "unit", "null", "bounds", "meaning")
 """Titles above the declaration of a table."""
@@ -26,6 +30,12 @@ The columns read, under the publishers' names and in their units. A line outside
 """
 
 
+SCORE_HEAD = """## Scores
+
+Files that `tracklake evaluate` writes; they are no tables of the lake.
+"""
+
+
 def format_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a Markdown table; a bar in a cell becomes a slash."""
     cells = (headings, ("---",) * len(headings), *rows)
@@ -34,7 +44,8 @@ def format_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list
 
 def write_tables() -> str:
     """Write the whole page."""
-    parts = [HEAD, *(_write_section(table, "##") for table in TABLES), RAW_HEAD]
+    parts = [HEAD, *(_write_section(table, "##") for table in TABLES), SCORE_HEAD]
+    parts += [*(_write_section(table, "###") for table in SCORE_TABLES), RAW_HEAD]
     parts += [_write_section(table, "###") for table in RAW_TABLES]
     return "\n".join(parts)
 

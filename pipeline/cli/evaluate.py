@@ -22,6 +22,7 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.score import BASELINE, finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
+from tracklake.schemas.comparisons import VEHICLE_ERRORS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
@@ -71,6 +72,12 @@ GainOption = Annotated[
         help="Score by recorded, filtered and reconstructed histories; the default where tracks_from is reconstructed.",
     ),
 ]
+VehicleErrorsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--vehicle-errors", help="Also write the summed errors of every run, vehicle and horizon to this .parquet."
+    ),
+]
 EveryTickOption = Annotated[
     bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
 ]
@@ -87,6 +94,7 @@ def evaluate(
     out: OutOption = None,
     every_tick: EveryTickOption = False,
     gain: GainOption = None,
+    vehicle_errors: VehicleErrorsOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -99,16 +107,19 @@ def evaluate(
         require_choice("--part", part, PARTS)
         if out is not None and out.suffix not in FORMATS:
             raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
+        if vehicle_errors is not None and vehicle_errors.suffix != ".parquet":
+            raise typer.BadParameter(f"--vehicle-errors ends with .parquet; got {vehicle_errors}")
         refuse_lake(out)
+        refuse_lake(vehicle_errors, "--vehicle-errors")
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         tensors = tensor_folder(root, load(root), settings)
         around = NEAREST if nearest is None else nearest
         plain = part == "eval" and around == NEAREST and published and not every_tick
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
-        if target is not None:
-            with explain_file_errors(target.parent):
-                target.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
+        for file in filter(None, (target, vehicle_errors)):
+            with explain_file_errors(file.parent):
+                file.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
         names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
@@ -125,6 +136,10 @@ def evaluate(
             terminal.print_line(describe_causality(tracks_from), style="dim")
             if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:
                 gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
+        if vehicle_errors is not None:
+            errors = pl.concat([VEHICLE_ERRORS.empty(), *(own.to_vehicle_errors() for own in found)])
+            _write_table(vehicle_errors, VEHICLE_ERRORS.validate(errors.sort(VEHICLE_ERRORS.key), where="evaluate"))
+            terminal.print_line(f"vehicle errors {vehicle_errors}: {errors.height:,} rows", style="dim")
         if target is not None:
             _write_table(target, table)
             terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")

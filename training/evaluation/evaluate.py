@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from tracklake.schemas.arrays import Integers
+from tracklake.schemas.comparisons import VEHICLE_ERRORS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.origin import DataOrigin, summarise_origins
@@ -35,7 +37,8 @@ class Evaluation:
     """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
     `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
-    `latency` is empty where it was not measured. `data_origin` is of all subsets of the tensors.
+    `latency` is empty where it was not measured. `data_origin` is of all subsets of the tensors. `vehicle_sums` has the
+    columns of `schemas.comparisons.VEHICLE_ERRORS` but for the first three; `run` is the content of the run's config.
     """
 
     model: str
@@ -48,6 +51,8 @@ class Evaluation:
     scores: tuple[Score, ...]
     nearest: int | None = None
     latency: Mapping[str, float] = field(default_factory=dict)
+    vehicle_sums: pl.DataFrame = field(default_factory=pl.DataFrame, repr=False, compare=False)
+    run: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def horizons(self) -> tuple[Score, ...]:
@@ -76,6 +81,13 @@ class Evaluation:
             for own in self.scores
         ]
         return pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
+
+    def to_vehicle_errors(self) -> pl.DataFrame:
+        """Convert to rows of `schemas.comparisons.VEHICLE_ERRORS`."""
+        drawn = self.run.get("training", {}).get("seed") if self.run.get("recipe") else None
+        named = {"run": self.model, "model": self.run.get("model", self.model), "seed": drawn}
+        rows = self.vehicle_sums.with_columns(pl.lit(value).alias(name) for name, value in named.items())
+        return VEHICLE_ERRORS.conform(rows.lazy()).sort(VEHICLE_ERRORS.key).collect()
 
 
 class EmptyPartError(TracklakeError):
@@ -106,6 +118,7 @@ def evaluate(
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
     found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)
+    found = replace(found, run=own.config)
     if with_latency:
         latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
         found = replace(found, latency=latency)
@@ -160,7 +173,34 @@ def measure_errors(
         vehicles=int(strata.vehicle[-1]) + 1,
         scores=tally.score(at, protocol.rate_hz),
         nearest=nearest if reads == "scene" else None,
+        vehicle_sums=_list_vehicle_sums(folder, samples, tally, at),
     )
+
+
+def _list_vehicle_sums(folder: TensorFolder, samples: Integers, tally: Tally, seconds: Sequence[float]) -> pl.DataFrame:
+    """List the sums of each vehicle of a part at some horizons that one of its samples reaches."""
+    sums = tally.sum_vehicles(seconds, folder.protocol.rate_hz)
+    first = np.unique(tally.strata.vehicle[tally.strata.of_sample], return_index=True)[1]
+    run = folder.runs_of(folder.sample_row[samples[first]])
+    subsets = pl.DataFrame(folder.index["subsets"]).select("dataset", "subset")[folder.run_subset[run]]
+    columns = {
+        "squared_longitudinal_m2": "longitudinal2",
+        "squared_lateral_m2": "lateral2",
+        "distance_m": "distance",
+        "nll_nats": "nll",
+    }
+    vehicles = subsets.with_columns(pl.Series("vehicle_id", folder.run_vehicle_id[run]))
+    return pl.concat(
+        vehicles.with_columns(
+            pl.lit(float(ahead)).alias("seconds"),
+            pl.Series("n", sums["n"][:, at], dtype=pl.Int64, strict=False),
+            *(
+                pl.Series(column, sums[name][:, at]) if name in sums else pl.lit(None, dtype=pl.Float64).alias(column)
+                for column, name in columns.items()
+            ),
+        )
+        for at, ahead in enumerate(seconds)
+    ).filter(pl.col("n") > 0)
 
 
 def measure_latency(

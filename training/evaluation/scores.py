@@ -172,13 +172,7 @@ class Tally:
         Raises:
             UsageError: the horizon has no tick at these seconds.
         """
-        horizon = self._shape[1]
-        at = np.round(np.multiply(seconds, rate_hz)).astype(np.int64)
-        for own, tick in zip(seconds, at, strict=True):
-            if abs(tick - own * rate_hz) > 1e-6 or not 1 <= tick <= horizon:
-                raise UsageError(
-                    f"no tick lies {own:g} s ahead: expected multiples of {1 / rate_hz:g} s up to {horizon / rate_hz:g}"
-                )
+        at = self._find_ticks(seconds, rate_hz)
         sums = {name: total[:, at - 1] for name, total in self.sums.items()}
         rows: list[Score] = []
         for dataset, group, members in self.strata.list_groups():
@@ -186,6 +180,23 @@ class Tally:
                 sums |= self._count_majority(members, sums["n"])
             rows += _score_group(dataset, group, members, sums, self.strata.vehicle, seconds)
         return tuple(rows)
+
+    def sum_vehicles(self, seconds: Sequence[float], rate_hz: int) -> dict[str, Floats]:
+        """Sum up the samples of each vehicle at some horizons, (V, T) each; errors are those of `score`."""
+        at = self._find_ticks(seconds, rate_hz)
+        starts = np.unique(self.strata.vehicle, return_index=True)[1]
+        return {name: np.add.reduceat(total[:, at - 1], starts, axis=0) for name, total in self.sums.items()}
+
+    def _find_ticks(self, seconds: Sequence[float], rate_hz: int) -> Integers:
+        """Find the ticks (T,) of some horizons, 1 at least; UsageError where there is none."""
+        horizon = self._shape[1]
+        at: Integers = np.round(np.multiply(seconds, rate_hz)).astype(np.int64)
+        for own, tick in zip(seconds, at, strict=True):
+            if abs(tick - own * rate_hz) > 1e-6 or not 1 <= tick <= horizon:
+                raise UsageError(
+                    f"no tick lies {own:g} s ahead: expected multiples of {1 / rate_hz:g} s up to {horizon / rate_hz:g}"
+                )
+        return at
 
     def _count_majority(self, members: Flags, n: Floats) -> dict[str, Floats]:
         """Count samples whose maneuver is a dataset's most frequent one: (P, T); of equally frequent ones the first."""

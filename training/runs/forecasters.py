@@ -1,7 +1,9 @@
 """Models and runs by name, ready to predict samples of a tensor folder."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -15,11 +17,15 @@ class UnknownRunError(TracklakeError):
 
 @dataclass(frozen=True)
 class Forecaster:
-    """A model that is ready to predict: name of the run or model, the model itself, and the kind of its input."""
+    """A model that is ready to predict: name of the run or model, the model itself, and the kind of its input.
+
+    `config` is the content of the run's `config.json`; empty where the model has no run.
+    """
 
     name: str
     predictor: Predictor
     reads: Reads
+    config: Mapping[str, Any] = field(default_factory=dict)
 
 
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
@@ -38,7 +44,7 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
         model = find_model(config["model"])
         for part in sorted(parts - {"train"}) if model.learns else ():
             refuse_leak(config, folder, part)
-        return Forecaster(name, predictor, model.reads)
+        return Forecaster(name, predictor, model.reads, config)
     refuse_unfinished(models / name)
     if Path(name).name == name and (models / name / "metrics.json").is_file():
         raise StaleRunError(f"{models / name}: a run without its config.json; train it again")

@@ -13,6 +13,7 @@ from rich.console import Console
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.comparisons import VEHICLE_ERRORS
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
@@ -26,12 +27,17 @@ def comparable():
 
 
 @pytest.fixture(scope="module")
-def said(command, lake, tmp_path_factory):
+def out(tmp_path_factory):
+    return tmp_path_factory.mktemp("scores")
+
+
+@pytest.fixture(scope="module")
+def said(command, lake, out):
     """The baseline, by name: nothing is written into the lake."""
-    out = tmp_path_factory.mktemp("scores") / "table.parquet"
-    done = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--out", out, "--json")
+    files = ("--out", out / "table.parquet", "--vehicle-errors", out / "errors.parquet")
+    done = command.here("evaluate", "constant-velocity", "--lake", lake.root, *files, "--json")
     assert done.code == 0, done.err
-    return json.loads(done.out), pl.read_parquet(out)
+    return json.loads(done.out), pl.read_parquet(out / "table.parquet")
 
 
 def test_scores_of_synthetic_data_say_so_and_have_no_published_rows(command, lake, said):
@@ -81,6 +87,17 @@ def test_groups_and_data_sets_add_up(said):
     )
     assert min(touched) > 0, "the sample's defects are findings"
     assert all(of_both <= own for own, of_both in zip(touched, in_error, strict=True))
+
+
+def test_errors_of_vehicles_add_up_to_the_scores(said, out):
+    errors = VEHICLE_ERRORS.validate(pl.read_parquet(out / "errors.parquet"), where="here")
+    squared = pl.col("squared_longitudinal_m2", "squared_lateral_m2")
+    sums = errors.group_by("seconds").agg(pl.col("n").sum(), pl.len(), pl.sum_horizontal(squared.sum()).alias("sum"))
+    scores = said[1].filter(dataset="all", group="all", average="samples").sort("seconds")
+    sums = sums.sort("seconds").with_columns(rmse_m=(pl.col("sum") / pl.col("n")).sqrt())
+    assert sums["n"].equals(scores["n"])
+    assert sums["len"].to_list() == scores["vehicles"].to_list()
+    assert sums["rmse_m"].to_list() == pytest.approx(scores["rmse_m"].to_list())
 
 
 def list_files(lake):
@@ -178,5 +195,10 @@ def test_a_part_without_samples_and_misuses(command, lake, tmp_path):
     empty = command.here("evaluate", "constant-velocity", "--part", "val", "--lake", lake.root)
     assert empty.code == 1
     assert "has no samples in `val`" in empty.err
-    for misuse in (("--out", tmp_path / "table.txt"), ("--by", "weather"), ("--nearest", "-1")):
+    for misuse in (
+        ("--out", tmp_path / "table.txt"),
+        ("--vehicle-errors", "errors.csv"),
+        ("--by", "weather"),
+        ("--nearest", "-1"),
+    ):
         assert command.here("evaluate", *misuse, "--lake", lake.root).code == 2, misuse

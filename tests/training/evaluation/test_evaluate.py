@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 from tensor_tables import CLOCK, TINY, drive, finding, sample_everything, split_row, write
 
+from tracklake.schemas.comparisons import VEHICLE_ERRORS
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -66,6 +67,14 @@ def test_errors_of_constant_velocity_by_hand(tmp_path):
     assert (after_2_s.seconds, after_2_s.n) == (2, 1)
     assert after_2_s.rmse_m == pytest.approx(0.0, abs=1e-6)
     assert result.to_dict()["horizons"][0]["n"] == 2
+    errors = VEHICLE_ERRORS.validate(result.to_vehicle_errors(), where="here")
+    assert errors.drop("squared_longitudinal_m2", "squared_lateral_m2", "distance_m").rows() == [
+        ("constant-velocity", "constant-velocity", None, "highd", "b", vehicle, seconds, 1, None)
+        for vehicle, seconds in ((1, 1.0), (1, 2.0), (2, 1.0))
+    ]
+    assert errors["squared_longitudinal_m2"].to_list() == pytest.approx([9, 0, 0], abs=1e-6)
+    assert errors["squared_lateral_m2"].to_list() == pytest.approx([16, 0, 0], abs=1e-6)
+    assert errors["distance_m"].to_list() == pytest.approx([5, 0, 0], abs=1e-6)
 
 
 class Says:

@@ -1,0 +1,1 @@
+"""Evidence for or against a model: intervals of differences between models."""

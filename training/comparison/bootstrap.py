@@ -1,0 +1,153 @@
+"""Differences between two models with intervals over vehicles and seeds, paired by vehicle.
+
+Samples of one vehicle depend on each other, and networks of other seeds err differently on the same vehicles: vehicles
+and seeds are crossed. So vehicles are drawn with replacement, the same for both models, and seeds of each model
+independently (Owen 2007, The pigeonhole bootstrap, Annals of Applied Statistics 1). One fewer are drawn than there are,
+so that few seeds do not make an interval too narrow (Rao and Wu 1988, Journal of the American Statistical Association
+83). Vehicles are taken for independent, which those of one traffic jam are not quite.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from tracklake.schemas.arrays import Floats, Integers
+from tracklake.schemas.comparisons import COMPARED_FIGURES, VEHICLE
+from tracklake.schemas.errors import TracklakeError, UsageError
+
+RESAMPLES = 2000
+"""Number of times that vehicles and seeds are drawn."""
+INTERVAL = (2.5, 97.5)
+"""Percentiles of the resampled differences between which an interval lies."""
+MAX_DRAWS = 1 << 22
+"""Largest number of counts drawn at once, so that many vehicles do not fill the memory."""
+
+
+class SamplesDifferError(TracklakeError):
+    """Two tables of errors are not of the same samples, so that they cannot be paired."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Sums of one figure: total (S, V, T) by seed, vehicle and horizon, over n (V, T) samples."""
+
+    keys: pl.DataFrame  # of VEHICLE, in the order of V
+    seconds: list[float]
+    seeds: list[int | None]
+    n: Floats
+    total: Floats
+
+
+def compare_errors(
+    a: pl.DataFrame, b: pl.DataFrame, figure: str = "rmse_m", *, resamples: int = RESAMPLES, seed: int = 0
+) -> pl.DataFrame:
+    """Compare two models' errors, rows of `schemas.comparisons.VEHICLE_ERRORS` with any number of seeds each.
+
+    Returns, by `seconds`: n, vehicles, a_seeds, b_seeds, a_value and b_value (means over the seeds), difference
+    (a_value - b_value), and low and high, its 95 % interval; null where fewer than two vehicles are left. Rows of one
+    seed and vehicle are summed, so that an evaluation may be in pieces. The interval covers seeds only where a model
+    has several.
+
+    Raises:
+        SamplesDifferError: the tables, or the seeds of one table, have other vehicles or numbers of samples.
+        UsageError: no such figure, or one that a table does not have.
+    """
+    own, other = arrange_errors(a, figure, "a"), arrange_errors(b, figure, "b")
+    _refuse_other_samples(own, other)
+    root = figure.startswith("rmse")
+    differences = np.concatenate(
+        [
+            _average_seeds(own, vehicles, first, root=root) - _average_seeds(other, vehicles, second, root=root)
+            for vehicles, first, second in _draw_all(own, other, resamples, seed)
+        ]
+    )
+    values = [
+        _average_seeds(one, np.ones((1, len(one.keys))), np.ones((1, len(one.seeds))), root=root)[0]
+        for one in (own, other)
+    ]
+    vehicles = (own.n > 0).sum(axis=0)
+    bounds = np.full((2, len(own.seconds)), np.nan)
+    if (enough := vehicles > 1).any():
+        bounds[:, enough] = np.nanpercentile(differences[:, enough], INTERVAL, axis=0)
+    table = {
+        "seconds": own.seconds,
+        "n": own.n.sum(axis=0).astype(np.int64),
+        "vehicles": vehicles,
+        "a_seeds": len(own.seeds),
+        "b_seeds": len(other.seeds),
+        "a_value": values[0],
+        "b_value": values[1],
+        "difference": values[0] - values[1],
+        "low": bounds[0],
+        "high": bounds[1],
+    }
+    return pl.DataFrame(table).with_columns(pl.col("low", "high").fill_nan(None))
+
+
+def arrange_errors(table: pl.DataFrame, figure: str, name: str = "the table") -> Errors:
+    """Arrange the sums of a figure by seed, vehicle and horizon; the errors are those of `compare_errors`."""
+    if figure not in COMPARED_FIGURES:
+        raise UsageError(f"no figure `{figure}` to compare: expected one of {', '.join(COMPARED_FIGURES)}")
+    summands = COMPARED_FIGURES[figure]
+    if table.is_empty() or table.select(pl.col(summands).is_null().any()).row(0) != (False,) * len(summands):
+        raise UsageError(f"{name} has no `{figure}` of every vehicle: expected sums in {', '.join(summands)}")
+    sums = table.group_by("seed", *VEHICLE, "seconds").agg(
+        pl.col("n").sum(), pl.sum_horizontal(pl.col(summands).sum()).alias("total")
+    )
+    (seeds, *_), (keys, *_), (seconds, *_) = found = [_number(sums, *by) for by in (["seed"], VEHICLE, ["seconds"])]
+    at = tuple(numbers for _, numbers in found)
+    n, total = (np.zeros((len(seeds), len(keys), len(seconds))) for _ in range(2))
+    n[at], total[at] = sums["n"].to_numpy(), sums["total"].to_numpy()
+    if (n != n[0]).any():
+        raise SamplesDifferError(f"{name} has other samples for one seed than for another: evaluate all on the same")
+    return Errors(keys, seconds["seconds"].to_list(), seeds["seed"].to_list(), n[0], total)
+
+
+def _number(rows: pl.DataFrame, *by: str) -> tuple[pl.DataFrame, Integers]:
+    """Return the distinct values of some columns, sorted, and the position of each row among them."""
+    values = rows.select(by).unique().sort(by)
+    numbered = rows.select(by).join(
+        values.with_row_index("at"), on=by, how="left", nulls_equal=True, maintain_order="left"
+    )
+    return values, numbered["at"].to_numpy().astype(np.int64)
+
+
+def _refuse_other_samples(a: Errors, b: Errors) -> None:
+    """Raise SamplesDifferError where two tables do not have the same vehicles, horizons and numbers of samples."""
+    if a.seconds != b.seconds:
+        raise SamplesDifferError(f"compare at the same horizons: a has {a.seconds} s, b has {b.seconds} s")
+    if not a.keys.equals(b.keys) or (a.n != b.n).any():
+        only = [one.keys.join(two.keys, on=list(VEHICLE), how="anti").height for one, two in ((a, b), (b, a))]
+        raise SamplesDifferError(
+            f"compare on the same samples: {only[0]} vehicles are in a only, {only[1]} in b only, and "
+            f"{int(a.n.sum()):,} samples stand against {int(b.n.sum()):,}; evaluate both on the same tensors and part"
+        )
+
+
+def _draw_all(a: Errors, b: Errors, resamples: int, seed: int) -> Iterator[tuple[Integers, Integers, Integers]]:
+    """Draw how often each vehicle and each seed of a and b counts: (r, V), (r, S_a), (r, S_b), r at a time."""
+    counts = (len(a.keys), len(a.seeds), len(b.seeds))
+    draws = [np.random.default_rng((seed, number)) for number in range(len(counts))]
+    most = max(1, MAX_DRAWS // counts[0])
+    for first in range(0, resamples, most):
+        size = min(most, resamples - first)
+        vehicles, own, other = (draw_counts(draw, count, size) for draw, count in zip(draws, counts, strict=True))
+        yield vehicles, own, other
+
+
+def draw_counts(draw: np.random.Generator, count: int, resamples: int) -> Integers:
+    """Draw (resamples, count) how often each of `count` units counts, `count` - 1 in all; 1 where there is one."""
+    return draw.multinomial(max(count - 1, 1), np.full(count, 1 / count), resamples)
+
+
+def _average_seeds(errors: Errors, vehicles: Floats | Integers, seeds: Floats | Integers, *, root: bool) -> Floats:
+    """Average a figure over weighted vehicles (R, V), then over weighted seeds (R, S): (R, T)."""
+    sums = np.einsum("rv,svt->rst", vehicles.astype(np.float64), errors.total, optimize=True)
+    with np.errstate(invalid="ignore", divide="ignore"):  # none of the vehicles drawn reaches the horizon
+        figure = sums / (vehicles @ errors.n)[:, None]
+    averaged: Floats = np.einsum(
+        "rs,rst->rt", seeds / seeds.sum(axis=1, keepdims=True), np.sqrt(figure) if root else figure
+    )
+    return averaged
