@@ -223,7 +223,8 @@ def _take_step(
     loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
     torch.nn.utils.clip_grad_norm_(network.parameters(), plan.recipe.max_gradient_norm)
     optimizer.step()
-    state.count_step(_require_finite(loss.item(), plan, state), samples)
+    supervised = int(network.supervised(observed, truth).sum())
+    state.count_step(_require_finite(loss.item(), plan, state), samples, supervised)
     state.stepping_s += time.perf_counter() - start
 
 
@@ -361,6 +362,8 @@ def _describe_training(plan: Plan, state: TrainingState, network: "Network") -> 
         "seconds": round(state.elapsed_s, 3),  # in the loop
         "steps": state.step,
         "samples_seen": state.samples,  # in all steps
+        "supervised_positions": state.supervised,  # true positions that the loss covered, in all steps
+        "supervised_positions_per_step": round(state.supervised / state.step, 1),
         "samples_per_s": round(state.samples / state.stepping_s, 1),  # reading included
         "data_share": round(state.reading_s / state.stepping_s, 4),
         "phases": state.describe_phases(),

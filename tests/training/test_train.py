@@ -18,6 +18,7 @@ from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models import MODELS, Phase, Recipe
+from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.train import DivergedError, TrainConfig, train
 
@@ -111,6 +112,19 @@ def test_an_epoch_is_every_training_sample_once_in_an_order_of_its_own(tensors, 
         assert sorted(epoch) == futures_of(tensors, "train")
     assert epochs[0] != epochs[1]
     assert [len(future) for *_, future in built[0].seen[:steps]] == [32] * (steps - 1) + [n - 32 * (steps - 1)]
+
+
+@pytest.mark.parametrize("name", ["v-lstm", "attention-h2"])
+def test_supervised_positions_are_those_that_the_loss_covers(name, tensors, tmp_path):
+    """A scene's loss covers the known future of every vehicle in it, that of a grid the sample's own."""
+    folder = TensorFolder.open(tensors)
+    train_samples = folder.samples_of("train")
+    _, truth = read_samples(folder, train_samples, MODELS[name].reads)
+    metrics = train(name, tensors, tmp_path / "run", TrainConfig(epochs=1, batch_size=16))
+    assert metrics["samples_seen"] == len(train_samples)
+    assert metrics["supervised_positions"] == truth.future_mask.sum() > 0
+    per_step = truth.future_mask.sum() / -(-len(train_samples) // 16)
+    assert metrics["supervised_positions_per_step"] == pytest.approx(per_step, abs=0.05)
 
 
 def test_an_epoch_of_fewer_samples_draws_others_each_time(tensors, tmp_path, monkeypatch):

@@ -178,11 +178,15 @@ class SceneAttention(Network):
             mean = mean + vehicles.place_m[..., None, :] + vehicles.velocity[..., None, :] * self.ahead[:, None]
         return mean, sigma, rho
 
+    def supervised(self, observed: ObservedScene[Tensor], truth: Truth[Tensor]) -> Tensor:
+        """Return the known positions (B, V, F) of all vehicles that are there."""
+        return truth.future_mask & observed.vehicle_mask[..., None]
+
     def loss(self, observed: ObservedScene[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
-        """Return () nll_weight x mean NLL + distance_weight x mean distance over all known positions."""
+        """Return () nll_weight x mean NLL + distance_weight x mean distance over all supervised positions."""
         check_phase(phase, "both")
         mean, sigma, rho = self(observed)
-        known = truth.future_mask & observed.vehicle_mask[..., None]
+        known = self.supervised(observed, truth)
         nll = gaussian_nll(mean, sigma, rho, truth.future, known)
         return self.nll_weight * nll + self.distance_weight * mean_distance(mean, truth.future, known)
 

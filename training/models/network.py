@@ -35,6 +35,10 @@ class Network(nn.Module):
         """
         raise NotImplementedError
 
+    def supervised(self, observed: Any, truth: Truth[Tensor]) -> Tensor:  # noqa: ANN401, ARG002  (as above; what a scene's loss covers depends on it)
+        """Return the true positions that the loss covers: (B, F), of scenes (B, V, F)."""
+        return truth.future_mask
+
     def predict_tensors(self, observed: Any) -> Prediction:  # noqa: ANN401  (as above)
         """Predict B samples given as tensors on the weights' device; called by `infer`."""
         raise NotImplementedError

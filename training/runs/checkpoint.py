@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch.optim import Optimizer
 
 CHECKPOINT_FILE = "checkpoint.pt"
-CHECKPOINT_VERSION = 4
+CHECKPOINT_VERSION = 5
 """Number of the checkpoint's layout; it grows when older checkpoints cannot be resumed exactly."""
 RESTART = "start over with `--anew`"
 

@@ -55,6 +55,7 @@ class TrainingState:
 
     step: int = 0  # optimiser steps done; gives the epoch and the place in it, too
     samples: int = 0  # in these steps
+    supervised: int = 0  # true positions that the loss covered in these steps
     elapsed_s: float = 0.0  # since the start, without interruptions
     stepping_s: float = 0.0  # time in steps, reading included
     reading_s: float = 0.0  # time for reading batches
@@ -80,10 +81,11 @@ class TrainingState:
         self.smooth_loss = math.nan
         self.best_loss = self.best_epoch = self.best_weights = None
 
-    def count_step(self, loss: float, samples: int) -> None:
-        """Count one more step with its loss and number of samples."""
+    def count_step(self, loss: float, samples: int, supervised: int) -> None:
+        """Count one more step with its loss and its numbers of samples and of supervised positions."""
         self.step += 1
         self.samples += samples
+        self.supervised += supervised
         self.losses.append(loss)
         self.smooth_loss = loss if math.isnan(self.smooth_loss) else 0.98 * self.smooth_loss + 0.02 * loss
 

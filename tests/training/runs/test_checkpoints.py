@@ -334,8 +334,8 @@ def seal(header, content):
 @pytest.mark.parametrize(
     ("header", "content", "reported"),
     [
-        ({"version": 3}, {}, "no checkpoint .*expected version 4, got 3"),
-        ({"version": torch.ones(3).tolist()}, {}, "no checkpoint .*expected version 4, got"),
+        ({"version": 4}, {}, "no checkpoint .*expected version 5, got 4"),
+        ({"version": torch.ones(3).tolist()}, {}, "no checkpoint .*expected version 5, got"),
         ({"run": 3}, {}, "no checkpoint that this version of tracklake can resume"),
         ({"run": {"training": [1]}}, {}, "no checkpoint that this version of tracklake can resume"),
         (

@@ -27,7 +27,7 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
     monkeypatch.setattr(
         tracklake.training.train.TrainingState,
         "count_step",
-        lambda self, loss, samples: (losses.append((loss, samples)), real(self, loss, samples)),
+        lambda self, loss, *counts: (losses.append((loss, counts[0])), real(self, loss, *counts)),
     )
     train("forgetful", tensors, tmp_path / "run", TrainConfig(log_steps=3))
     course, epochs = (read_log(tmp_path / "run" / name) for name in ("course.csv", "epochs.csv"))
