@@ -86,17 +86,20 @@ def train(
     """
     entry, folder, out = find_model(model), TensorFolder.open(tensors), Path(out)
     if not entry.learns:
-        return _write_baseline(entry, folder, out, dict(config.parameters) if config else {})
+        config = config or TrainConfig()
+        return _write_baseline(entry, folder.narrow(config.dataset, config.recording), out, dict(config.parameters))
     require_torch(model)
-    if not without_evaluation and len(folder.samples_of("eval")) == 0:
-        raise TracklakeError(
-            f"{tensors}: the split `{folder.split}` has no samples in `eval` to score the model on. Add recordings, or "
-            'set split = "time-blocks" or a shorter `split_block_s`, and run again; or give `--no-evaluation`.'
-        )
     with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
         plan = make_plan(entry, folder, config or started_with)
+        folder = plan.folder
+        if not without_evaluation and len(folder.samples_of("eval")) == 0:
+            raise TracklakeError(
+                f"{tensors}: the split `{folder.split}` has no samples in `eval` to score the model on. Add "
+                'recordings, or set split = "time-blocks" or a shorter `split_block_s`, and run again; or give '
+                "`--no-evaluation`."
+            )
         settings = vars(plan.config) | {"parameters": dict(plan.config.parameters)}
         run = describe_run(model, plan.parameters, settings, folder, plan.recipe)
         if stored:

@@ -12,7 +12,15 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
+from tracklake.pipeline.cli.options import (
+    JsonOption,
+    LakeOption,
+    OnlyDatasetOption,
+    OnlyRecordingOption,
+    ProtocolOption,
+    QuietOption,
+    require_choice,
+)
 from tracklake.pipeline.cli.score_tables import show_evaluations
 from tracklake.pipeline.cli.smoothing_gain import describe_causality, measure_gain, open_histories, show_gain
 from tracklake.pipeline.lake import load, refuse_lake
@@ -88,6 +96,8 @@ def evaluate(
     lake: LakeOption = None,
     part: Annotated[str, typer.Option("--part", help="train, val or eval.")] = "eval",
     protocol: ProtocolOption = None,
+    dataset: OnlyDatasetOption = None,
+    recording: OnlyRecordingOption = None,
     by: ByOption = None,
     published: PublishedOption = True,
     nearest: NearestOption = None,
@@ -100,8 +110,8 @@ def evaluate(
 ) -> None:
     """Score runs and models at each horizon, beside published figures.
 
-    The whole table goes to LAKE/evaluations/<protocol>.csv. Where RUNS, another part, --nearest, --every-tick or
-    --no-published are given, it goes to --out only.
+    The whole table goes to LAKE/evaluations/<protocol>.csv. Where RUNS, another part, --dataset, --recording,
+    --nearest, --every-tick or --no-published are given, it goes to --out only.
     """
     with command(quiet=quiet, json=json) as terminal:
         require_choice("--part", part, PARTS)
@@ -113,9 +123,9 @@ def evaluate(
         refuse_lake(vehicle_errors, "--vehicle-errors")
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
-        tensors = tensor_folder(root, load(root), settings)
+        tensors = TensorFolder.open(tensor_folder(root, load(root), settings)).narrow(dataset, recording)
         around = NEAREST if nearest is None else nearest
-        plain = part == "eval" and around == NEAREST and published and not every_tick
+        plain = part == "eval" and around == NEAREST and published and not every_tick and tensors.kept is None
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
         for file in filter(None, (target, vehicle_errors)):
             with explain_file_errors(file.parent):
@@ -125,7 +135,7 @@ def evaluate(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
         )
         table = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
-        comparable = print_comparability(terminal, root, TensorFolder.open(tensors), published=published)
+        comparable = print_comparability(terminal, root, tensors, published=published)
         if comparable:
             table = pl.concat([table, published_rows(settings.get_protocol().name, comparable)])
         table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
@@ -155,7 +165,7 @@ def evaluate(
 def _evaluate_all(
     terminal: Terminal,
     names: Iterable[str],
-    tensors: Path,
+    tensors: TensorFolder,
     models: Path,
     part: str,
     nearest: int,
@@ -178,10 +188,9 @@ def _evaluate_all(
 
 
 def _compare_histories(
-    terminal: Terminal, settings: Settings, names: Iterable[str], tensors: Path, part: str, nearest: int
+    terminal: Terminal, settings: Settings, names: Iterable[str], folder: TensorFolder, part: str, nearest: int
 ) -> pl.DataFrame:
     """Score models with histories of every kind of tracks, and show what smoothing gains."""
-    folder = TensorFolder.open(tensors)
     reader = LakeReader(settings.lake, load(settings.lake))
     inputs = open_histories(settings, reader, folder, part, nearest)
     models = [open_forecaster(name, folder, settings.lake / MODELS, frozenset({part})) for name in names]

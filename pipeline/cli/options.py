@@ -29,6 +29,12 @@ ColumnsOption = Annotated[
 RecordingOption = Annotated[
     str | None, typer.Option("--recording", help="Name of the recording, where a file's times do not tell it.")
 ]
+OnlyDatasetOption = Annotated[
+    str | None, typer.Option("--dataset", help="Only samples of this dataset (ngsim, highd or custom).")
+]
+OnlyRecordingOption = Annotated[
+    str | None, typer.Option("--recording", help="Only samples of this recording or subset (us-101-0750, 01-upper).")
+]
 ReplaceOption = Annotated[
     bool, typer.Option("--replace", help="Let SOURCE's files replace a recording's earlier files that SOURCE lacks.")
 ]

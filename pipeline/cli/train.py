@@ -12,6 +12,8 @@ from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST
 from tracklake.pipeline.cli.options import (
     JsonOption,
     LakeOption,
+    OnlyDatasetOption,
+    OnlyRecordingOption,
     ProtocolOption,
     QuietOption,
     read_pairs,
@@ -69,6 +71,8 @@ def train(
     model: Annotated[str, typer.Argument(help="A model's name, for instance lstm, or your own as mymodule:MyModel.")],
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
+    dataset: OnlyDatasetOption = None,
+    recording: OnlyRecordingOption = None,
     seconds: SecondsOption = None,
     epochs: EpochsOption = None,
     steps: StepsOption = None,
@@ -92,11 +96,12 @@ def train(
             raise typer.BadParameter(f"{model} does not learn; `tracklake evaluate {model}` scores it")
         given: dict[str, Any] = {"seconds": seconds, "epochs": epochs, "steps": steps, "patience": patience}
         given |= {"samples_per_epoch": samples_per_epoch, "seed": seed, "device": device, "threads": threads}
+        given |= {"dataset": dataset, "recording": recording}
         given |= _read_settings_of_model(entry, settings or [])
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
-        terminal.print_origin(describe_synthetic(TensorFolder.open(tensors).origins))
+        terminal.print_origin(describe_synthetic(TensorFolder.open(tensors).narrow(dataset, recording).origins))
         out = found.lake / RUNS / run_name
         try:
             with explain_file_errors(out), terminal.show_training(f"train {model}") as show:

@@ -67,8 +67,14 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
             skip(f"skipped a run: {stale}")
             continue
         if scored is not None and (config["protocol"], config["blocks"]) == (index["protocol"], index["blocks"]):
-            scores.append({"model": path.parent.name, **scored})
+            scores.append({"model": _name_run(path.parent.name, config), **scored})
     return scores
+
+
+def _name_run(name: str, config: dict[str, Any]) -> str:
+    """Add to a run's name what it was trained and scored on alone, as its errors are of other samples."""
+    alone = [str(own) for key in ("dataset", "recording") if (own := config.get("training", {}).get(key))]
+    return f"{name} ({' '.join(alone)} alone)" if alone else name
 
 
 def _read_score(path: Path) -> dict[str, Any] | None:

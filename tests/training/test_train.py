@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensor_tables import TINY, sample_everything, split_row, write
 from tensor_tables import drive as drive_vehicles
-from tiny_network import PARTS, RECIPE, Forgetful, read_log, register, write_tiny
+from tiny_network import PARTS, RECIPE, Forgetful, make_tables, read_log, register, write_tiny
 
 import tracklake.training.train
 from tracklake.schemas.errors import TracklakeError, UsageError
@@ -87,6 +87,34 @@ def test_every_model_that_learns_goes_through_the_loop(name, tensors, tmp_path):
 
 
 # What it is shown
+
+
+def test_training_on_one_recording_is_training_on_a_folder_that_holds_it_alone(tmp_path, monkeypatch):
+    """Its neighbors, the order of its samples and its scores are the same; the other recordings change nothing."""
+    register(monkeypatch)
+    names, parts = ("01-lower", "01-upper", "01-x", "011", "02-lower"), ("train", "eval", "val", "train", "eval")
+    splits = pl.concat([split_row(name, part) for name, part in zip(names, parts, strict=True)])
+    tables = make_tables(subsets=names)
+    every = write(tmp_path / "every", tables, splits)
+    alone = write(tmp_path / "alone", tables[:3], splits.filter(pl.col("subset").str.starts_with("01-")))
+    config = TrainConfig(epochs=3, patience=2)
+    expected = train("forgetful", alone, tmp_path / "expected", config)["evaluation"]
+    found = train("forgetful", every, tmp_path / "found", replace(config, recording="01", dataset="highd"))
+    assert found["evaluation"] | {"model": "expected"} == expected
+    run = json.loads((tmp_path / "found" / "config.json").read_text())
+    assert (run["training"]["dataset"], run["training"]["recording"]) == ("highd", "01")
+    assert (run["train_subsets"], run["val_subsets"]) == (["highd/01-lower"], ["highd/01-x"])
+    narrowed = TensorFolder.open(every).narrow(recording="01")
+    assert sorted(narrowed.origins) == ["highd/01-lower", "highd/01-upper", "highd/01-x"]
+    assert evaluate("found", narrowed, tmp_path).to_dict() == found["evaluation"]
+    assert evaluate("found", every, tmp_path).samples > found["evaluation"]["samples"]
+    with pytest.raises(TracklakeError, match="no samples of 02 in `train`"):
+        train("forgetful", every, tmp_path / "none", replace(config, recording="02"))
+    with pytest.raises(UsageError, match=r"expected the dataset of `01` \(highd\), got `ngsim`"):
+        train("forgetful", every, tmp_path / "none", replace(config, recording="01", dataset="ngsim"))
+    with pytest.raises(TracklakeError, match="no samples in `eval`"):
+        train("forgetful", every, tmp_path / "none", TrainConfig(epochs=1, recording="011"))
+    assert not any("none" in path.name for path in tmp_path.iterdir())
 
 
 def epochs_of(network, steps):

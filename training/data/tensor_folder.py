@@ -1,7 +1,7 @@
 """Tensor folders: opened memory-mapped, checked against their declaration, gathered in batches by indexing."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["Batch", "DeviceFolder", "SceneBatch", "TensorError", "TensorFolder"]
 
 _NAMES = frozenset(array.name for array in ARRAYS)
+_NO_PART = 255
+"""Code of samples and scenes that `narrow` leaves out, in `sample_part` and `scene_part`."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +42,14 @@ class TensorFolder:
     """The arrays of one split, mapped into memory and not read until indexed.
 
     Every array of `schemas.tensors.ARRAYS` is an attribute, too: `folder.sample_row`. `index` is the content of
-    `index.json`; the protocol of the samples gives H and F.
+    `index.json`; the protocol of the samples gives H and F. `kept` are the numbers of the subsets that `narrow` keeps.
     """
 
     path: Path
     index: dict[str, Any] = field(repr=False)
     protocol: Protocol
     arrays: Mapping[str, npt.NDArray[Any]] = field(repr=False)
+    kept: frozenset[int] | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
@@ -54,6 +57,31 @@ class TensorFolder:
         path = Path(path)
         index = read_index(path)
         return cls(path, index, read_protocol(path, index), map_arrays(path, index))
+
+    def narrow(self, dataset: str | None = None, recording: str | None = None) -> Self:
+        """Keep the samples and scenes of one dataset, and of one recording or subset in it; all others are of no part.
+
+        What is kept has the same input as before: neighbors are of the sample's own subset.
+
+        Raises:
+            UsageError: no subset has these names.
+        """
+        if dataset is recording is None:
+            return self
+        meant = self._find_subsets(*([] if recording is None else [recording]))
+        datasets = np.array([own["dataset"] for own in self.index["subsets"]])
+        if dataset is not None and dataset not in datasets[meant]:
+            known = ", ".join(np.unique(datasets[meant]))
+            what = "a dataset" if recording is None else f"the dataset of `{recording}`"
+            raise UsageError(f"{self.path}: expected {what} ({known}), got `{dataset}`")
+        meant &= (datasets == dataset) | (dataset is None)
+        scene = self.run_subset[self.runs_of(self.scene_row[self.scene_offset[:-1]])]
+        parts = {
+            "sample_part": np.where(meant[self.run_subset[self.runs_of(self.sample_row)]], self.sample_part, _NO_PART),
+            "scene_part": np.where(meant[scene], self.scene_part, _NO_PART),
+        }
+        narrowed = {name: part.astype(np.uint8) for name, part in parts.items()}
+        return replace(self, arrays={**self.arrays, **narrowed}, kept=frozenset(np.flatnonzero(meant).tolist()))
 
     def __getattr__(self, name: str) -> npt.NDArray[Any]:
         """Return an array by its name."""
@@ -125,8 +153,10 @@ class TensorFolder:
 
     @property
     def origins(self) -> dict[str, str]:
-        """Origin, recorded or synthetic, of each subset by name (`dataset/subset`)."""
-        return {f"{named['dataset']}/{named['subset']}": named["origin"] for named in self.index["subsets"]}
+        """Origin, recorded or synthetic, of each subset that is kept, by name (`dataset/subset`)."""
+        subsets = self.index["subsets"]
+        kept = (subsets[number] for number in sorted(range(len(subsets)) if self.kept is None else self.kept))
+        return {f"{named['dataset']}/{named['subset']}": named["origin"] for named in kept}
 
     @property
     def split(self) -> str:
@@ -143,12 +173,18 @@ class TensorFolder:
         """
         chosen = self.sample_part == _find_part(part)
         if names:
-            subsets = [own["subset"] for own in self.index["subsets"]]
-            meant = np.array([[own == name or own.startswith(f"{name}-") for name in names] for own in subsets])
-            if not meant.any(axis=0).all():
-                raise UsageError(f"{self.path}: expected names among {', '.join(subsets)}, got {', '.join(names)}")
-            chosen &= np.isin(self.run_subset[self.runs_of(self.sample_row)], np.flatnonzero(meant.any(axis=1)))
+            chosen &= self._find_subsets(*names)[self.run_subset[self.runs_of(self.sample_row)]]
         return np.flatnonzero(chosen)
+
+    def _find_subsets(self, *names: str) -> Flags:
+        """Return (subsets,) which subsets are named, or are of a recording that is; all of them without names."""
+        subsets = [own["subset"] for own in self.index["subsets"]]
+        if not names:
+            return np.ones(len(subsets), dtype=np.bool_)
+        meant = np.array([[own == name or own.startswith(f"{name}-") for name in names] for own in subsets])
+        if not meant.any(axis=0).all():
+            raise UsageError(f"{self.path}: expected names among {', '.join(subsets)}, got {', '.join(names)}")
+        return np.asarray(meant.any(axis=1))
 
     def read_part(self, part: str, *names: str) -> Batch:
         """Read all samples of a part as one batch, of all subsets or of those named (see `samples_of`)."""

@@ -96,7 +96,7 @@ class EmptyPartError(TracklakeError):
 
 def evaluate(
     name: str,
-    tensors: str | Path,
+    tensors: str | Path | TensorFolder,
     models: str | Path,
     part: str = "eval",
     *,
@@ -106,14 +106,15 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a trained run, or a model that needs no training.
 
-    `name` is a run's folder in `models`, or a model that does not learn. `nearest` is the largest number of vehicles
+    `name` is a run's folder in `models`, or a model that does not learn; `tensors` their folder, or the folder opened
+    (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles
     around the ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon.
 
     Raises:
         TensorError: the tensors are missing or damaged.
         TracklakeError: see `open_forecaster` and `measure_errors`.
     """
-    folder = TensorFolder.open(tensors)
+    folder = tensors if isinstance(tensors, TensorFolder) else TensorFolder.open(tensors)
     own = open_forecaster(name, folder, Path(models), frozenset({part}))
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None

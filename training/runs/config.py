@@ -49,6 +49,8 @@ class TrainConfig:
     schedule: ScheduleName | None = None  # cosine: warms up over the first 2 % and decays to 0
     max_gradient_norm: float | None = None  # larger gradients are scaled down
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of the model
+    dataset: str | None = None  # trains, validates and evaluates on this dataset alone
+    recording: str | None = None  # on this recording or subset alone
     seed: int = 0  # of the weights, of the order of samples, and of dropout
     # Threads of torch; None = its own choice. For networks this small more gain little on an idle machine, and wait for
     # each other on a busy one: a step takes ten times as long.
@@ -131,16 +133,18 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
     """Combine model, tensor folder and settings; TracklakeError where they do not allow a training."""
     if entry.recipe is None:
         raise UsageError(f"model `{entry.name}` does not learn; `tracklake evaluate {entry.name}` scores it")
+    folder = folder.narrow(config.dataset, config.recording)
+    alone = f" of {config.recording or config.dataset}" if folder.kept is not None else ""
     train, val = folder.samples_of("train"), folder.samples_of("val")
     if len(train) == 0:
         raise TracklakeError(
-            f"{folder.path}: the split `{folder.split}` has no samples in `train`: nothing to learn from; see "
+            f"{folder.path}: the split `{folder.split}` has no samples{alone} in `train`: nothing to learn from; see "
             '`sample_drops` for why (`tracklake sql "FROM sample_drops"`)'
         )
     if config.patience is not None and len(val) == 0:
         raise TracklakeError(
             f"{folder.path}: patience {config.patience} needs samples in `val` to judge by, and the split "
-            f"`{folder.split}` has none: set `validation_part = true` and run `tracklake run`, or train without it"
+            f"`{folder.split}` has none{alone}: set `validation_part = true` and run `tracklake run`, or leave it out"
         )
     device = find_device(config.device)
     given = {name: value for name in RECIPE_SETTINGS if (value := getattr(config, name)) is not None}

@@ -36,6 +36,25 @@ def test_options_come_to_the_training(command, lake, models):
     assert "reading them took" in said.out
 
 
+def test_one_data_set_is_trained_and_scored_alone(command, lake, models):
+    options = ("--lake", lake.root, "--steps", "2", "--set", "hidden=8", "--name", "highd-alone", "--dataset", "highd")
+    done = command.here("train", "lstm", *options, "--json")
+    assert done.code == 0, done.err
+    scored = json.loads(done.out)["evaluation"]
+    config = json.loads((models / "highd-alone" / "config.json").read_text())
+    assert {name.partition("/")[0] for name in config["train_subsets"]} == {"highd"}
+    of_all, of_highd = (
+        json.loads(command.here("evaluate", "highd-alone", "--lake", lake.root, *more, "--json").out)
+        for more in ((), ("--dataset", "highd"))
+    )
+    assert {own["dataset"] for own in of_highd["rows"]} == {"all", "highd"}
+    assert of_highd["evaluations"][0]["horizons"] == scored["horizons"]
+    counted = {own["n"] for own in of_all["rows"] if own["dataset"] == "highd" and own["group"] == "all"}
+    assert counted == {own["n"] for own in scored["horizons"]}
+    wrong = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--dataset", "pneuma")
+    assert (wrong.code, "expected a dataset (highd, ngsim), got `pneuma`" in wrong.err) == (2, True)
+
+
 def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypatch):
     steps = ("train", "lstm", "--lake", lake.root, "--name", "half", "--steps", "6", "--set", "hidden=8")
 

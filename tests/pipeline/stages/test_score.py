@@ -40,6 +40,11 @@ def test_runs_of_other_tensors_are_none(root):
     assert skipped == []
 
 
+def test_a_run_that_was_scored_on_one_recording_says_so(root):
+    write_run(root, "lstm", training={"dataset": "highd", "recording": None})
+    assert [own["model"] for own in collect_scores(root, MANIFEST, print)] == ["lstm (highd alone)", "whole"]
+
+
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
