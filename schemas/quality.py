@@ -313,6 +313,7 @@ class ShownSettings(TypedDict, total=False):
     split_seed: Annotated[int, "seed of the splits' searches and draws"]
     split_block_s: Annotated[float, "time-blocks: length of a block"]
     split_purge_s: Annotated[float, "time-blocks: time between two blocks"]
+    split_eval_block: Annotated[int | None, "time-blocks: number of the block that is eval; null: allocated by flow"]
     drop_cut_samples: Annotated[bool, "true: val and eval of time-blocks leave out samples with a neighbor cut off"]
 
 

@@ -21,11 +21,13 @@ MEANINGS: Mapping[str, str] = {
     BY_RECORDING: "whole recordings drawn at random; for comparison",
 }
 
+BLOCK_LEFT_OUT = "stretches of time of a carriageway with a purge between them, one of each carriageway evaluated on"
+"""Meaning of time-blocks with an `eval_block`."""
 _SEARCH = ("train_share", "validation", "seed", "restarts")
 
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
     FLOW_BALANCED: _SEARCH,
-    TIME_BLOCKS: (*_SEARCH, "block_s", "purge_s", "rate_hz", "history_s", "horizon_s", "min_future_s"),
+    TIME_BLOCKS: (*_SEARCH, "block_s", "purge_s", "rate_hz", "history_s", "horizon_s", "min_future_s", "eval_block"),
     CSP_2018: (),
     BY_RECORDING: ("train_share", "validation", "seed"),
 }
@@ -48,6 +50,7 @@ class SplitRecipe:
         history_s: what a sample needs before it, within its block.
         horizon_s: how far it looks ahead.
         min_future_s: what it needs after it, within its block.
+        eval_block: number of the block of each subset that is `eval`; None: blocks are allocated by flow.
     """
 
     name: SplitName
@@ -61,6 +64,12 @@ class SplitRecipe:
     history_s: float = 3.0
     horizon_s: float = 5.0
     min_future_s: float = 0.2
+    eval_block: int | None = None
+
+    @property
+    def meaning(self) -> str:
+        """How the split divides, for the table `split_recipes`."""
+        return MEANINGS[self.name] if self.eval_block is None else BLOCK_LEFT_OUT
 
     @property
     def shares(self) -> dict[str, int]:
@@ -93,9 +102,10 @@ class SplitRecipe:
 
     @property
     def parameters(self) -> str:
-        """Name and parameters of the split, as JSON."""
-        values = asdict(self)
-        return json.dumps({name: values[name] for name in ("name", *PARAMETERS[self.name])}, sort_keys=True)
+        """Name and parameters of the split, as JSON, without those that are None."""
+        values = {name: value for name, value in asdict(self).items() if value is not None}
+        known = values.keys() & {"name", *PARAMETERS[self.name]}
+        return json.dumps({name: values[name] for name in known}, sort_keys=True)
 
     @property
     def digest(self) -> str:

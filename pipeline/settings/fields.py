@@ -17,7 +17,7 @@ from tracklake.schemas.protocols import (
     Protocol,
     TracksFrom,
 )
-from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitName, SplitRecipe
+from tracklake.schemas.split_recipes import SPLIT_NAMES, TIME_BLOCKS, SplitName, SplitRecipe
 from tracklake.schemas.text import suggest_name
 from tracklake.schemas.traffic import SAFETY_THRESHOLDS
 
@@ -110,6 +110,12 @@ class DeclaredSettings(BaseModel):
     split_purge_s: float = Field(
         8.0, ge=0, description="time-blocks: time between two blocks, s; at least history and future"
     )
+    split_eval_block: int | None = Field(
+        None,
+        ge=0,
+        description="time-blocks: block of each recording that is eval, all others train (leave-one-block-"
+        "out); none: allocated by flow",
+    )
     drop_cut_samples: bool = Field(
         False, description="time-blocks: samples of val and eval with a neighbor that is cut off are left out"
     )
@@ -174,6 +180,13 @@ class DeclaredSettings(BaseModel):
             raise ValueError(f"expected {protocol.history_s + protocol.horizon_s:g} or more, history and future")
         return purge_s
 
+    @field_validator("split_eval_block")
+    @classmethod
+    def _check_eval_block(cls, block: int | None, others: ValidationInfo) -> int | None:
+        if block is not None and others.data.get("split") != TIME_BLOCKS:
+            raise ValueError(f'expected split = "{TIME_BLOCKS}" with it')
+        return block
+
     def get_protocol(self) -> Protocol:
         """Return the protocol with the settings that change it."""
         changes: dict[str, Any] = {name: getattr(self, name) for name in PROTOCOL_SETTINGS}
@@ -201,6 +214,7 @@ class DeclaredSettings(BaseModel):
                 history_s=protocol.history_s,
                 horizon_s=protocol.horizon_s,
                 min_future_s=protocol.min_future_s,
+                eval_block=self.split_eval_block,
             )
             for name in SPLIT_NAMES
             if name in self.splits

@@ -23,7 +23,7 @@ from tracklake.schemas import (
     SUBSETS,
 )
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.split_recipes import MEANINGS, TIME_BLOCKS, SplitRecipe
+from tracklake.schemas.split_recipes import TIME_BLOCKS, SplitRecipe
 
 
 def build(reader: LakeReader, settings: Settings) -> StageResult:
@@ -128,7 +128,7 @@ def _describe_recipes(made: dict[SplitRecipe, SplitResult], trains: str) -> pl.D
     rows = [
         {
             "split": recipe.name,
-            "meaning": MEANINGS[recipe.name],
+            "meaning": recipe.meaning,
             "claims_no_leakage": recipe.claims_no_leakage,
             "trains": recipe.name == trains,
             "window_s": recipe.window_s,

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 import polars as pl
 
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, tabulate_allocation
+from tracklake.pipeline.transforms.splits.allocation import (
+    allocate_flow_balanced,
+    leave_block_out,
+    tabulate_allocation,
+)
 from tracklake.pipeline.transforms.splits.comparisons import divide_by_id, divide_by_recording
 from tracklake.pipeline.transforms.splits.tables import Allocation
 from tracklake.pipeline.transforms.splits.time_blocks import (
@@ -72,7 +76,7 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
         )
     seen, sampled = pl.concat(visits), pl.concat(weights)
     units = describe_blocks(blocks, inputs.subsets, seen, sampled)
-    allocation = allocate_flow_balanced(units, recipe)
+    allocation = (allocate_flow_balanced if recipe.eval_block is None else leave_block_out)(units, recipe)
     left_out = find_left_out(seen, allocation.splits)
     # The search counts a vehicle in every block in which it is; what the parts hold is known only afterwards.
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)

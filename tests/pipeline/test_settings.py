@@ -49,6 +49,7 @@ def test_what_is_set_takes_its_place(tmp_path, monkeypatch):
         ({"protocol": "grid-2021", "min_future_s": 2.5}, "expected 2 or less, the horizon of the protocol grid-2021"),
         ({"protocol": "csp-2018", "splits": ["flow-balanced"]}, "expected 'csp-2018' among them"),
         ({"protocol": "csp-2018", "split": "time-blocks", "splits": ["csp-2018"]}, "expected 'time-blocks' among them"),
+        ({"split_eval_block": 0}, 'expected split = "time-blocks" with it'),
         ({"protocol": "mha-2020", "split_purge_s": 5.9}, "expected 6 or more, history and future"),
     ],
 )

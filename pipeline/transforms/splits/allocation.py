@@ -1,7 +1,7 @@
-"""The flow-balanced allocation of subsets to parts.
+"""The flow-balanced allocation of subsets to parts, and the one that leaves one block of each out of training.
 
-No subset is in two parts, so the evaluation data cannot be reached from the training data. Among such allocations the
-one is chosen whose parts differ least in the sample-weighted mean and standard deviation of `vehicles_per_lane_s`.
+No subset is in two parts, so the evaluation data cannot be reached from the training data. Among such allocations
+the one is chosen whose parts differ least in the sample-weighted mean and standard deviation of `vehicles_per_lane_s`.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,8 @@ from tracklake.pipeline.transforms.splits.search import (
     sum_facts,
 )
 from tracklake.pipeline.transforms.splits.tables import COLUMNS, Allocation, add_defaults, tabulate_units
+from tracklake.schemas.columns import PARTS
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.split_recipes import SplitRecipe
 
 
@@ -66,15 +68,37 @@ def allocate_flow_balanced(subsets: pl.DataFrame, recipe: SplitRecipe) -> Alloca
     return tabulate_allocation(pl.concat(allocated), recipe)
 
 
+def leave_block_out(blocks: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
+    """Make the block `eval_block` of each subset its evaluation part; all others train.
+
+    With a validation part, `val` is the block half the subset's blocks away, in subsets of at least three: next to
+    eval, more vehicles would be in both and lost to both. A subset without that block is in train, but for `val`.
+
+    `blocks` have the columns of `splits.tables.COLUMNS`, and `block`.
+
+    Raises:
+        UsageError: no subset has that block.
+    """
+    left_out = recipe.eval_block
+    numbers = blocks["block"].to_list()
+    if left_out is None or (numbers and left_out not in numbers):
+        last = max(numbers, default=0)
+        raise UsageError(f"setting split_eval_block: expected 0 to {last}, the last block there is, got {left_out}")
+    count = pl.len().over("dataset", "subset")
+    validates = (pl.col("block") == (left_out + count // 2) % count) & (count > 2) & recipe.validation
+    part = pl.when(pl.col("block") == left_out).then(pl.lit(PARTS[2])).when(validates).then(pl.lit(PARTS[1]))
+    return tabulate_allocation(blocks.with_columns(part=part.otherwise(pl.lit(PARTS[0]))), recipe)
+
+
 def tabulate_allocation(units: pl.DataFrame, recipe: SplitRecipe) -> Allocation:
-    """Build the tables of an allocation, and check by the given counts whether it is relaxed.
+    """Build the tables of an allocation, and check by the given counts whether it is relaxed; none that was set is.
 
     `units` have the columns of `splits.tables.COLUMNS`, `part`, and `block` if a subset has several rows.
     """
     shares = recipe.shares
     units = add_defaults(units).sort("dataset", "site", "direction", "subset", "block")
     reasons: dict[str, str | None] = {}
-    for (dataset,), rows in units.group_by("dataset"):
+    for (dataset,), rows in units.group_by("dataset") if recipe.eval_block is None else ():
         part = rows["part"].replace_strict(list(shares), range(len(shares)), return_dtype=pl.Int64).to_numpy()
         reasons[str(dataset)] = _describe_broken(rows, _build_problem(rows, shares), part.astype(np.intp), shares)
     return tabulate_units(units, split=recipe.name, parts=list(shares), reasons=reasons)

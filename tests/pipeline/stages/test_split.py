@@ -14,6 +14,7 @@ from tracklake.pipeline.stages import split
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import Job, StageError
 from tracklake.schemas import NEIGHBORS, SAMPLES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.hashing import hash_values
 from tracklake.schemas.split_recipes import SPLIT_NAMES, SplitRecipe
 
@@ -221,7 +222,7 @@ def test_the_digest_covers_every_parameter():
     changed = [replace(plain, **{name: value}) for name, value in
                {"name": "csp-2018", "train_share": 0.7, "validation": True, "seed": 1, "restarts": 5, "block_s": 60.0,
                 "purge_s": 9.0, "rate_hz": 10, "history_s": 2.0, "horizon_s": 4.0,
-                "min_future_s": 5.0}.items()]  # fmt: skip
+                "min_future_s": 5.0, "eval_block": 0}.items()]  # fmt: skip
     assert len({plain.digest, *(recipe.digest for recipe in changed)}) == 1 + len(SplitRecipe.__dataclass_fields__)
 
 
@@ -283,6 +284,37 @@ def test_time_blocks_are_balanced_by_what_is_left_when_vehicles_are_left_out(tmp
     assert index["split_recipe"]["parameters"]["block_s"] == 10
     assert index["split_recipe"]["digest"] == settings.get_split_recipe().digest
     assert {part: n for part, n in index["samples_by_part"].items() if n} == context
+
+
+def test_leaving_each_block_out_in_turn_evaluates_on_all_samples_without_a_leak(root):
+    """Vehicles leave within the purge: none is in two blocks, so that every sample is evaluated once."""
+    evaluated, trained = [], []
+    for block in range(4):
+        settings = Settings(split="time-blocks", splits=["time-blocks"], split_block_s=10, split_eval_block=block)
+        commit = build_one(root, Job("split", f"{4 + block}" * 16), settings)
+        (splits,), (balance,) = (
+            [pl.read_parquet(root / file.path, hive_partitioning=False) for file in commit.files[name]]
+            for name in ("splits", "split_balance")
+        )
+        assert splits.filter(part="eval").select("subset", "block").rows() == [
+            (name, block) for name in ("01-lower", "01-upper", "02-lower")
+        ]
+        samples = dict(balance.select("part", "samples").iter_rows())
+        evaluated.append(samples["eval"])
+        trained.append(samples["train"])
+    ends = splits.filter(subset="01-upper").select("first_frame", "last_frame").rows()
+    assert ends == [(1, 50), (91, 140), (181, 230), (271, 300)]
+    assert all(trains == sum(evaluated) - own for own, trains in zip(evaluated, trained, strict=True))
+    # A vehicle comes every second and gives 4 samples, of which those count whose 15 ticks before and one after fit.
+    on_road = [[first + age for age in range(15, 19)] for first in range(1, 281, 5)]
+    fitting = [sum(own - 15 >= begin and own + 1 <= end for ticks in on_road for own in ticks) for begin, end in ends]
+    assert evaluated == [3 * own for own in fitting]
+    with pytest.raises(UsageError, match="expected 0 to 3, the last block there is, got 4"):
+        build_one(root, JOB, settings.model_copy(update={"split_eval_block": 4}))
+    (leakage,) = (pl.read_parquet(root / file.path, hive_partitioning=False) for file in commit.files["split_leakage"])
+    assert leakage.select("vehicles_shared", "frames_shared").sum().row(0) == (0, 0)
+    recipe = settings.get_split_recipe()
+    assert (recipe.eval_block, "eval_block" in SplitRecipe("time-blocks").parameters) == (3, False)
 
 
 @pytest.fixture(scope="module")

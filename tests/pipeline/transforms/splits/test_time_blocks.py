@@ -8,7 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced, tabulate_allocation
+from tracklake.pipeline.transforms.splits.allocation import (
+    allocate_flow_balanced,
+    leave_block_out,
+    tabulate_allocation,
+)
 from tracklake.pipeline.transforms.splits.time_blocks import (
     VISITS,
     WEIGHTS,
@@ -19,6 +23,7 @@ from tracklake.pipeline.transforms.splits.time_blocks import (
     find_visits,
     recount_blocks,
 )
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.split_recipes import SplitRecipe
 from tracklake.schemas.splits import SPLIT_LEFT_OUT, SPLITS
 
@@ -138,6 +143,44 @@ def test_a_subset_cut_into_blocks_may_stand_in_several_parts():
     assert allocation.splits.height == blocks.height
     assert allocation.balance["subsets"].to_list() == [2, 2]
     assert allocation.balance["samples"].sum() == 10 * blocks.height
+
+
+@settings(max_examples=20, deadline=None)
+@given(counts=st.lists(st.integers(1, 9), min_size=1, max_size=4), validation=st.booleans(), order=st.randoms())
+def test_each_block_is_left_out_of_training_once(counts, validation, order):
+    """Recordings of unequal numbers of blocks, in any order of rows."""
+    rows = [(f"r{name}", block) for name, count in enumerate(counts) for block in range(count)]
+    order.shuffle(rows)
+    known = {
+        "dataset": "ngsim",
+        "site": "S",
+        "direction": "south",
+        "vehicles": 5,
+        "weight": 2,
+        "vehicles_per_lane_s": 0.5,
+    }
+    units = pl.DataFrame(rows, schema={"subset": pl.String, "block": pl.Int32}, orient="row").with_columns(
+        **{name: pl.lit(value) for name, value in known.items()},
+        first_frame=200 * pl.col("block"),
+        last_frame=200 * pl.col("block") + 99,
+    )
+    seen = []
+    for left_out in range(max(counts)):
+        allocation = leave_block_out(units, SplitRecipe("time-blocks", validation=validation, eval_block=left_out))
+        SPLITS.validate(allocation.splits, where="test")
+        assert not allocation.relaxations
+        part = {
+            (subset, block): own for subset, block, own in allocation.splits.select("subset", "block", "part").rows()
+        }
+        assert part.keys() == set(rows)
+        assert {key for key, own in part.items() if own == "eval"} == {key for key in rows if key[1] == left_out}
+        seen += [key for key, own in part.items() if own == "eval"]
+        for name, count in enumerate(counts):
+            validated = [block for block in range(count) if part[f"r{name}", block] == "val"]
+            assert validated == ([(left_out + count // 2) % count] if validation and count > 2 else [])
+    assert sorted(seen) == sorted(rows)
+    with pytest.raises(UsageError, match=rf"split_eval_block: expected 0 to {max(counts) - 1}.*got {max(counts)}"):
+        leave_block_out(units, SplitRecipe("time-blocks", eval_block=max(counts)))
 
 
 def test_samples_count_where_history_and_least_future_fit():
