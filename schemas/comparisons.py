@@ -44,3 +44,31 @@ COMPARED_FIGURES = {
     "nll_nats": ("nll_nats",),
 }
 """Figures that can be compared, and the sums of VEHICLE_ERRORS behind each; those named rmse are roots of means."""
+
+
+def _figure(description: str) -> Column:
+    """Declare a value in the figure's own unit."""
+    return column(pl.Float64, description, nullable=True)
+
+
+COMPARISONS = Table(
+    "comparisons",
+    "One row per two models, figure and horizon: the difference with its 95 % interval over vehicles and seeds.",
+    key=("a", "b", "figure", "seconds"),
+    partition=(),
+    columns={
+        "a": column(pl.String, "first run or model; `(8 seeds)` where it stands for the runs of several seeds"),
+        "b": column(pl.String, "the other one"),
+        "figure": column(pl.String, "as in `evaluations`", isin=tuple(COMPARED_FIGURES)),
+        "seconds": column(pl.Float64, "ahead of the sample", unit="s", gt=0),
+        "n": column(pl.Int64, "samples of both", ge=1),
+        "vehicles": column(pl.Int64, "vehicles that they are of", ge=1),
+        "a_seeds": column(pl.Int64, "seeds of a", ge=1),
+        "b_seeds": column(pl.Int64, "seeds of b", ge=1),
+        "a_value": _figure("the figure of a, in m (NLL: nat): the mean over its seeds"),
+        "b_value": _figure("the same of b"),
+        "difference": _figure("a_value - b_value; below 0, a is better"),
+        "low": _figure("lower end of the 95 % interval; null: of one vehicle"),
+        "high": _figure("upper end of it; the models differ where 0 lies outside"),
+    },
+)

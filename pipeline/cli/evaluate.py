@@ -12,6 +12,7 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.evidence import show_comparisons
 from tracklake.pipeline.cli.options import (
     JsonOption,
     LakeOption,
@@ -86,6 +87,10 @@ VehicleErrorsOption = Annotated[
         "--vehicle-errors", help="Also write the summed errors of every run, vehicle and horizon to this .parquet."
     ),
 ]
+CompareOption = Annotated[
+    bool,
+    typer.Option("--compare", help="Compare the first of RUNS with the others: differences with 95 % intervals."),
+]
 EveryTickOption = Annotated[
     bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
 ]
@@ -105,6 +110,7 @@ def evaluate(
     every_tick: EveryTickOption = False,
     gain: GainOption = None,
     vehicle_errors: VehicleErrorsOption = None,
+    compare: CompareOption = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -130,7 +136,7 @@ def evaluate(
         for file in filter(None, (target, vehicle_errors)):
             with explain_file_errors(file.parent):
                 file.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
-        names = dict.fromkeys(runs or sorted({BASELINE, *(path.parent.name for path in finished_runs(root))}))
+        names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in finished_runs(root))])
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
         )
@@ -146,6 +152,7 @@ def evaluate(
             terminal.print_line(describe_causality(tracks_from), style="dim")
             if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:
                 gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
+        compared = show_comparisons(terminal, found) if compare else None
         if vehicle_errors is not None:
             errors = pl.concat([VEHICLE_ERRORS.empty(), *(own.to_vehicle_errors() for own in found)])
             _write_table(vehicle_errors, VEHICLE_ERRORS.validate(errors.sort(VEHICLE_ERRORS.key), where="evaluate"))
@@ -159,7 +166,8 @@ def evaluate(
             )
         rows = table.to_dicts()
         shown = {"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target}
-        terminal.print_json(shown | ({} if gains is None else {"smoothing_gain": gains.to_dicts()}))
+        further = {"smoothing_gain": gains, "comparisons": compared}
+        terminal.print_json(shown | {name: own.to_dicts() for name, own in further.items() if own is not None})
 
 
 def _evaluate_all(

@@ -3,11 +3,15 @@
 Samples of one vehicle depend on each other, and networks of other seeds err differently on the same vehicles: vehicles
 and seeds are crossed. So vehicles are drawn with replacement, the same for both models, and seeds of each model
 independently (Owen 2007, The pigeonhole bootstrap, Annals of Applied Statistics 1). One fewer are drawn than there are,
-so that few seeds do not make an interval too narrow (Rao and Wu 1988, Journal of the American Statistical Association
-83). Vehicles are taken for independent, which those of one traffic jam are not quite.
+so that few units do not make an interval too narrow (Rao and Wu 1988, Journal of the American Statistical Association
+83). An interval is the difference, give or take the draws' standard deviation times a quantile of Student's t, whose
+degrees of freedom follow from the number of vehicles and seeds (Satterthwaite 1946, Biometrics Bulletin 2): percentiles
+of the draws hold the truth in 92 % of cases with 5 seeds, such intervals in 95 %. Vehicles are taken for independent,
+which those of one traffic jam are not quite.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +23,10 @@ from tracklake.schemas.errors import TracklakeError, UsageError
 
 RESAMPLES = 2000
 """Number of times that vehicles and seeds are drawn."""
-INTERVAL = (2.5, 97.5)
-"""Percentiles of the resampled differences between which an interval lies."""
+CONFIDENCE = 0.95
+"""Share of intervals that hold the true difference."""
+MAX_FREEDOM = 10_000.0
+"""Degrees of freedom beyond which Student's t is taken for normal."""
 MAX_DRAWS = 1 << 22
 """Largest number of counts drawn at once, so that many vehicles do not fill the memory."""
 
@@ -63,25 +69,24 @@ def compare_errors(
             for vehicles, first, second in _draw_all(own, other, resamples, seed)
         ]
     )
-    values = [
-        _average_seeds(one, np.ones((1, len(one.keys))), np.ones((1, len(one.seeds))), root=root)[0]
-        for one in (own, other)
-    ]
+    values, half = _estimate(own, root=root), np.full(len(own.seconds), np.nan)
+    others = _estimate(other, root=root)
     vehicles = (own.n > 0).sum(axis=0)
-    bounds = np.full((2, len(own.seconds)), np.nan)
-    if (enough := vehicles > 1).any():
-        bounds[:, enough] = np.nanpercentile(differences[:, enough], INTERVAL, axis=0)
+    for at in np.flatnonzero(vehicles > 1):
+        by_seed = [(one[:, at].var(ddof=1) / len(one), len(one) - 1) for one in (values, others) if len(one) > 1]
+        half[at] = find_half_width(float(np.nanvar(differences[:, at])), by_seed, int(vehicles[at]) - 1)
+    a_value, b_value = values.mean(axis=0), others.mean(axis=0)
     table = {
         "seconds": own.seconds,
         "n": own.n.sum(axis=0).astype(np.int64),
         "vehicles": vehicles,
         "a_seeds": len(own.seeds),
         "b_seeds": len(other.seeds),
-        "a_value": values[0],
-        "b_value": values[1],
-        "difference": values[0] - values[1],
-        "low": bounds[0],
-        "high": bounds[1],
+        "a_value": a_value,
+        "b_value": b_value,
+        "difference": a_value - b_value,
+        "low": a_value - b_value - half,
+        "high": a_value - b_value + half,
     }
     return pl.DataFrame(table).with_columns(pl.col("low", "high").fill_nan(None))
 
@@ -151,3 +156,37 @@ def _average_seeds(errors: Errors, vehicles: Floats | Integers, seeds: Floats | 
         "rs,rst->rt", seeds / seeds.sum(axis=1, keepdims=True), np.sqrt(figure) if root else figure
     )
     return averaged
+
+
+def _estimate(errors: Errors, *, root: bool) -> Floats:
+    """Compute a figure of each seed over all vehicles: (S, T)."""
+    count = len(errors.seeds)
+    return _average_seeds(errors, np.ones((count, len(errors.keys))), np.eye(count), root=root)
+
+
+def find_half_width(variance: float, by_seed: Sequence[tuple[float, int]], freedom: int) -> float:
+    """Find half the width of an interval from the draws' variance and its parts.
+
+    Args:
+        variance: variance of the resampled differences.
+        by_seed: for each model with several seeds, the variance that they add, and its degrees of freedom.
+        freedom: degrees of freedom of the rest, which the vehicles add.
+    """
+    of_seeds = sum(part for part, _ in by_seed)
+    parts = [*by_seed, (max(variance - of_seeds, 0.0), freedom)]
+    total = sum(part for part, _ in parts)
+    if total == 0:
+        return 0.0
+    return find_quantile(total**2 / sum(part**2 / own for part, own in parts)) * math.sqrt(total)
+
+
+def find_quantile(freedom: float) -> float:
+    """Find the quantile of Student's t distribution, 1 degree of freedom or more, beyond which 2.5 % lie.
+
+    With t = sqrt(freedom) tan(angle) the density is proportional to cos(angle) ** (freedom - 1).
+    """
+    freedom = min(freedom, MAX_FREEDOM)
+    angle = np.linspace(0.0, np.pi / 2, 100_001)
+    density = np.cos(angle) ** (freedom - 1)
+    below = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
+    return float(np.sqrt(freedom) * np.tan(np.interp(CONFIDENCE * below[-1], below, angle)))

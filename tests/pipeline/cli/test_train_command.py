@@ -116,3 +116,28 @@ def test_patience_asks_for_a_validation_part(command, lake):
     done = command.here("train", "lstm", "--patience", "2", "--lake", lake.root)
     assert done.code == 1
     assert "patience 2 needs samples in `val`" in done.err
+
+
+def test_runs_of_several_seeds_are_compared_with_a_model(command, lake, models):
+    for seed in ("0", "1"):
+        options = ("--steps", "2", "--set", "hidden=8", "--seed", seed, "--name", f"small-{seed}")
+        assert command.here("train", "lstm", "--lake", lake.root, *options).code == 0
+    call = ("evaluate", "small-0", "constant-velocity", "small-1", "--compare", "--lake", lake.root)
+    answer = json.loads(command.here(*call, "--json").out)
+    rows = [row for row in answer["comparisons"] if row["figure"] == "rmse_m"]
+    assert [row["seconds"] for row in rows] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    of = {own["model"]: [row["rmse_m"] for row in own["horizons"]] for own in answer["evaluations"]}
+    for at, row in enumerate(rows):
+        assert (row["a"], row["b"], row["a_seeds"], row["b_seeds"]) == ("small-0 (2 seeds)", "constant-velocity", 2, 1)
+        assert row["a_value"] == pytest.approx((of["small-0"][at] + of["small-1"][at]) / 2)
+        assert row["difference"] == pytest.approx(row["a_value"] - of["constant-velocity"][at])
+        assert row["low"] < row["difference"] < row["high"]
+    out = command.here(*call[:3], "--compare", "--lake", lake.root).out
+    assert "difference of RMSE, m\n" in out
+    assert "small-0 - constant-velocity" in out
+    assert "note: small-0: one seed; another one may change the difference" in out
+    alone = command.here("evaluate", "small-0", "small-1", "--compare", "--lake", lake.root)
+    assert (alone.code, "a comparison needs two models; small-0, small-1 are seeds of one" in alone.err) == (2, True)
+    shutil.copytree(models / "small-0", models / "twice")
+    twice = command.here("evaluate", "constant-velocity", "small-0", "twice", "--compare", "--lake", lake.root)
+    assert "small-0 (2 seeds): two of the runs small-0, twice have the same seed" in twice.err
