@@ -134,7 +134,7 @@ def _check_name(name: str) -> str:
 def _read_settings_of_model(entry: Model, settings: list[str]) -> dict[str, Any]:
     """Read NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
     recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS}
-    known = {**recipe, **entry.parameters}
+    known = {**recipe, **entry.settings}
     read = read_pairs(settings, known, entry.name)
     config = {name: value for name, value in read.items() if name in recipe}
     parameters = {name: value for name, value in read.items() if name not in recipe}

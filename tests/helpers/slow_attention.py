@@ -44,7 +44,7 @@ def find_velocity(history, known, ticks):
     return None if steps == 0 else (history[-1] - history[-1 - steps]) / steps
 
 
-def restate(weights, observed, heads, *, ticks, rate_hz, horizon_ticks, residual):
+def restate(weights, observed, heads, *, ticks, rate_hz, horizon_ticks, residual, positions=False):
     """Per scene: (vehicles that are there, their means (n, F, 2), covariances (n, F, 2, 2), three lists of weights)."""
     reported = []
     for scene in range(len(observed.history)):
@@ -62,6 +62,10 @@ def restate(weights, observed, heads, *, ticks, rate_hz, horizon_ticks, residual
                 numbers += [away[0] / 5, away[1]] if mask[k] else [0, 0]
             numbers += [float(each) for each in mask]
             numbers += [observed.size_m[scene, v, 0] / 5, observed.size_m[scene, v, 1] / 2]
+            if positions:  # in m; before it came, the first one that is known
+                first = list(mask).index(True)
+                numbers = [each for k in range(len(history)) for each in history[max(k, first)]]
+                numbers += list(observed.size_m[scene, v])
             embedded.append(perceptron(weights, "embed_vehicle", np.array(numbers, dtype=np.float64)))
         lanes = [
             linear(weights, "embed_lane", np.array([offset / 4, width / 4, 1.0]))

@@ -38,6 +38,8 @@ def wander(seed, scenes, vehicles, *, present=0.8, protocol=CSP):
         vehicle_mask=vehicle_mask,
         size_m=(random.uniform((4, 1.6), (16, 2.5), (scenes, vehicles, 2)) * there).astype(np.float32),
         lanes=(lanes * exists[..., None]).astype(np.float32),
+        all_lanes=np.concatenate([lanes - [8, 0, 0], lanes[:, :2] + [4, 0, 0]], axis=1).astype(np.float32)
+        * np.concatenate([exists, exists[:, :2]], axis=1)[..., None],
     )
     truth = Truth(
         future=(path[:, :, history_ticks:] * there[..., None]).astype(np.float32),

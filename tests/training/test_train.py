@@ -86,6 +86,15 @@ def test_every_model_that_learns_goes_through_the_loop(name, tensors, tmp_path):
     assert evaluate("run", tensors, tmp_path).horizons[0].rmse_m == metrics["evaluation"]["horizons"][0]["rmse_m"]
 
 
+@pytest.mark.parametrize("name", [name for name, model in MODELS.items() if model.published])
+def test_networks_as_published_go_through_the_loop(name, tensors, tmp_path):
+    config = TrainConfig(steps=2, batch_size=8, parameters={"as_published": True})
+    metrics = train(name, tensors, tmp_path / "run", config)
+    recorded = json.loads((tmp_path / "run" / "config.json").read_text())["parameters"]
+    assert recorded == {**MODELS[name].parameters, **MODELS[name].published}
+    assert evaluate("run", tensors, tmp_path).horizons[0].rmse_m == metrics["evaluation"]["horizons"][0]["rmse_m"]
+
+
 # What it is shown
 
 

@@ -228,12 +228,14 @@ def gather_vehicles(folder: Folder, sample: Array, nearest: int) -> tuple[Observ
     future, future_mask = read_future(folder, row, folder.run_first_row[run + 1] - 1)
     origin = folder.position_m[row[:, :1]]
     there = present[..., None, None]
+    lanes, all_lanes = _describe_lanes(folder, cast(folder.sample_row[sample], "int64"))
     observed = ObservedScene(
         history=xp.where(there, to_relative(folder, history, origin), 0),
         history_mask=history_mask & present[..., None],
         vehicle_mask=present,
         size_m=xp.where(present[..., None], folder.run_size_m[run], 0),
-        lanes=_describe_lanes(folder, cast(folder.sample_row[sample], "int64")),
+        lanes=lanes,
+        all_lanes=all_lanes,
     )
     truth = Truth(
         future=xp.where(there, to_relative(folder, future, origin), 0),
@@ -265,9 +267,12 @@ def find_nearest(folder: Folder, sample: Array, nearest: int) -> NearestVehicles
     return NearestVehicles(xp.where(present, take_columns(row, order), ego), present)
 
 
-def _describe_lanes(folder: Folder, row: Array) -> Array:
-    """Return (B, 3, 3) the lanes left of, under and right of each ego, see `ObservedScene`."""
-    subset, lanes = folder.run_subset[find_runs(folder, row)], folder.adjacent_lanes
-    described = lanes[subset, find_namespace(row).clip(cast(folder.lane[row], "int64"), 0, lanes.shape[1] - 1)]
-    described[..., 0] -= locate_rows(folder, row)[:, 1:] * described[..., 2]
-    return cast(described, "float32")
+def _describe_lanes(folder: Folder, row: Array) -> tuple[Array, Array]:
+    """Return (B, 3, 3) the lanes left of, under and right of each ego, and (B, M, 3) all, see `ObservedScene`."""
+    subset, adjacent = folder.run_subset[find_runs(folder, row)], folder.adjacent_lanes
+    own = find_namespace(row).clip(cast(folder.lane[row], "int64"), 0, adjacent.shape[1] - 1)
+    y_m = locate_rows(folder, row)[:, 1:]
+    described = adjacent[subset, own], folder.all_lanes[subset]
+    for lanes in described:
+        lanes[..., 0] -= y_m * lanes[..., 2]
+    return cast(described[0], "float32"), cast(described[1], "float32")

@@ -60,7 +60,8 @@ class ObservedScene(_Blind, Generic[Array]):
     others stand in order of distance; where there are fewer, rows are masked and hold zeros.
 
     `lanes` are those left of, under and right of the ego: the centre's offset from the ego's last position (m, positive
-    to the right), the width (m), and 1 where the lane exists; all 0 where it does not. This is knowledge of the map:
+    to the right), the width (m), and 1 where the lane exists; all 0 where it does not. `all_lanes` are those of the
+    whole carriageway, from the left; M is the most of any carriageway in the tensors. This is knowledge of the map:
     where no markings are known, the rightmost lane is the highest that any vehicle uses during the whole recording
     (`last_lane` of `schemas.tensors`), so that a lane may exist here because a vehicle uses it later.
     """
@@ -70,6 +71,7 @@ class ObservedScene(_Blind, Generic[Array]):
     vehicle_mask: Array  # (B, V) True where there is a vehicle; the first always is
     size_m: Array  # (B, V, 2) length and width; 0 where unknown
     lanes: Array  # (B, 3, 3)
+    all_lanes: Array  # (B, M, 3)
 
 
 @dataclass(frozen=True)

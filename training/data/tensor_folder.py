@@ -121,22 +121,31 @@ class TensorFolder:
         return Lanes(np.array([subset["last_lane"] for subset in subsets], dtype=np.int16), centre, width)
 
     @cached_property
-    def adjacent_lanes(self) -> Floats:
-        """(subsets, O, 3, 3) the lanes left of, under and right of lanes 0 to O - 1: y of the centre, width, and 1.
+    def all_lanes(self) -> Floats:
+        """(subsets, M, 3) every lane from the left one on: y of the centre, width, and 1; zeros beyond the last lane.
 
-        Zeros where a lane does not exist: lane 0 stands for no lane and has no neighbors, and neither has any above
-        O - 1. Where a subset has no markings, lanes are NOMINAL_LANE_M wide, from the left edge on.
+        Where a subset has no markings, lanes are NOMINAL_LANE_M wide, from the left edge on.
         """
         lanes = self.lanes
-        own = np.arange(int(lanes.last.max(initial=0)) + 3)[:, None]
-        lane = own + np.arange(-1, 2)
-        exists = (own > 0) & (lane > 0) & (lane <= lanes.last[:, None, None])
-        known = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
+        lane = np.arange(1, int(lanes.last.max(initial=0)) + 1)
+        exists = lane <= lanes.last[:, None]
+        known = np.minimum(lane, lanes.centre_m.shape[1] - 1)
         centre, width = lanes.centre_m[:, known], lanes.lane_width_m[:, known]
         unmarked = np.isnan(centre)
         centre = np.where(unmarked, (lane - 0.5) * NOMINAL_LANE_M, centre)
         width = np.where(unmarked, NOMINAL_LANE_M, width)
         return np.stack([centre, width, exists], axis=-1) * exists[..., None]
+
+    @cached_property
+    def adjacent_lanes(self) -> Floats:
+        """(subsets, O, 3, 3) the lanes left of, under and right of lanes 0 to O - 1, as in `all_lanes`.
+
+        Zeros where a lane does not exist: lane 0 stands for no lane and has no neighbors, and neither has any above
+        O - 1.
+        """
+        own = np.arange(self.all_lanes.shape[1] + 3)[:, None]
+        padded = np.pad(self.all_lanes, ((0, 0), (2, 3), (0, 0)))  # lane 1 is at 2
+        return padded[:, own + np.arange(3)] * (own > 0)[..., None]
 
     @cached_property
     def scene_of_sample(self) -> npt.NDArray[np.int32]:

@@ -16,6 +16,9 @@ from tracklake.training.models.prediction import Prediction
 MAX_PARAMETER = 2048
 """Largest number that a model takes as a parameter: hidden units above all, whose squares are weights."""
 
+AS_PUBLISHED = "as_published"
+"""Parameter that sets others, so that a network's inputs, outputs and loss are those of its publication."""
+
 Reads = Literal["grid", "scene"]
 """Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
@@ -80,6 +83,8 @@ class Model:
         builder: class in the module; takes the protocol, and the parameters as keywords.
         parameters: the model's own parameters with their defaults.
         recipe: how a torch network is trained; None where the model needs no training.
+        published: what `as_published` sets, so that inputs, outputs and loss are the publication's.
+        differs: what differs from the publication even then.
     """
 
     name: str
@@ -90,24 +95,41 @@ class Model:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     reads: Reads = "grid"
     recipe: Recipe | None = None
+    published: Mapping[str, Any] = field(default_factory=dict)
+    differs: str = ""
 
     @property
     def learns(self) -> bool:
         """Whether the model is trained before it predicts."""
         return self.recipe is not None
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Names that may be set, with their defaults: the parameters and, where there is one, `as_published`."""
+        return {**self.parameters, **({AS_PUBLISHED: False} if self.published else {})}
+
+    def complete(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what is given with the other parameters as published (`as_published`) or by default."""
+        if not self.published:
+            return {**self.parameters, **given}
+        changes = dict(given)
+        as_published = changes.pop(AS_PUBLISHED, False)
+        _check_parameter(f"model `{self.name}`: parameter `{AS_PUBLISHED}`", as_published, bool)
+        return {**self.parameters, **(self.published if as_published else {}), **changes}
+
     def build(self, protocol: Protocol, **parameters: Any) -> Any:  # noqa: ANN401  (a Predictor; where it learns, an nn.Module too)
         """Build the model; raises UsageError on an unknown parameter, MissingExtraError where torch is missing."""
+        parameters = self.complete(parameters)
         unknown = sorted(set(parameters) - set(self.parameters))
         if unknown:
-            known = ", ".join(self.parameters) or "none"
+            known = ", ".join(self.settings) or "none"
             raise UsageError(f"model `{self.name}` has no parameter {', '.join(unknown)}: expected {known}")
         for name, value in parameters.items():
             _check_parameter(f"model `{self.name}`: parameter `{name}`", value, type(self.parameters[name]))
         if self.learns:
             require_torch(self.name)
         make: Callable[..., Any] = getattr(import_module(self.module, __name__), self.builder)
-        return make(protocol, **{**self.parameters, **parameters})
+        return make(protocol, **parameters)
 
 
 def _check_parameter(what: str, value: object, kind: type) -> None:
@@ -124,8 +146,21 @@ KIM, CHOI = references.KIM.name, references.CHOI.name
 
 _SQUARED = (Phase("mse", 8),)
 _CONVOLUTIONAL = Recipe((Phase("mse", 5), Phase("nll", 3)))
-_RESIDUAL = {"residual": True}
-_ATTENTION = {"hidden": 128, "dropout": 0.7, "nll_weight": 1.0, "distance_weight": 1.0, **_RESIDUAL}
+_RESIDUAL, _UNANCHORED = {"residual": True}, {"residual": False}
+_POOLING = {**_RESIDUAL, "short_histories": True, "maneuver_loss": "categorical"}
+_ATTENTION = {
+    "hidden": 128,
+    "dropout": 0.7,
+    "nll_weight": 1.0,
+    "distance_weight": 1.0,
+    **_RESIDUAL,
+    "inputs": "deviations",
+    "sizes": True,
+    "lanes": "adjacent",
+    "nearest": 10,
+    "range_m": 0.0,
+    "ego_only": False,
+}
 
 _MODELS = (
     Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", ".constant_velocity", "ConstantVelocity"),
@@ -154,6 +189,8 @@ _MODELS = (
         "VanillaLstm",
         _RESIDUAL,
         recipe=_CONVOLUTIONAL,
+        published=_UNANCHORED,
+        differs="metres instead of feet",
     ),
     Model(
         "stacked-lstm",
@@ -161,8 +198,10 @@ _MODELS = (
         CHOI,
         ".lstms",
         "StackedLstm",
-        _RESIDUAL,
+        {"hidden": 128, **_RESIDUAL},
         recipe=Recipe(_SQUARED),
+        published={"hidden": 256, **_UNANCHORED},
+        differs="positions alone instead of twelve features",
     ),
     Model(
         "lstm-encoder-decoder",
@@ -170,8 +209,10 @@ _MODELS = (
         CHOI,
         ".lstms",
         "EncoderDecoder",
-        _RESIDUAL,
+        {**_RESIDUAL, "recursive": False},
         recipe=Recipe(_SQUARED, batch_size=100),
+        published={**_UNANCHORED, "recursive": True},
+        differs="positions alone instead of twelve features",
     ),
     *(
         Model(
@@ -180,8 +221,10 @@ _MODELS = (
             DEO,
             ".social_pooling",
             "SocialPooling",
-            {"maneuvers": bool(words), **_RESIDUAL},
+            {"maneuvers": bool(words), **_POOLING},
             recipe=_CONVOLUTIONAL,
+            published={**_UNANCHORED, "short_histories": False, "maneuver_loss": "binary"},
+            differs="metres instead of feet",
         )
         for name, words in (("cs-lstm", ""), ("cs-lstm-m", " with maneuvers"))
     ),
@@ -195,6 +238,8 @@ _MODELS = (
             {"heads": heads, **_ATTENTION},
             reads="scene",
             recipe=Recipe((Phase("both", 8),)),
+            published={**_UNANCHORED, "inputs": "positions", "lanes": "all"},
+            differs="weights of the loss, hidden layers and the reading of dropout, which the publication leaves open",
         )
         for heads in (2, 4, 8)
     ),

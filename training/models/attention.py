@@ -1,7 +1,7 @@
 """Vehicle and lane attention, which predicts every vehicle of a scene at once (Kim et al. 2020)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,7 +15,8 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.models.constant_velocity import velocity_ticks
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
-from tracklake.training.models.network import Network, check_phase, to_numpy
+from tracklake.training.models.inputs import NEAREST
+from tracklake.training.models.network import Network, check_choice, check_phase, to_numpy
 from tracklake.training.models.prediction import Prediction
 
 VEHICLE_WIDTH, LANE_WIDTH = 16, 4
@@ -28,6 +29,8 @@ PLACE_SCALE_M, SPEED_SCALE_MPS, DEVIATION_SCALE_M = (50.0, 5.0), (15.0, 1.0), (5
 """Divisors of last positions, of velocities and of deviations from constant velocity, along and across the road."""
 SIZE_SCALE_M, LANE_SCALE_M = (5.0, 2.0), 4.0
 """Divisors of a vehicle's length and width, and of a lane's offset and width, in m."""
+INPUTS, LANES = ("deviations", "positions"), ("adjacent", "all", "none")
+"""Ways to describe a vehicle's history, and the lanes that vehicles attend to."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Attention:
 
     Args:
         vehicles: (B, heads, V, V) weights of the encoder; a row's vehicle attends to a column's.
-        lanes: (B, heads, V, 3) weights of the encoder for the lanes left of, under and right of the ego.
+        lanes: (B, heads, V, 3 or M) weights of the encoder for the lanes of `SceneAttention.choose_lanes`.
         decoder: (B, heads, V, V) weights of the decoder.
     """
 
@@ -64,7 +67,10 @@ class Vehicles(NamedTuple):
     """Vehicles of B scenes; all 0 where there is none."""
 
     features: Tensor
-    """(B, V, 3 H + 6) inputs: last position 2, velocity 2, deviations 2 H, known or not H, size 2."""
+    """(B, V, 3 H + 6) inputs: last position 2, velocity 2, deviations 2 H, known or not H, size 2.
+
+    Of raw positions (B, V, 2 H + 2): positions in m, size in m.
+    """
     place_m: Tensor
     """(B, V, 2) last positions, relative to the ego's."""
     velocity: Tensor
@@ -128,14 +134,21 @@ class SceneAttention(Network):
       RMSE at 5 s is then 3.00 and 3.17 m as against 2.95 and 3.03 m with 0.7 kept, NLL 0.73 and 0.74 as against 0.70
       and 0.73 nats; constant velocity has 3.43 m. `dropout` = 0.3 is the other reading.
 
-    Differences: positions are given as last position, velocity and deviations (`describe_vehicles`), and means are
-    counted from every vehicle's own constant velocity unless `residual` is False; an untrained network predicts it.
+    Differences: positions are given as last position, velocity and deviations (`describe_vehicles`) unless `inputs` is
+    `positions`; of all lanes only those at the ego unless `lanes` is `all`; and means are counted from every vehicle's
+    own constant velocity unless `residual` is False; an untrained network predicts it.
 
     Args:
         hidden: width of the hidden layers in the vehicle embedding and before the output; 0: none.
         dropout: probability of dropping a number of an attention's output in training.
         nll_weight: weight of the negative log likelihood (nats) in the loss.
         distance_weight: weight of the distance (m) in the loss.
+        inputs: `deviations`, or `positions`, raw and in m.
+        sizes: whether the vehicles' lengths and widths are given; otherwise they are 0, as where they are unknown.
+        lanes: `adjacent` (those left of, under and right of the ego), `all` of the carriageway, or `none`.
+        nearest: most vehicles around the ego in training; a prediction sees all that it is given.
+        range_m: distance along the road from the ego at which vehicles are left out; 0: none is.
+        ego_only: whether the loss covers the ego's positions alone.
     """
 
     def __init__(
@@ -148,8 +161,22 @@ class SceneAttention(Network):
         nll_weight: float = 1.0,
         distance_weight: float = 1.0,
         residual: bool = True,
+        inputs: str = "deviations",
+        sizes: bool = True,
+        lanes: str = "adjacent",
+        nearest: int = NEAREST,
+        range_m: float = 0.0,
+        ego_only: bool = False,
     ) -> None:
         super().__init__()
+        check_choice("inputs", inputs, INPUTS)
+        check_choice("lanes", lanes, LANES)
+        if nearest > NEAREST:
+            raise UsageError(
+                f"parameter `nearest`: expected 0 to {NEAREST}, the most that a training reads, got {nearest}"
+            )
+        self.raw, self.sizes, self.lanes = inputs == "positions", sizes, lanes
+        self.nearest, self.range_m, self.ego_only = nearest, range_m, ego_only
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)
         self.nll_weight, self.distance_weight = nll_weight, distance_weight
@@ -159,7 +186,8 @@ class SceneAttention(Network):
         self.register_buffer("ahead", ahead, persistent=False)
         encoded = 2 * VEHICLE_WIDTH
         common = partial(MultiHeadAttention, heads=heads, dropout=dropout)
-        self.embed_vehicle = perceptron(3 * protocol.history_ticks + 6, hidden, VEHICLE_WIDTH)
+        ticks = protocol.history_ticks
+        self.embed_vehicle = perceptron(2 * ticks + 2 if self.raw else 3 * ticks + 6, hidden, VEHICLE_WIDTH)
         self.embed_lane = nn.Linear(3, LANE_WIDTH)
         self.vehicle_attention = common(VEHICLE_WIDTH, VEHICLE_WIDTH, head_width=VEHICLE_HEAD_WIDTH)
         self.lane_attention = common(VEHICLE_WIDTH, LANE_WIDTH, head_width=LANE_HEAD_WIDTH)
@@ -173,19 +201,20 @@ class SceneAttention(Network):
         """Return mean (B, V, F, 2) in m relative to the ego's last position, sigma (B, V, F, 2) in m, rho (B, V, F)."""
         decoded, _, vehicles = self._attend(observed)
         raw = torch.unflatten(self.out(decoded), -1, (len(self.ahead), 5))
-        mean, sigma, rho = to_gaussian(raw.masked_fill(~observed.vehicle_mask[..., None, None], 0.0))
+        mean, sigma, rho = to_gaussian(raw.masked_fill(~self.limit(observed).vehicle_mask[..., None, None], 0.0))
         if self.residual:
             mean = mean + vehicles.place_m[..., None, :] + vehicles.velocity[..., None, :] * self.ahead[:, None]
         return mean, sigma, rho
 
     def supervised(self, observed: ObservedScene[Tensor], truth: Truth[Tensor]) -> Tensor:
-        """Return the known positions (B, V, F) of all vehicles that are there."""
-        return truth.future_mask & observed.vehicle_mask[..., None]
+        """Return the known positions (B, V, F) of the vehicles that the training sees, or of the ego alone."""
+        there: Tensor = self.limit(observed, 0 if self.ego_only else self.nearest).vehicle_mask
+        return truth.future_mask & there[..., None]
 
     def loss(self, observed: ObservedScene[Tensor], truth: Truth[Tensor], phase: str) -> Tensor:
         """Return () nll_weight x mean NLL + distance_weight x mean distance over all supervised positions."""
         check_phase(phase, "both")
-        mean, sigma, rho = self(observed)
+        mean, sigma, rho = self(self.limit(observed, self.nearest))
         known = self.supervised(observed, truth)
         nll = gaussian_nll(mean, sigma, rho, truth.future, known)
         return self.nll_weight * nll + self.distance_weight * mean_distance(mean, truth.future, known)
@@ -201,18 +230,37 @@ class SceneAttention(Network):
         covariance = sigma[..., :, None] * sigma[..., None, :]  # (B, V, F, 2, 2)
         covariance[..., 0, 1] *= rho
         covariance[..., 1, 0] *= rho
-        return SceneForecast(to_numpy(mean), to_numpy(covariance), np.asarray(observed.vehicle_mask))
+        return SceneForecast(to_numpy(mean), to_numpy(covariance), np.asarray(self.limit(observed).vehicle_mask))
 
     def read_attention(self, observed: ObservedScene[Any]) -> Attention:
         """Return the attention weights for scenes of NumPy arrays."""
         _, weights, _ = self.infer(observed, self._attend)
-        absent = ~np.asarray(observed.vehicle_mask)[:, None, :, None]
+        absent = ~np.asarray(self.limit(observed).vehicle_mask)[:, None, :, None]
         return Attention(*(np.where(absent, np.float32(0), to_numpy(part)) for part in weights))
+
+    def limit(self, observed: ObservedScene[Any], nearest: int | None = None) -> ObservedScene[Any]:
+        """Mark vehicles beyond the range, or all but the ego and the `nearest`, as absent."""
+        present = observed.vehicle_mask
+        if self.range_m > 0:
+            present = present & (abs(observed.history[:, :, -1, 0]) < self.range_m)
+        if nearest is not None and nearest + 1 < present.shape[1]:
+            present = present.clone()
+            present[:, nearest + 1 :] = False
+        return replace(observed, vehicle_mask=present)
+
+    def choose_lanes(self, observed: ObservedScene[Any]) -> Any:  # noqa: ANN401  (NumPy's arrays or torch's tensors)
+        """Return (B, 3 or M, 3) offset, width and existence of the lanes that vehicles attend to."""
+        if self.lanes == "none":
+            return 0 * observed.lanes
+        return observed.all_lanes if self.lanes == "all" else observed.lanes
 
     def _attend(self, observed: ObservedScene[Tensor]) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Vehicles]:
         """Return (B, V, 32), the weights of the vehicles, the lanes and the decoder, and the vehicles' features."""
-        present, vehicles = observed.vehicle_mask, describe_vehicles(observed, self.ticks, self.rate_hz)
-        lanes, exists = describe_lanes(observed)
+        observed = self.limit(observed)
+        if not self.sizes:
+            observed = replace(observed, size_m=0 * observed.size_m)
+        present, vehicles = observed.vehicle_mask, describe_vehicles(observed, self.ticks, self.rate_hz, raw=self.raw)
+        lanes, exists = describe_lanes(self.choose_lanes(observed))
         embedded = self.embed_vehicle(vehicles.features)
         to_vehicles, vehicle_weights = self.vehicle_attention(embedded, embedded, present)
         to_lanes, lane_weights = self.lane_attention(embedded, self.embed_lane(lanes), exists)
@@ -235,17 +283,22 @@ def mean_distance(predicted: Tensor, future: Tensor, known: Tensor) -> Tensor:
     return distances.sum() / known.sum().clamp(min=1)
 
 
-def describe_vehicles(observed: ObservedScene[Tensor], ticks: int, rate_hz: float) -> Vehicles:
+def describe_vehicles(observed: ObservedScene[Tensor], ticks: int, rate_hz: float, *, raw: bool = False) -> Vehicles:
     """Convert positions of H ticks to last position, velocity and the deviations from going straight on.
 
     A velocity is the displacement over the last `ticks` ticks, or over as many of them as are known; where none is, the
-    mean velocity of the scene's others. `rate_hz` is in ticks a second. Masked values are ignored.
+    mean velocity of the scene's others. `rate_hz` is in ticks a second. Masked values are ignored. `raw` features
+    are the positions themselves (before a vehicle came its earliest one again) and the sizes.
     """
     present = observed.vehicle_mask
     known = observed.history_mask & present[..., None]  # (B, V, H)
     history = observed.history.masked_fill(~known[..., None], 0.0)
     place_m = history[..., -1, :]
     velocity = _find_velocities(history, known, ticks).masked_fill(~present[..., None], 0.0)
+    size_m = observed.size_m.masked_fill(~present[..., None], 0.0)
+    if raw:
+        positions = observed.history.masked_fill(~present[..., None, None], 0.0)
+        return Vehicles(torch.cat([positions.flatten(start_dim=2), size_m], dim=-1), place_m, velocity)
 
     back = torch.arange(1 - history.shape[2], 1, device=history.device, dtype=history.dtype)
     straight = place_m[..., None, :] + velocity[..., None, :] * back[:, None]  # (B, V, H, 2)
@@ -256,7 +309,7 @@ def describe_vehicles(observed: ObservedScene[Tensor], ticks: int, rate_hz: floa
             velocity * rate_hz / history.new_tensor(SPEED_SCALE_MPS),
             (deviation / history.new_tensor(DEVIATION_SCALE_M)).flatten(start_dim=2),
             known.to(history.dtype),
-            observed.size_m.masked_fill(~present[..., None], 0.0) / history.new_tensor(SIZE_SCALE_M),
+            size_m / history.new_tensor(SIZE_SCALE_M),
         ],
         dim=-1,
     )
@@ -274,8 +327,8 @@ def _find_velocities(history: Tensor, known: Tensor, ticks: int) -> Tensor:
     return torch.where(has, own, mean)
 
 
-def describe_lanes(observed: ObservedScene[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return (B, 3, 3) scaled offset, width and existence of lanes, and (B, 3) which exist."""
-    exists = observed.lanes[..., 2] > 0
-    scale = observed.lanes.new_tensor([LANE_SCALE_M, LANE_SCALE_M, 1.0])
-    return (observed.lanes / scale).masked_fill(~exists[..., None], 0.0), exists
+def describe_lanes(lanes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (B, M, 3) scaled offset, width and existence of M lanes, and (B, M) which exist."""
+    exists = lanes[..., 2] > 0
+    scale = lanes.new_tensor([LANE_SCALE_M, LANE_SCALE_M, 1.0])
+    return (lanes / scale).masked_fill(~exists[..., None], 0.0), exists

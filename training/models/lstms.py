@@ -1,5 +1,7 @@
 """LSTM networks over a sample's own history, which predict positions."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -68,11 +70,12 @@ class EncoderDecoder(PlaceNetwork):
     """Embeds H positions in m (256, ReLU), encodes them (2 x 256), decodes F steps (2 x 256) to positions.
 
     The output layer has 256 units (ReLU) and is followed by the linear one to 2 numbers. The decoder starts from the
-    encoder's states, layer by layer, and gets the encoder's last output at every step. That input is our choice: with
-    its own last position instead, it would run step by step and carry early errors on.
+    encoder's states, layer by layer, and gets the encoder's last output at every step. That input is our choice:
+    `recursive`, it is as published and gets its own output of the step before, embedded (256, ReLU), at first 0. It
+    then runs step by step and carries early errors on.
     """
 
-    def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
+    def __init__(self, protocol: Protocol, *, residual: bool = True, recursive: bool = False) -> None:
         super().__init__()
         self.steps = protocol.horizon_ticks
         self.straight = Straight(protocol, residual=residual)
@@ -81,11 +84,29 @@ class EncoderDecoder(PlaceNetwork):
         self.decoder = nn.LSTM(WIDTH, WIDTH, num_layers=2, batch_first=True)
         self.output = nn.Linear(WIDTH, WIDTH)
         self.place = nn.Linear(WIDTH, 2)
+        self.embedding_of_place = nn.Linear(2, WIDTH) if recursive else None
 
     def forward(self, history: Tensor) -> Tensor:
         """Predict (B, F, 2) from a history (B, H, 2): positions in m relative to the sample's last one."""
         _, states = self.encoder(torch.relu(self.embedding(history)))
+        if self.embedding_of_place is not None:
+            places: Tensor = self.straight(history) + decode_recursively(self, states, self.steps)
+            return places
         encoding = states[0][-1][:, None, :].expand(-1, self.steps, -1)  # (B, F, 256)
         decoded, _ = self.decoder(encoding, states)  # (B, F, 256)
         positions: Tensor = self.straight(history) + self.place(torch.relu(self.output(decoded)))
         return positions
+
+
+def decode_recursively(network: Any, states: tuple[Tensor, Tensor], steps: int) -> Tensor:  # noqa: ANN401  (a network of these layers)
+    """Decode places (B, steps, 2), each from the one before, at first from 0; in training as in prediction.
+
+    The network has the layers `embedding_of_place`, `decoder` (an LSTM with these states), `output` and `place`.
+    """
+    place = states[0].new_zeros(states[0].shape[1], 1, 2)
+    places = []
+    for _ in range(steps):
+        decoded, states = network.decoder(torch.relu(network.embedding_of_place(place)), states)
+        place = network.place(torch.relu(network.output(decoded)))
+        places.append(place)
+    return torch.cat(places, dim=1)

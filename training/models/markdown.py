@@ -1,5 +1,6 @@
 """docs/models.md, derived from the registry of models: `python -m tracklake.training.models.markdown`."""
 
+import json
 import sys
 
 from tracklake.schemas.references import link_references
@@ -16,10 +17,44 @@ given the future or a true maneuver: `predict` gets `training.data.observed.Obse
 neighbors in its grid) or `ObservedScene` (the sample and the vehicles nearest to it), and nothing else.
 """
 
+_PUBLISHED = """\
+## As published
+
+`--set as_published=true` trains a network with the inputs, outputs and loss of its publication; settings that are given
+beside it count. The run's `config.json` holds what it sets. `--patience N` trains until the validation loss stops
+improving.
+
+| model | ours | as published | what differs even then |
+| --- | --- | --- | --- |"""
+
+_ABLATIONS = """
+## Ablations of attention
+
+| setting | the network |
+| --- | --- |
+| `ego_only=true` | learns from the positions of the sample alone, as networks that read the grid do |
+| `sizes=false` | is not given lengths and widths of vehicles |
+| `lanes=none` | is not given lanes; `lanes=all` gives all of the carriageway |
+| `nearest=2` | is trained with the two nearest vehicles around the ego; `0` to `10`, which is the default |
+| `range_m=27.432` | sees no vehicle that is as far as this ahead or behind, which is the reach of the grid; `0`: any |
+
+`metrics.json` of a run counts the positions that its loss covered (`supervised_positions`).
+"""
+
 
 def write_models() -> str:
     """Return the page as Markdown."""
-    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values())])
+    compared = [_compare(model) for model in MODELS.values() if model.published]
+    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values()), _PUBLISHED, *compared, _ABLATIONS])
+
+
+def _compare(model: Model) -> str:
+    """Return the row of a network's own settings and of those of its publication."""
+    ours, theirs = (
+        ", ".join(f"`{name}={json.dumps(values[name]).strip(chr(34))}`" for name in model.published)
+        for values in (model.parameters, model.published)
+    )
+    return f"| `{model.name}` | {ours} | {theirs} | {model.differs} |"
 
 
 def _describe(model: Model) -> str:

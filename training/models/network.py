@@ -97,6 +97,12 @@ def check_phase(phase: str, *known: str) -> None:
         raise ValueError(f"unknown phase `{phase}` of training: expected one of {', '.join(known)}")
 
 
+def check_choice(name: str, value: str, known: tuple[str, ...]) -> None:
+    """Raise UsageError where a parameter's value is none of those known."""
+    if value not in known:
+        raise UsageError(f"parameter `{name}`: expected one of {', '.join(known)}, got {value!r}")
+
+
 def to_numpy(tensor: Tensor) -> npt.NDArray[Any]:
     """Convert a tensor on any device to an array."""
     return tensor.detach().cpu().numpy()

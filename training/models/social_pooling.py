@@ -2,13 +2,20 @@
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy, leaky_relu, one_hot
+from torch.nn.functional import binary_cross_entropy, cross_entropy, leaky_relu, one_hot
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
-from tracklake.training.models.network import Network, Straight, check_phase, mean_squared_distance, to_numpy
+from tracklake.training.models.network import (
+    Network,
+    Straight,
+    check_choice,
+    check_phase,
+    mean_squared_distance,
+    to_numpy,
+)
 from tracklake.training.models.prediction import Prediction
 
 SLOPE = 0.1
@@ -70,13 +77,24 @@ class SocialPooling(Network):
     (2 * lateral + longitudinal), whose weights are the products of the probabilities.
 
     Differences from the published code: metres, with the axis along the road first; a neighbor with a short history is
-    encoded with its earliest known position repeated, where the published reader leaves its cell empty; the
-    cross-entropies are those of one class out of several, where it averages one binary entropy per class; means are
-    counted from constant velocity, unless `residual` is False.
+    encoded with its earliest known position repeated, where the published reader leaves its cell empty, unless
+    `short_histories` is False; the cross-entropies are those of one class out of several, where it averages one binary
+    entropy per class, unless `maneuver_loss` is `binary`; means are counted from constant velocity, unless `residual`
+    is False.
     """
 
-    def __init__(self, protocol: Protocol, *, maneuvers: bool, residual: bool = True) -> None:
+    def __init__(
+        self,
+        protocol: Protocol,
+        *,
+        maneuvers: bool,
+        residual: bool = True,
+        short_histories: bool = True,
+        maneuver_loss: str = "categorical",
+    ) -> None:
         super().__init__()
+        check_choice("maneuver_loss", maneuver_loss, ("categorical", "binary"))
+        self.short_histories, self.binary = short_histories, maneuver_loss == "binary"
         self.steps = protocol.horizon_ticks
         self.maneuvers = maneuvers
         self.straight = Straight(protocol, residual=residual)
@@ -103,11 +121,15 @@ class SocialPooling(Network):
     def encode(self, observed: Observed[Tensor]) -> Tensor:
         """Return (B, 112): 80 numbers of the neighbors, 32 of the vehicle."""
         samples = len(observed.history)
-        positions = torch.cat([observed.history, observed.neighbor_history]).transpose(0, 1)  # (H, B + K, 2)
+        around, sample, cell = observed.neighbor_history, observed.neighbor_sample.long(), observed.neighbor_cell.long()
+        if not self.short_histories:
+            whole = observed.neighbor_mask.all(dim=1)
+            around, sample, cell = around[whole], sample[whole], cell[whole]
+        positions = torch.cat([observed.history, around]).transpose(0, 1)  # (H, B + K, 2)
         _, (hidden, _) = self.enc_lstm(leaky_relu(self.ip_emb(positions), SLOPE))
         own, neighbors = hidden[-1][:samples], hidden[-1][samples:]  # (B, 64), (K, 64)
         pool = self._pool_sparsely if self.sparse else self._pool_densely
-        social = pool(neighbors, observed.neighbor_sample.long(), observed.neighbor_cell.long(), samples)
+        social = pool(neighbors, sample, cell, samples)
         return torch.cat([social, leaky_relu(self.dyn_emb(own), SLOPE)], dim=1)
 
     def _pool_densely(self, states: Tensor, sample: Tensor, cell: Tensor, samples: int) -> Tensor:
@@ -170,8 +192,15 @@ class SocialPooling(Network):
         loss = _find_loss(self._to_gaussian(self.decode(decoded), observed.history), truth, phase)
         if self.maneuvers and phase == "nll":
             for head, true in ((self.op_lat, lateral), (self.op_lon, longitudinal)):
-                loss = loss + cross_entropy(head(encoding), true, reduction="sum") / max(len(true), 1)
+                loss = loss + self._judge_maneuvers(head(encoding), true)
         return loss
+
+    def _judge_maneuvers(self, logits: Tensor, true: Tensor) -> Tensor:
+        """Return () the mean cross-entropy in nats of logits (B, C) and true classes (B,)."""
+        if not self.binary:
+            return cross_entropy(logits, true, reduction="sum") / max(len(true), 1)
+        wanted = one_hot(true, logits.shape[1]).to(logits.dtype)
+        return binary_cross_entropy(logits.softmax(dim=1), wanted, reduction="sum") / max(wanted.numel(), 1)
 
     def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
         """Return the means of the most probable maneuver, the mixture of all, and their probabilities."""

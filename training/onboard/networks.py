@@ -7,7 +7,7 @@ choice (the publication predicts places), as for the networks of overhead tracks
 import torch
 from torch import Tensor, nn
 
-from tracklake.training.models.lstms import WIDTH
+from tracklake.training.models.lstms import WIDTH, decode_recursively
 from tracklake.training.onboard.samples import FEATURES
 
 
@@ -75,10 +75,4 @@ class RecursiveDecoder(FeatureNetwork):
     def decode(self, feature: Tensor) -> Tensor:
         """Predict tick by tick."""
         _, states = self.encoder(torch.relu(self.embedding(feature)))
-        place = feature.new_zeros(len(feature), 1, 2)
-        places = []
-        for _ in range(self.ticks):
-            decoded, states = self.decoder(torch.relu(self.embedding_of_place(place)), states)
-            place = self.place(torch.relu(self.output(decoded)))
-            places.append(place)
-        return torch.cat(places, dim=1)
+        return decode_recursively(self, states, self.ticks)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tracklake.training.models.attention import SceneAttention
 
 LANES = ("left", "own", "right")
-"""Names of the ego's lane and its neighbors, in the order of the weights."""
+"""Names of the ego's lane and its neighbors, in the order of the weights; all lanes of a carriageway have numbers."""
 ROAD_WIDTH, MATRIX_SIZE, LANES_WIDTH = 590, 165, 48
 """Width of the road, side of a matrix, and width of the matrix of lanes, in pixels."""
 VEHICLE_SHADES = ("#f7fbff", "#c6dbef", "#6baed6", "#2171b5", "#08306b")
@@ -44,9 +44,10 @@ class AttentionMap:
         vehicle_id: n ids, unique within the subset.
         place_m: (n, 2) front centres relative to the ego's: along the road, and across, positive to the right.
         size_m: (n, 2) length and width; 0 where unknown.
-        lanes: (3, 3) per lane of LANES: the centre's offset in m, the width in m, and 1 where the lane exists.
+        lanes: (M, 3) per lane: the centre's offset in m, the width in m, and 1 where the lane exists.
+        lane_names: M names, those of LANES or numbers from the left.
         vehicles: (heads, n, n) weights of the encoder; a row attends to the columns and sums to 1.
-        to_lanes: (heads, n, 3) weights of the encoder from vehicles to lanes.
+        to_lanes: (heads, n, M) weights of the encoder from vehicles to lanes.
         decoder: (heads, n, n) weights of the decoder.
     """
 
@@ -55,6 +56,7 @@ class AttentionMap:
     place_m: Floats
     size_m: Floats
     lanes: Floats
+    lane_names: tuple[str, ...]
     vehicles: Floats
     to_lanes: Floats
     decoder: Floats
@@ -88,7 +90,7 @@ class AttentionMap:
             ],
             "lanes": [
                 {"name": name, "exists": exists > 0, "offset_m": round(offset_m, 3), "width_m": round(width_m, 3)}
-                for name, (offset_m, width_m, exists) in zip(LANES, self.lanes.tolist(), strict=True)
+                for name, (offset_m, width_m, exists) in zip(self.lane_names, self.lanes.tolist(), strict=True)
             ],
             "attention": {
                 "encoder_vehicles": self.vehicles.round(6).tolist(),
@@ -128,7 +130,8 @@ def map_attention(
     """
     numbers = np.asarray(samples, dtype=np.int64)
     observed, _ = gather_nearest(folder, numbers, nearest=nearest)
-    weights = network.read_attention(observed)
+    weights, lanes = network.read_attention(observed), network.choose_lanes(observed)
+    names = tuple(map(str, range(1, lanes.shape[1] + 1))) if network.lanes == "all" else LANES
     ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, numbers, nearest).row)]
     maps = []
     for row, (sample, present) in enumerate(zip(numbers.tolist(), observed.vehicle_mask.sum(axis=1), strict=True)):
@@ -139,7 +142,8 @@ def map_attention(
                 vehicle_id=tuple(ids[row, there].tolist()),
                 place_m=observed.history[row, there, -1].astype(np.float64),
                 size_m=observed.size_m[row, there].astype(np.float64),
-                lanes=observed.lanes[row].astype(np.float64),
+                lanes=lanes[row].astype(np.float64),
+                lane_names=names,
                 vehicles=weights.vehicles[row, :, there, there].astype(np.float64),
                 to_lanes=weights.lanes[row, :, there].astype(np.float64),
                 decoder=weights.decoder[row, :, there, there].astype(np.float64),
@@ -186,9 +190,11 @@ def describe_head(shown: AttentionMap, head: int) -> str:
         most = int(weights.argmax())
         return f"{'itself' if most == 0 else f'vehicle {most}'} ({weights[most]:.0%})"
 
-    lanes = shown.to_lanes[head, 0]
-    most = int(lanes.argmax())
-    lane = f"the {LANES[most]} lane ({lanes[most]:.0%})" if lanes.sum() > 0 else "no lane, as none is known"
+    lane, lanes = "no lane, as none is known", shown.to_lanes[head, 0]
+    if lanes.sum() > 0:
+        most = int(lanes.argmax())
+        name = shown.lane_names[most]
+        lane = f"{f'the {name} lane' if name in LANES else f'lane {name}'} ({lanes[most]:.0%})"
     encoder, decoder = name_most(shown.vehicles[head, 0]), name_most(shown.decoder[head, 0])
     return f"the ego attends most to {encoder} and {lane}; in the decoder to {decoder}"
 
@@ -212,7 +218,9 @@ def list_bands(shown: AttentionMap, head: int) -> list[Row]:
             "weight": weight,
             "label": f"{lane} ({weight:.0%})",
         }
-        for lane, (offset_m, width_m, exists), weight in zip(LANES, shown.lanes.tolist(), weights, strict=True)
+        for lane, (offset_m, width_m, exists), weight in zip(
+            shown.lane_names, shown.lanes.tolist(), weights, strict=True
+        )
         if exists
     ]
 
@@ -229,7 +237,8 @@ def list_boxes(shown: AttentionMap, head: int) -> list[Row]:
 
 def list_weights(shown: AttentionMap, head: int) -> list[Row]:
     """List the weights of a head's three matrices, with the names of row and column; only of lanes that exist."""
-    vehicles, lanes = [*enumerate(shown.names)], [lane for lane in enumerate(LANES) if shown.lanes[lane[0], 2]]
+    vehicles = [*enumerate(shown.names)]
+    lanes = [(number, name) for number, name in enumerate(shown.lane_names) if shown.lanes[number, 2]]
     matrices = (
         ("vehicles", shown.vehicles, vehicles),
         ("lanes", shown.to_lanes, lanes),
@@ -292,7 +301,7 @@ def _draw_road(shown: AttentionMap, head: int) -> Layers:
 def _draw_matrix(shown: AttentionMap, head: int, matrix: str, title: str) -> alt.Chart:
     lanes = matrix == "lanes"
     axis = partial(alt.Axis, labelFontSize=11, labelPadding=3, ticks=False, domain=False)
-    columns = alt.Scale(domain=list(LANES) if lanes else shown.names)
+    columns = alt.Scale(domain=list(shown.lane_names) if lanes else shown.names)
     chart: alt.Chart = (
         name_rows("weights", f"datum.head === {head}", f"datum.matrix === '{matrix}'")
         .mark_rect(stroke=PAPER, strokeWidth=0.5)

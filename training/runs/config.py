@@ -149,7 +149,7 @@ def make_plan(entry: Model, folder: TensorFolder, config: TrainConfig) -> Plan:
     device = find_device(config.device)
     given = {name: value for name in RECIPE_SETTINGS if (value := getattr(config, name)) is not None}
     recipe = replace(entry.recipe, **given)
-    return Plan(entry, folder, config, recipe, {**entry.parameters, **config.parameters}, train, val, device)
+    return Plan(entry, folder, config, recipe, entry.complete(config.parameters), train, val, device)
 
 
 def find_device(name: str) -> "torch.device":

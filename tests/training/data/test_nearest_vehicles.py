@@ -69,29 +69,32 @@ def loop_over_surroundings(tables, splits, nearest, markings):
                         "size_m": sizes[vehicle_id],
                     }
                 )
-            lanes = []
-            for lane in (own_lane - 1, own_lane, own_lane + 1):
-                if own_lane == 0 or not 1 <= lane <= last_lane:
-                    lanes.append([0.0, 0.0, 0.0])
-                elif markings:
+            all_lanes = {}
+            for lane in range(1, last_lane + 1):
+                if markings:
                     left, right = markings[lane - 1], markings[lane]
-                    lanes.append([(left + right) / 2 - origin[1], right - left, 1.0])
+                    all_lanes[lane] = [(left + right) / 2 - origin[1], right - left, 1.0]
                 else:
-                    lanes.append([(lane - 0.5) * 12 * 0.3048 - origin[1], 12 * 0.3048, 1.0])
-            expected.append((vehicles, lanes, found[key].lateral, found[key].longitudinal))
+                    all_lanes[lane] = [(lane - 0.5) * 12 * 0.3048 - origin[1], 12 * 0.3048, 1.0]
+            beside = (own_lane - 1, own_lane, own_lane + 1) if own_lane else (0, 0, 0)
+            lanes = [all_lanes.get(lane, [0.0, 0.0, 0.0]) for lane in beside]
+            expected.append((vehicles, lanes, list(all_lanes.values()), found[key].lateral, found[key].longitudinal))
     return expected
 
 
 def compare(got, want, *, atol):
     """B expected surroundings beside what was gathered."""
     observed, truth = got
-    for place, (vehicles, lanes, lateral, longitudinal) in enumerate(want):
+    for place, (vehicles, lanes, all_lanes, lateral, longitudinal) in enumerate(want):
         there = len(vehicles)
         for name in vehicles[0]:
             array = getattr(truth if name.startswith("future") else observed, name)[place]
             np.testing.assert_allclose(array[:there], [vehicle[name] for vehicle in vehicles], atol=atol, err_msg=name)
             assert not array[there:].any(), name
         np.testing.assert_allclose(observed.lanes[place], lanes, atol=max(atol, 1e-5))
+        exist = len(all_lanes)  # other subsets may have more
+        np.testing.assert_allclose(observed.all_lanes[place, :exist].reshape(-1, 3), all_lanes, atol=max(atol, 1e-5))
+        assert not observed.all_lanes[place, exist:].any()
         assert (truth.lateral[place], truth.longitudinal[place]) == (lateral, longitudinal)
 
 
@@ -123,6 +126,7 @@ def test_types_are_as_declared_and_the_future_is_not_among_what_may_be_seen(tmp_
     kinds = {own.name: getattr(observed, own.name).dtype.name for own in fields(observed)}
     assert kinds == {
         "history": "float32", "history_mask": "bool", "vehicle_mask": "bool", "size_m": "float32", "lanes": "float32",
+        "all_lanes": "float32",
     }  # fmt: skip
     assert (truth.future.dtype.name, truth.future_mask.dtype.name) == ("float32", "bool")
     with pytest.raises(FutureInputError, match="`future` is not known"):

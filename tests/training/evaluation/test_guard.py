@@ -375,7 +375,7 @@ def test_what_may_be_seen_has_no_other_names(folder):
     known = {"history", "neighbor_history", "neighbor_mask", "neighbor_sample", "neighbor_cell"}
     assert set(vars(observed)) == known
     scene, _ = read_samples(folder, [0], "scene")
-    assert set(vars(scene)) == {"history", "history_mask", "vehicle_mask", "size_m", "lanes"}
+    assert set(vars(scene)) == {"history", "history_mask", "vehicle_mask", "size_m", "lanes", "all_lanes"}
     for given in (observed, scene):
         for name in vars(truth):
             with pytest.raises(FutureInputError, match=f"`{name}` is not known"):

@@ -42,6 +42,7 @@ def scene(*vehicles, lanes=LANES):
         vehicle_mask=np.ones((1, len(vehicles)), np.bool_),
         size_m=np.zeros((1, len(vehicles), 2), np.float32),
         lanes=np.array([lanes], np.float32),
+        all_lanes=np.array([lanes], np.float32),
     )
 
 
@@ -218,6 +219,7 @@ def test_order_of_scenes_and_of_vehicles_changes_nothing(seed):
         vehicle_mask=seen.vehicle_mask[scenes][:, vehicles],
         size_m=seen.size_m[scenes][:, vehicles],
         lanes=seen.lanes[scenes],
+        all_lanes=seen.all_lanes[scenes],
     )
     np.testing.assert_array_equal(describe_targets(other, RATE), describe_targets(seen, RATE)[scenes])
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from lone_vehicles import TWO_SECONDS, observe, reveal, seeds, wander
 from scipy.stats import multivariate_normal
 
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.models.network import Straight
@@ -188,6 +189,67 @@ def step_through_encoder_decoder(network, history):
         decoded = written.stack("decoder", last, states)
         places.append(written.dense("place", np.maximum(written.dense("output", decoded), 0)))
     return np.array(places)
+
+
+def step_through_recursive_decoder(network, history):
+    """The encoder-decoder as published: the decoder is fed the place that it put out before, at first (0, 0)."""
+    written, states = Written(network), [(np.zeros(256), np.zeros(256)) for _ in range(2)]
+    for position in history.astype(float):
+        written.stack("encoder", np.maximum(written.dense("embedding", position), 0), states)
+    places = [np.zeros(2)]
+    for _ in range(F):
+        fed = np.maximum(written.dense("embedding_of_place", places[-1]), 0)
+        decoded = written.stack("decoder", fed, states)
+        places.append(written.dense("place", np.maximum(written.dense("output", decoded), 0)))
+    return np.array(places[1:])
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_recursive_decoder_is_its_description(residual):
+    history, _ = wander(np.random.default_rng(13), CSP, 2)
+    network = build("lstm-encoder-decoder", recursive=True, residual=residual)
+    with torch.no_grad():
+        for weights in network.parameters():
+            weights *= 2
+    said = network.predict(observe(history)).position_m
+    for sample in range(2):
+        straight = np.arange(1, F + 1)[:, None] * (history[sample, -1] - history[sample, -2]) if residual else 0
+        written = step_through_recursive_decoder(network, history[sample])
+        np.testing.assert_allclose(said[sample], straight + written, atol=1e-4)
+
+
+def test_as_published_sets_the_parameters_of_the_publication():
+    published = {
+        "v-lstm": {"residual": False},
+        "stacked-lstm": {"residual": False, "hidden": 256},
+        "lstm-encoder-decoder": {"residual": False, "recursive": True},
+        "cs-lstm-m": {
+            "residual": False,
+            "short_histories": False,
+            "maneuver_loss": "binary",
+            "maneuvers": True,
+        },
+    }
+    for name, expected in published.items():
+        model = MODELS[name]
+        assert model.complete({"as_published": True}) == expected
+        assert model.complete({}) == model.complete({"as_published": False}) == dict(model.parameters)
+        assert model.settings == {**model.parameters, "as_published": False}
+    mixed = MODELS["stacked-lstm"].complete({"as_published": True, "hidden": 64})
+    assert mixed == {"residual": False, "hidden": 64}, "what is given itself counts"
+    assert sum(each.numel() for each in build("stacked-lstm", as_published=True).parameters()) == (
+        lstm(2, 256) + lstm(256, 256) + linear(256, 25 * 2)
+    )
+    for name, value in (("v-lstm", "yes"), ("ctrv", True)):
+        with pytest.raises(UsageError, match="as_published"):
+            build(name, as_published=value)
+
+
+def test_what_as_published_sets_is_a_parameter_of_another_value():
+    for model in MODELS.values():
+        assert all(type(model.parameters[name]) is type(value) for name, value in model.published.items())
+        assert all(model.parameters[name] != value for name, value in model.published.items())
+        assert bool(model.published) == bool(model.differs)
 
 
 @pytest.mark.parametrize(

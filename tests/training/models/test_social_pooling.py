@@ -142,6 +142,39 @@ def test_losses_are_those_of_the_true_maneuver(name, fast, residual):
 
 
 @settings(max_examples=15)
+@given(seed=st.integers(0, 1000), neighbors=st.lists(st.integers(0, 8), max_size=4), fast=st.booleans())
+def test_as_published_a_neighbor_with_a_short_history_is_an_empty_cell(seed, neighbors, fast):
+    observed, truth = draw(seed, neighbors)
+    whole = observed.neighbor_mask.all(axis=1)
+    fewer = {name: values[whole] for name, values in vars(observed).items() if name.startswith("neighbor")}
+    losses = []
+    for model, seen in (
+        (build("cs-lstm", as_published=True), observed),
+        (build("cs-lstm", residual=False), Observed(observed.history, **fewer)),
+    ):
+        model.fast = fast
+        losses.append(model.loss(to_tensors(seen), to_tensors(truth), "nll").item())
+    assert losses[0] == losses[1]
+
+
+def test_as_published_maneuvers_are_judged_by_binary_entropies():
+    """The published code takes torch's BCELoss of softmaxed heads: the mean over samples and over classes."""
+    model, plain = build("cs-lstm-m", as_published=True), build("cs-lstm-m", residual=False, short_histories=False)
+    observed, truth = draw(3, [4, 7])
+    said, asked = model.predict(observed), (to_tensors(observed), to_tensors(truth))
+    entropies = {"binary": 0.0, "categorical": 0.0}
+    for probability, true in ((said.lateral, truth.lateral), (said.longitudinal, truth.longitudinal)):
+        for sample, klass in enumerate(true):
+            right = np.delete(1 - probability[sample], klass)
+            own = -np.log(probability[sample, klass])
+            entropies["binary"] += (own - np.log(right).sum()) / probability.size
+            entropies["categorical"] += own / len(true)
+    apart = model.loss(*asked, "nll").item() - plain.loss(*asked, "nll").item()
+    assert apart == pytest.approx(entropies["binary"] - entropies["categorical"], rel=1e-9)
+    assert model.loss(*asked, "mse").item() == plain.loss(*asked, "mse").item()
+
+
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 1000),
     neighbors=st.lists(st.integers(0, 8), min_size=0, max_size=5),

@@ -34,6 +34,11 @@ class Weights:
 class KnownAttention:
     """Weights that are known: in head h vehicle v gives u (h + 1) (u + 1) parts, the lanes 1, 2, 3 parts."""
 
+    lanes = "adjacent"
+
+    def choose_lanes(self, observed):
+        return observed.lanes
+
     def read_attention(self, observed):
         there, exists = observed.vehicle_mask, observed.lanes[..., 2] > 0
         scenes, vehicles = there.shape
