@@ -18,6 +18,7 @@ from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Model, Predictor, Reads, find_model, require_torch
+from tracklake.training.models.fitting import fit_model
 from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, claim_folder, read_checkpoint, restore, save_checkpoint
@@ -71,7 +72,8 @@ def train(
     The evaluation part is read once, after the last step, and decides nothing; `evaluation` is null where it is empty.
 
     Args:
-        model: name in the registry, or a user's own by `module:Class`; one that does not learn is only evaluated.
+        model: name in the registry, or a user's own by `module:Class`; one that is no network is fitted, if it has
+            something to fit, and evaluated.
         tensors: the tensor folder.
         out: the run's folder, replaced after the training; until then its checkpoint and logs are hidden beside it.
         config: settings; None = the model's recipe or, when resuming, the settings of the checkpoint.
@@ -87,7 +89,7 @@ def train(
     entry, folder, out = find_model(model), TensorFolder.open(tensors), Path(out)
     if not entry.learns:
         config = config or TrainConfig()
-        return _write_baseline(entry, folder.narrow(config.dataset, config.recording), out, dict(config.parameters))
+        return _write_baseline(entry, folder.narrow(config.dataset, config.recording), out, config)
     require_torch(model)
     with claim_folder(out, resume=resume) as unfinished:
         checkpoint = unfinished / CHECKPOINT_FILE
@@ -121,11 +123,18 @@ def train(
     return metrics
 
 
-def _write_baseline(entry: Model, folder: TensorFolder, out: Path, parameters: dict[str, Any]) -> dict[str, Any]:
-    """Evaluate a model that needs no training, write it as a run, and return its metrics."""
-    evaluation = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
-    metrics = {"model": entry.name, "seconds": 0.0, "steps": 0, "evaluation": evaluation}
-    save_run(out, describe_run(entry.name, parameters, {}, folder), metrics, None)
+def _write_baseline(entry: Model, folder: TensorFolder, out: Path, config: TrainConfig) -> dict[str, Any]:
+    """Fit a model that is no network, evaluate it, write it as a run, and return its metrics."""
+    started, parameters = time.monotonic(), dict(config.parameters)
+    metrics: dict[str, Any] = {"model": entry.name, "seconds": 0.0, "steps": 0}
+    settings: dict[str, Any] = {}
+    if entry.fitted:
+        settings = {"dataset": config.dataset, "recording": config.recording}
+        fit = fit_model(entry, folder, folder.samples_of("train"), parameters)
+        parameters, metrics["fit"] = dict(fit.parameters), fit.to_dict()
+        metrics["seconds"] = round(time.monotonic() - started, 3)
+    metrics["evaluation"] = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
+    save_run(out, describe_run(entry.name, parameters, settings, folder), metrics, None)
     return metrics
 
 

@@ -148,6 +148,8 @@ def evaluate(
         gains = None
         if found:
             show_evaluations(terminal, found[0], table, [own.value for own in by or []])
+            for fit in (own.fit for own in found if own.fit):
+                terminal.print_line(fit.describe(), style="dim")
             tracks_from = found[0].protocol.tracks_from
             terminal.print_line(describe_causality(tracks_from), style="dim")
             if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:

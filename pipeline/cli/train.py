@@ -28,6 +28,7 @@ from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.text import quote_shell
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Model, find_model
+from tracklake.training.models.fitting import Fit
 from tracklake.training.runs.config import RECIPE_SETTINGS, TrainConfig
 from tracklake.training.train import TrainingInterruptedError
 from tracklake.training.train import train as train_model
@@ -91,11 +92,15 @@ def train(
     """Train a model on the split's training part and evaluate it once on the evaluation part."""
     with command(quiet=quiet, json=json) as terminal:
         entry = find_model(model)
-        run_name = _check_name(model.rpartition(":")[2] if name is None else name)
-        if not entry.learns:
+        run_name = _check_name(model.rpartition(":")[2] if name is None else name, model)
+        if not entry.learns and not entry.fitted:
             raise typer.BadParameter(f"{model} does not learn; `tracklake evaluate {model}` scores it")
         given: dict[str, Any] = {"seconds": seconds, "epochs": epochs, "steps": steps, "patience": patience}
         given |= {"samples_per_epoch": samples_per_epoch, "seed": seed, "device": device, "threads": threads}
+        unused = [own for own, value in {**given, "resume": resume}.items() if value is not None]
+        if entry.fitted and unused:
+            names = ", ".join(f"--{own.replace('_', '-')}" for own in unused)
+            raise typer.BadParameter(f"{model} is fitted in one pass over `train`, without {names}; it takes --set")
         given |= {"dataset": dataset, "recording": recording}
         given |= _read_settings_of_model(entry, settings or [])
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
@@ -119,21 +124,21 @@ def train(
         terminal.print_json(metrics)
 
 
-def _check_name(name: str) -> str:
-    """Refuse a name that is no run's: a path, a folder of others, or a model that does not learn."""
+def _check_name(name: str, model: str) -> str:
+    """Refuse a name that is no run's: a path, a folder of others, or another model that is no network."""
     if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
         raise typer.BadParameter(f"--name is a plain name (letters, digits, `-`, `_`, `.`); got {name!r}")
     if name in (FOREST, ONBOARD):
         keeps = "`tracklake lane-forest` keeps its forest" if name == FOREST else "`tracklake onboard` keeps its runs"
         raise typer.BadParameter(f"`{name}` is where {keeps}; name the run otherwise")
-    if name in MODELS and not MODELS[name].learns:
+    if name in MODELS and not MODELS[name].learns and not (name == model and MODELS[name].fitted):
         raise typer.BadParameter(f"{name} does not learn; `tracklake evaluate {name}` scores it")
     return name
 
 
 def _read_settings_of_model(entry: Model, settings: list[str]) -> dict[str, Any]:
     """Read NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
-    recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS}
+    recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS} if entry.recipe else {}
     known = {**recipe, **entry.settings}
     read = read_pairs(settings, known, entry.name)
     config = {name: value for name, value in read.items() if name in recipe}
@@ -154,10 +159,13 @@ def _show_training(terminal: Terminal, metrics: dict[str, Any], out: Path) -> No
         _show_scores(terminal, metrics["evaluation"])
     else:
         terminal.print_line("note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim")
-    terminal.print_line(
-        f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
-        f"reading them took {metrics['data_share']:.1%} of it"
-    )
+    if fit := metrics.get("fit"):
+        terminal.print_line(Fit(**fit).describe())
+    else:
+        terminal.print_line(
+            f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "
+            f"reading them took {metrics['data_share']:.1%} of it"
+        )
     terminal.print_line(f"run {out}; `tracklake evaluate` compares runs, `tracklake report` adds them to the report")
 
 

@@ -20,6 +20,7 @@ from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
 from tracklake.training.evaluation.scores import Score, Tally, find_strata
 from tracklake.training.models import Predictor, Reads
+from tracklake.training.models.fitting import Fit
 from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import open_forecaster
@@ -39,6 +40,7 @@ class Evaluation:
     `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
     `latency` is empty where it was not measured. `data_origin` is of all subsets of the tensors. `vehicle_sums` has the
     columns of `schemas.comparisons.VEHICLE_ERRORS` but for the first three; `run` is the content of the run's config.
+    `fit` says what was fitted before the evaluation.
     """
 
     model: str
@@ -52,7 +54,8 @@ class Evaluation:
     nearest: int | None = None
     latency: Mapping[str, float] = field(default_factory=dict)
     vehicle_sums: pl.DataFrame = field(default_factory=pl.DataFrame, repr=False, compare=False)
-    run: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    run: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    fit: Fit | None = None
 
     @property
     def horizons(self) -> tuple[Score, ...]:
@@ -66,7 +69,8 @@ class Evaluation:
         values = {name: getattr(self, name) for name in names}
         shared = {"dataset", "group", "average"}
         rows = [{name: value for name, value in asdict(own).items() if name not in shared} for own in self.horizons]
-        return values | {"protocol": self.protocol.name, "horizons": rows}
+        fit = {"fit": self.fit.to_dict()} if self.fit else {}
+        return values | {"protocol": self.protocol.name, "horizons": rows} | fit
 
     def to_table(self) -> pl.DataFrame:
         """Convert to rows of `schemas.evaluations.EVALUATIONS`."""
@@ -104,9 +108,9 @@ def evaluate(
     with_latency: bool = False,
     every_tick: bool = False,
 ) -> Evaluation:
-    """Evaluate a trained run, or a model that needs no training.
+    """Evaluate a trained run, or a model that is no network.
 
-    `name` is a run's folder in `models`, or a model that does not learn; `tensors` their folder, or the folder opened
+    `name` is a run's folder in `models`, or a model that is no network; `tensors` their folder, or the folder opened
     (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles
     around the ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon.
 
@@ -119,7 +123,7 @@ def evaluate(
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
     found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)
-    found = replace(found, run=own.config)
+    found = replace(found, run=own.config, fit=own.fit)
     if with_latency:
         latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
         found = replace(found, latency=latency)

@@ -82,9 +82,11 @@ class Model:
         module: its module, relative to `training.models` or absolute; imported only when the model is built.
         builder: class in the module; takes the protocol, and the parameters as keywords.
         parameters: the model's own parameters with their defaults.
-        recipe: how a torch network is trained; None where the model needs no training.
+        recipe: how a torch network is trained; None where there is none to train.
         published: what `as_published` sets, so that inputs, outputs and loss are the publication's.
         differs: what differs from the publication even then.
+        fitted: whether parameters that are not set are fitted on the training part, in one pass and without torch, by
+            the builder's `fit` (see `training.models.fitting`).
     """
 
     name: str
@@ -97,10 +99,11 @@ class Model:
     recipe: Recipe | None = None
     published: Mapping[str, Any] = field(default_factory=dict)
     differs: str = ""
+    fitted: bool = False
 
     @property
     def learns(self) -> bool:
-        """Whether the model is trained before it predicts."""
+        """Whether the model is a network that is trained before it predicts."""
         return self.recipe is not None
 
     @property
@@ -165,11 +168,27 @@ _ATTENTION = {
 _MODELS = (
     Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", ".constant_velocity", "ConstantVelocity"),
     Model(
+        "damped-velocity",
+        "constant velocity along the road, while the lateral velocity decays",
+        "",
+        ".constant_velocity",
+        "DampedVelocity",
+        {"decay_s": 1.0},
+        fitted=True,
+    ),
+    Model(
         "kalman-cv",
         "Kalman filter over the history with constant velocity and white-noise acceleration",
         BAR_SHALOM,
         ".constant_velocity",
         "KalmanConstantVelocity",
+        {
+            "measurement_longitudinal_m": 0.15,
+            "measurement_lateral_m": 0.1,
+            "acceleration_longitudinal_m2ps3": 1.0,
+            "acceleration_lateral_m2ps3": 0.04,
+        },
+        fitted=True,
     ),
     Model("ctrv", "constant turn rate and velocity", SCHUBERT, ".ctrv", "ConstantTurnRate"),
     Model(

@@ -1,30 +1,26 @@
-"""Constant velocity, the baseline of all models: of the last 0.2 s, and by a Kalman filter, with NumPy only."""
+"""Constant velocity, the baseline of all models: of the last 0.2 s, damped, and by a Kalman filter; NumPy only."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from tracklake.schemas.arrays import Floats, Singles
+from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed
+from tracklake.training.models.fitting import Moments, search
 from tracklake.training.models.prediction import Density, Prediction
 
 VELOCITY_S = 0.2
 """Length of history that the velocity is taken from, in seconds."""
 
-MEASUREMENT_M = (0.15, 0.10)
-"""Standard deviation of a recorded position in m, along and across the road.
-
-Larger than the jitter from tick to tick (0.03 m and 0.02 m about a cubic over 1.5 s of the public excerpt of US-101),
-since the errors of tracking in video last longer than a tick.
-"""
-
-ACCELERATION_M2PS3 = (1.0, 0.04)
-"""Power spectral density q of the acceleration in m2/s3, along and across the road.
-
-Over T seconds the velocity changes by sqrt(q T): 2.2 m/s along and 0.45 m/s across in 5 s; in the same excerpt, dense
-traffic, it is 2.4 m/s and 0.39 m/s.
-"""
+DECAY_S = (0.01, 1000.0)
+"""Least and largest time in s after which a lateral velocity may have fallen to 37 %."""
+MEASUREMENT_RANGE_M, ACCELERATION_RANGE_M2PS3 = (1e-3, 10.0), (1e-6, 100.0)
+"""Ranges that the Kalman filter's noise is fitted in."""
+AXES = ("longitudinal", "lateral")
+"""Names of the axes of positions, as in the names of parameters."""
 
 
 def velocity_ticks(protocol: Protocol) -> int:
@@ -33,12 +29,12 @@ def velocity_ticks(protocol: Protocol) -> int:
 
 
 def extrapolate(history: Any, ticks: int, steps: Any) -> Any:  # noqa: ANN401  (NumPy's arrays or torch's tensors, all of one kind)
-    """Return (..., F, 2) in m relative to the last position of histories (..., H, 2), for `steps` (F,) ticks ahead.
+    """Return (..., F, 2) in m relative to the last position of histories (..., H, 2), for `steps` (F, 1 or 2) ticks.
 
-    The velocity is that of the last `ticks` ticks.
+    The velocity is that of the last `ticks` ticks; steps are the same for both axes, or of each axis.
     """
     velocity = (history[..., -1, :] - history[..., -1 - ticks, :]) / ticks  # m per tick
-    return velocity[..., None, :] * steps[:, None]
+    return velocity[..., None, :] * steps
 
 
 class ConstantVelocity:
@@ -50,11 +46,47 @@ class ConstantVelocity:
 
     def __init__(self, protocol: Protocol) -> None:
         self.ticks = velocity_ticks(protocol)
-        self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)
+        self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)[:, None]
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
         """Predict the positions of B samples."""
         return Prediction(position_m=extrapolate(observed.history, self.ticks, self.steps))
+
+
+class DampedVelocity(ConstantVelocity):
+    """Constant velocity along the road, while the lateral velocity decays: y(t) = v_y T (1 - exp(-t / T)).
+
+    Vehicles end a lane change, and what a tracker's noise adds to a lateral velocity does not last either. `decay_s` is
+    T; fitted, it has the least sum of squared lateral errors over all known positions ahead.
+    """
+
+    def __init__(self, protocol: Protocol, *, decay_s: float) -> None:
+        super().__init__(protocol)
+        _require_positive(decay_s=decay_s)
+        across = _damp(self.steps, decay_s * protocol.rate_hz)
+        self.steps = np.concatenate([self.steps, across], axis=1).astype(np.float32)
+
+    @staticmethod
+    def fit(protocol: Protocol, moments: Moments, given: Mapping[str, float]) -> dict[str, float]:
+        """Return `decay_s`, unless it is given."""
+        if "decay_s" in given:
+            return {}
+        ticks, steps = velocity_ticks(protocol), np.arange(1.0, protocol.horizon_ticks + 1)
+        velocity = np.zeros(protocol.history_ticks)
+        velocity[-1], velocity[-1 - ticks] = 1 / ticks, -1 / ticks
+
+        def measure(decay_s: Floats) -> Floats:
+            weights = _damp(steps, decay_s * protocol.rate_hz)[..., None] * velocity
+            squares: Floats = moments.sum_squared_errors(1, weights).sum(axis=1)
+            return squares
+
+        (decay_s,) = search(measure, DECAY_S[:1], DECAY_S[1:])
+        return {"decay_s": float(decay_s)}
+
+
+def _damp(steps: Any, decay: Any) -> Any:  # noqa: ANN401  (arrays that fit each other)
+    """Return the ticks of full velocity that ticks of a decaying one are worth; both times in ticks."""
+    return -decay * np.expm1(-steps / decay)
 
 
 class KalmanConstantVelocity:
@@ -63,33 +95,67 @@ class KalmanConstantVelocity:
     Bar-Shalom, Li and Kirubarajan 2001, Estimation with Applications to Tracking and Navigation: the discretised
     continuous white-noise acceleration model of section 6.2.2, the filter of 5.2.4, begun with the first two positions
     (two-point differencing, 5.5.3). The density is that of the position as it will be recorded, with the variances of
-    state and measurement. Gains and variances are the same for all samples.
+    state and measurement. Gains and variances are the same for all samples, so that predictions are linear in the
+    history.
+
+    Fitted, the noise of each axis has the greatest likelihood of the positions ahead: the sum of the log densities of
+    all known ones, each by itself (a composite likelihood, as positions of one future depend on each other). It is not
+    that of the innovations, which would fit the next tick and be too sure of those after 5 s.
+
+    The defaults are for dense traffic. 0.15 m and 0.1 m are larger than the jitter from tick to tick (0.03 m and 0.02 m
+    about a cubic over 1.5 s of the public excerpt of US-101), since the errors of tracking in video last longer than a
+    tick. Over T seconds a density q changes the velocity by sqrt(q T): 1 m2/s3 and 0.04 m2/s3 by 2.2 m/s along the road
+    and 0.45 m/s across it in 5 s; in the same excerpt it is 2.4 m/s and 0.39 m/s.
+
+    Args:
+        protocol: rate, history and horizon.
+        measurement_longitudinal_m: standard deviation of a recorded position along the road.
+        measurement_lateral_m: the same across the road.
+        acceleration_longitudinal_m2ps3: power spectral density of the acceleration along the road.
+        acceleration_lateral_m2ps3: the same across the road.
     """
 
     def __init__(
         self,
         protocol: Protocol,
         *,
-        measurement_m: tuple[float, float] = MEASUREMENT_M,
-        acceleration_m2ps3: tuple[float, float] = ACCELERATION_M2PS3,
+        measurement_longitudinal_m: float,
+        measurement_lateral_m: float,
+        acceleration_longitudinal_m2ps3: float,
+        acceleration_lateral_m2ps3: float,
     ) -> None:
-        self.tick_s = 1.0 / protocol.rate_hz
-        self.ahead_s: Floats = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float64) * self.tick_s
-        noise = np.square(np.array(measurement_m))  # (2,) m2, by axis
-        density = np.array(acceleration_m2ps3)
-        self.gains, covariance = _gains(noise, density, self.tick_s, protocol.history_ticks)
-        ahead = _predicted(covariance[:, None], density[:, None], self.ahead_s)  # (2, F, 2, 2)
-        self.sigma_m: Floats = np.sqrt(ahead[:, :, 0, 0] + noise[:, None]).T  # (F, 2)
+        sigma_m = {"measurement_longitudinal_m": measurement_longitudinal_m}
+        sigma_m["measurement_lateral_m"] = measurement_lateral_m
+        density = {"acceleration_longitudinal_m2ps3": acceleration_longitudinal_m2ps3}
+        density["acceleration_lateral_m2ps3"] = acceleration_lateral_m2ps3
+        _require_positive(**sigma_m, **density)
+        weights, variance = _filter(protocol, np.array([*sigma_m.values()]), np.array([*density.values()]))
+        self.weights: Floats = weights  # (2, F, H)
+        self.sigma_m: Floats = np.sqrt(variance).T  # (F, 2)
+
+    @staticmethod
+    def fit(protocol: Protocol, moments: Moments, given: Mapping[str, float]) -> dict[str, float]:
+        """Return the noise that is not given, of both axes."""
+        fitted: dict[str, float] = {}
+        for axis, axis_name in enumerate(AXES):
+
+            def measure(noise: Floats, axis: int = axis) -> Floats:
+                weights, variance = _filter(protocol, noise[:, 0], noise[:, 1])
+                squares = moments.sum_squared_errors(axis, weights)
+                nats: Floats = ((moments.count * np.log(variance) + squares / variance) / 2).sum(axis=1)
+                return nats
+
+            names = f"measurement_{axis_name}_m", f"acceleration_{axis_name}_m2ps3"
+            ranges = zip(names, (MEASUREMENT_RANGE_M, ACCELERATION_RANGE_M2PS3), strict=True)
+            low, high = zip(*((given[own], given[own]) if own in given else span for own, span in ranges), strict=True)
+            found = dict(zip(names, search(measure, low, high).tolist(), strict=True))
+            fitted |= {own: value for own, value in found.items() if own not in given}
+        return fitted
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
         """Predict the positions of B samples."""
-        history = observed.history.astype(np.float64)
-        position, velocity = history[:, 1], (history[:, 1] - history[:, 0]) / self.tick_s  # (B, 2) by axis
-        for tick, gain in enumerate(self.gains, start=2):
-            expected = position + velocity * self.tick_s
-            surprise = history[:, tick] - expected
-            position, velocity = expected + gain[:, 0] * surprise, velocity + gain[:, 1] * surprise
-        predicted = (position[:, None] + velocity[:, None] * self.ahead_s[:, None]).astype(np.float32)  # (B, F, 2)
+        by_axis = np.moveaxis(observed.history, -1, 0).astype(np.float64)  # (2, B, H)
+        predicted = np.moveaxis(by_axis @ np.swapaxes(self.weights, 1, 2), 0, -1).astype(np.float32)  # (B, F, 2)
         samples, steps, _ = predicted.shape
         density = Density(
             weight=np.ones((samples, 1), dtype=np.float32),
@@ -100,16 +166,32 @@ class KalmanConstantVelocity:
         return Prediction(position_m=predicted, density=density)
 
 
-def _gains(noise: Floats, density: Floats, tick_s: float, ticks: int) -> tuple[Floats, Floats]:
-    """Compute gains (H - 2, 2 axes, 2) from the third position on, and the last covariance (2 axes, 2, 2)."""
+def _require_positive(**parameters: float) -> None:
+    """Raise UsageError for a parameter that is not above 0."""
+    for name, value in parameters.items():
+        if not value > 0:
+            raise UsageError(f"parameter `{name}`: expected a number above 0, got {value:g}")
+
+
+def _filter(protocol: Protocol, measurement_m: Floats, density: Floats) -> tuple[Floats, Floats]:
+    """Run A filters with noise (A,), (A,): weights (A, F, H) of past positions in those ahead, and variances (A, F)."""
+    tick_s, past = 1.0 / protocol.rate_hz, np.eye(protocol.history_ticks)
+    ahead_s: Floats = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float64) * tick_s
+    noise = np.square(measurement_m)
     covariance = noise[:, None, None] * np.array([[1.0, 1.0 / tick_s], [1.0 / tick_s, 2.0 / tick_s**2]])
-    gains = np.empty((ticks - 2, 2, 2))
-    for tick in range(ticks - 2):
+    position = np.tile(past[1], (len(noise), 1))  # (A, H): a weight for each past position
+    velocity = np.tile((past[1] - past[0]) / tick_s, (len(noise), 1))
+    for recorded in past[2:]:
         covariance = _predicted(covariance, density, np.array(tick_s))
-        column = covariance[:, :, 0]  # (2 axes, 2) of position and velocity with the position
-        gains[tick] = column / (column[:, :1] + noise[:, None])
-        covariance = covariance - gains[tick][:, :, None] * column[:, None, :]
-    return gains, covariance
+        column = covariance[:, :, 0]  # (A, 2) of position and velocity with the position
+        gain = column / (column[:, :1] + noise[:, None])
+        covariance = covariance - gain[:, :, None] * column[:, None, :]
+        position = position + velocity * tick_s
+        surprise = recorded - position
+        position, velocity = position + gain[:, :1] * surprise, velocity + gain[:, 1:] * surprise
+    ahead = _predicted(covariance[:, None], density[:, None], ahead_s)  # (A, F, 2, 2)
+    weights = position[:, None] + velocity[:, None] * ahead_s[:, None]
+    return weights, ahead[..., 0, 0] + noise[:, None]
 
 
 def _predicted(covariance: Floats, density: Floats, time_s: Floats) -> Floats:

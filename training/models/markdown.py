@@ -12,9 +12,11 @@ _HEAD = """\
 Derived from `training/models/__init__.py`; do not edit (`make docs` writes it).
 
 `tracklake train MODEL` trains one by its own recipe; `--set name=value` changes a parameter or what is learned by
-(batch_size, learning_rate, optimizer, schedule, max_gradient_norm). Those without a recipe predict as they are. None is
-given the future or a true maneuver: `predict` gets `training.data.observed.Observed` (the sample and the
-neighbors in its grid) or `ObservedScene` (the sample and the vehicles nearest to it), and nothing else.
+(batch_size, learning_rate, optimizer, schedule, max_gradient_norm). Fitted models need no torch: `tracklake train` fits
+their parameters on the training part in one pass and writes a run, and `tracklake evaluate MODEL` fits them on the fly.
+Those without a recipe that are not fitted predict as they are. None is given the future or a true maneuver: `predict`
+gets `training.data.observed.Observed` (the sample and the neighbors in its grid) or `ObservedScene` (the sample and the
+vehicles nearest to it), and nothing else.
 """
 
 _PUBLISHED = """\
@@ -63,6 +65,8 @@ def _describe(model: Model) -> str:
     lines += [f"- source: {link_references(model.source) or 'ours'}", f"- reads: the {model.reads}"]
     if model.parameters:
         lines.append(f"- parameters: {', '.join(f'`{name}` = {value}' for name, value in model.parameters.items())}")
+    if model.fitted:
+        lines.append("- fitted: parameters that are not set; the defaults above hold where `train` has no samples")
     if (recipe := model.recipe) is not None:
         phases = ", then ".join(f"{phase.epochs} epochs of `{phase.loss}`" for phase in recipe.phases)
         lines.append(

@@ -81,7 +81,7 @@ class Straight(nn.Module):
     def __init__(self, protocol: Protocol, *, residual: bool) -> None:
         super().__init__()
         self.ticks = velocity_ticks(protocol)
-        steps = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)
+        steps = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)[:, None]
         self.steps: Tensor
         self.register_buffer("steps", steps if residual else torch.zeros_like(steps), persistent=False)
 

@@ -8,6 +8,7 @@ from typing import Any
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, Reads, find_model
+from tracklake.training.models.fitting import Fit, fit_model
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
 
 
@@ -19,17 +20,21 @@ class UnknownRunError(TracklakeError):
 class Forecaster:
     """A model that is ready to predict: name of the run or model, the model itself, and the kind of its input.
 
-    `config` is the content of the run's `config.json`; empty where the model has no run.
+    `config` is the content of the run's `config.json`, empty where the model has no run; `fit` says what was fitted on
+    opening it.
     """
 
     name: str
     predictor: Predictor
     reads: Reads
     config: Mapping[str, Any] = field(default_factory=dict)
+    fit: Fit | None = None
 
 
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:
-    """Open a trained run in the folder `models`, or a model that needs no training, to predict parts of a split.
+    """Open a trained run in the folder `models`, or a model that needs none, to predict parts of a split.
+
+    A model that is fitted and has no run of its name is fitted on the part `train`.
 
     Raises:
         StaleRunError: the run was trained for another protocol, or on subsets of these parts (other than `train`); or
@@ -37,21 +42,25 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
         UnknownRunError: neither a run nor a model of that name, or a model that learns and has no run.
         MissingExtraError: torch is needed and not installed.
     """
-    if name in MODELS and not MODELS[name].learns:
-        return Forecaster(name, MODELS[name].build(folder.protocol), MODELS[name].reads)
+    own = MODELS.get(name)
+    if own and not own.learns and not own.fitted:
+        return Forecaster(name, own.build(folder.protocol), own.reads)
     if Path(name).name == name and (models / name / "config.json").is_file():
         config, predictor = load_run(models / name, folder.protocol)
         model = find_model(config["model"])
-        for part in sorted(parts - {"train"}) if model.learns else ():
+        for part in sorted(parts - {"train"}) if model.learns or model.fitted else ():
             refuse_leak(config, folder, part)
         return Forecaster(name, predictor, model.reads, config)
+    if own and own.fitted:
+        fit = fit_model(own, folder, folder.samples_of("train"), {})
+        return Forecaster(name, own.build(folder.protocol, **fit.parameters), own.reads, fit=fit)
     refuse_unfinished(models / name)
     if Path(name).name == name and (models / name / "metrics.json").is_file():
         raise StaleRunError(f"{models / name}: a run without its config.json; train it again")
-    if name in MODELS:
+    if own:
         raise UnknownRunError(f"{models / name}: no trained run; run `tracklake train {name}` first")
     runs = sorted(path.parent.name for path in models.glob("[!.]*/config.json"))
-    known = [own for own, model in MODELS.items() if not model.learns]
+    known = [name for name, model in MODELS.items() if not model.learns]
     raise UnknownRunError(
         f"no run or model `{name}`: expected one of the runs {', '.join(runs) or '(none yet)'}, or of the models that "
         f"need no training, {', '.join(known)}; `tracklake train MODEL --name {name}` trains one"

@@ -98,6 +98,8 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         (("foo",), "unknown model `foo`: expected one of constant-velocity"),
         (("constant-velocity",), "constant-velocity does not learn"),
         (("lstm", "--name", "kalman-cv"), "kalman-cv does not learn"),
+        (("damped-velocity", "--epochs", "3"), "is fitted in one pass over `train`, without --epochs; it takes --set"),
+        (("kalman-cv", "--set", "batch_size=3"), "kalman-cv has measurement_longitudinal_m,"),
         (("lstm", "--seconds", "1", "--epochs", "2"), "one of seconds, steps, epochs"),
         (("lstm", "--set", "heads=2"), "lstm has batch_size, learning_rate,"),
         (("lstm", "--set", "hidden"), "lstm has batch_size"),
@@ -110,6 +112,19 @@ def test_words_that_mean_nothing_here_are_usage_errors(arguments, reported, comm
     done = command.here("train", *arguments, "--lake", lake.root)
     assert done.code == 2
     assert reported in " ".join(done.err.replace("│", " ").split())
+
+
+def test_a_fitted_model_is_trained_and_evaluated_with_what_was_fitted(command, lake, models):
+    done = command.here("train", "damped-velocity", "--lake", lake.root)
+    assert done.code == 0, done.err
+    fitted = json.loads((models / "damped-velocity" / "config.json").read_text())["parameters"]
+    assert f"damped-velocity: decay_s = {fitted['decay_s']:g}, fitted on " in done.out
+    chosen = command.here("train", "damped-velocity", "--set", "decay_s=2", "--name", "two", "--lake", lake.root)
+    assert chosen.code == 0, chosen.err
+    assert json.loads((models / "two" / "config.json").read_text())["parameters"] == {"decay_s": 2.0}
+    shown = command.here("evaluate", "two", "damped-velocity", "kalman-cv", "--lake", lake.root)
+    assert "kalman-cv: measurement_longitudinal_m = " in shown.out
+    assert "damped-velocity: " not in shown.out, "it has a run"
 
 
 def test_patience_asks_for_a_validation_part(command, lake):
