@@ -2,7 +2,9 @@
 
 import json as json_format
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +13,8 @@ import typer
 from tracklake.pipeline.cli.command import REFUSED, command, read_settings
 from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
+from tracklake.pipeline.cli.lane_forest_tables import show_curve, show_published, show_scores
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
-from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS as RUNS
 from tracklake.pipeline.stages.score import finished_runs
@@ -21,18 +23,15 @@ from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_er
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_file
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
-from tracklake.training.lane_changes.examples import ALL, LaneForestSettings
+from tracklake.training.lane_changes.examples import LaneForestSettings
 from tracklake.training.lane_changes.forest import ForestError, LaneForest, fit_lane_forest
 from tracklake.training.lane_changes.scores import (
-    SIZES,
-    CellScore,
-    GridScores,
-    LearningPoint,
     evaluate_grid,
     learn_curve,
 )
 from tracklake.training.models import MODELS, Predictor, Reads
+from tracklake.training.onboard.as_published import PublishedScores, score_published
+from tracklake.training.onboard.overhead import require_ticks
 from tracklake.training.runs.forecasters import open_forecaster
 
 FOLDER = "lane-forest"
@@ -80,6 +79,16 @@ def lane_forest(
     learning_curve: Annotated[
         bool, typer.Option("--learning-curve", help="Also fit fewer examples, with and without augmentation.")
     ] = False,
+    as_published: Annotated[
+        bool,
+        typer.Option(
+            "--as-published", help="Also fit the publication's forest, and this one, on 70 % of the vehicles; compare."
+        ),
+    ] = False,
+    epochs: Annotated[
+        int | None,
+        typer.Option("--epochs", min=1, help="With --as-published: also train its decoder, for so many epochs."),
+    ] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -91,9 +100,15 @@ def lane_forest(
         require_extras("the lane forest", "forest")
         if use and (seed, examples, augment, settings_given) != (None,) * 4:
             raise typer.BadParameter("--use scores a forest as it is: give no --seed, --examples, --augment or --set")
+        if epochs is not None:
+            if not as_published:
+                raise typer.BadParameter("--epochs trains the decoder of --as-published: give both")
+            require_extras("the decoder", "training")
         wanted = None if use else _read_forest_settings(examples, augment, settings_given or [])
         settings = read_settings(lake=lake, protocol=protocol)
         folder = TensorFolder.open(tensor_folder(settings.lake, load(settings.lake), settings))
+        if as_published:
+            require_ticks(folder)
         comparable = print_comparability(
             terminal, settings.lake, folder, published=folder.protocol.name == PUBLISHED_PROTOCOL
         )
@@ -101,16 +116,21 @@ def lane_forest(
         forest = _open_forest(out / FOREST, folder) if wanted is None else _fit_forest(out, folder, seed or 0, wanted)
         record = _score_forest(terminal, settings.lake / RUNS, folder, forest, runs or [], published=bool(comparable))
         _write_scores(out / SCORES, record)
-        no_curve = None
+        lacking = {}
         if learning_curve:
-            no_curve = _add_curve(terminal, record, folder, forest.settings)
-            _write_scores(out / SCORES, record)
+            lacking["learning curve"] = _add_curve(terminal, record, folder, forest.settings)
+        if as_published:
+            fit = partial(score_published, folder, forest.settings, seed or 0, with_curve=learning_curve)
+            lacking["comparison"] = _add_published(terminal, record, fit, epochs or 0, shown=bool(comparable))
+        _write_scores(out / SCORES, record)
         terminal.print_line(
             f"forest {out / FOREST}; coefficients of all features and scores by stratum: {out / SCORES}"
         )
         terminal.print_json({"lake": settings.lake, "path": out, **record})
-        if no_curve:
-            terminal.print_problem(f"{no_curve}. Everything else is done", label="no learning curve")
+        problems = {what: why for what, why in lacking.items() if why}
+        for what, why in problems.items():
+            terminal.print_problem(f"{why}. Everything else is done", label=f"no {what}")
+        if problems:
             raise typer.Exit(REFUSED)
 
 
@@ -161,9 +181,10 @@ def _score_forest(
 
     predictors, reads = _find_predictors(models, folder, runs, skip)
     scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=skip)
-    _show_scores(terminal, folder, scores, forest, published=published)
+    show_scores(terminal, folder, scores, forest, published=published)
     features = list(forest.names)
-    return {"forest": forest.facts, "features": features, **asdict(scores), "learning_curve": [], "skipped": skipped}
+    facts = {"forest": forest.facts, "features": features, **asdict(scores)}
+    return {**facts, "learning_curve": [], "as_published": None, "skipped": skipped}
 
 
 def _add_curve(
@@ -175,7 +196,21 @@ def _add_curve(
     except TracklakeError as impossible:
         return str(impossible)
     record["learning_curve"] = [asdict(point) for point in curve]
-    _show_curve(terminal, curve)
+    show_curve(terminal, curve)
+    return None
+
+
+def _add_published(
+    terminal: Terminal, record: dict[str, Any], fit: Callable[..., PublishedScores], epochs: int, *, shown: bool
+) -> str | None:
+    """Fit and score the arm as published, print it and add it to the record; the reason where it is impossible."""
+    try:
+        with terminal.show_training("train the decoder") if epochs else nullcontext() as show:
+            scores = fit(epochs=epochs, progress=show)
+    except TracklakeError as impossible:
+        return str(impossible)
+    record["as_published"] = asdict(scores)
+    show_published(terminal, scores, published=shown)
     return None
 
 
@@ -205,93 +240,3 @@ def _find_predictors(
             continue
         predictors[name], reads[name] = own.predictor, own.reads
     return predictors, reads
-
-
-def _show_scores(
-    terminal: Terminal, folder: TensorFolder, scores: GridScores, forest: LaneForest, *, published: bool
-) -> None:
-    """Print cell accuracies by horizon, those of the last horizon by stratum, and the maneuvers' accuracies."""
-    protocol = folder.protocol
-    terminal.print_line(f"eval of {folder.split}, protocol {protocol.title}", style="bold")
-    _show_cells(terminal, scores.cells, published=published)
-    rows = [
-        [own.stratum, f"{own.n:,}", *map(_format_percent, (own.accuracy, *own.recall.values(), own.majority))]
-        for own in scores.maneuvers
-    ]
-    recalls = [f"of {name} %" for name in scores.maneuvers[0].recall]
-    _show_table(terminal, "maneuver right", ["n", "all %", *recalls, "always the commonest %"], rows)
-    _show_left_out(terminal, protocol.horizon_s, forest.facts["settings"]["start_s"], scores)
-    terminal.print_line(f"features, the strongest first: {', '.join(forest.names)}", style="dim")
-
-
-def _show_left_out(terminal: Terminal, horizon_s: float, start_s: float, scores: GridScores) -> None:
-    """Print how many samples are not scored, and why."""
-    reasons = {
-        "no lane": "no lane now",
-        "future unknown": f"not recorded for {horizon_s:g} s",
-        "maneuver unknown": f"recorded for {horizon_s:g} s but not for the {start_s:g} s in which a change would begin "
-        "(left out of the cells, too, whose strata are by maneuver)",
-        "speed unknown": "of unknown speed",
-    }
-    why = "; ".join(f"{count:,} {reasons[reason]}" for reason, count in scores.left_out_by_reason.items() if count)
-    terminal.print_line(f"{scores.left_out:,} samples are not scored{': ' * bool(why)}{why}", style="dim")
-
-
-def _show_curve(terminal: Terminal, curve: list[LearningPoint]) -> None:
-    points = [
-        [f"{own.drawn:,}", "yes" if own.augmented else "no", own.seed, *map(_format_percent, figures)]
-        for own in curve
-        for figures in [(own.accuracy, own.balanced, own.lane)]
-    ]
-    headings = ["augmented", "seed", "maneuver right %", "mean recall %", "lane right %"]
-    _show_table(terminal, "learning curve, examples drawn", headings, points)
-    last = max((own.drawn for own in curve), default=0)
-    if last < max(SIZES):
-        terminal.print_line(f"it ends at {last:,} examples, with which the smallest stratum is used up", style="dim")
-
-
-def _show_cells(terminal: Terminal, cells: list[CellScore], *, published: bool) -> None:
-    horizons = sorted({own.seconds for own in cells})
-    strata = list(dict.fromkeys(own.stratum for own in cells))
-    by_key = {(own.model, own.column, own.seconds, own.stratum): own for own in cells}
-    lines = list(dict.fromkeys((own.model, own.column) for own in cells))
-    if not lines:
-        terminal.print_line("no score: the evaluation part has no sample whose maneuver is known to the end")
-        return
-    first = lines[0]
-    rows: list[list[Any]] = [
-        [_name_line(*line), *(_format_percent(by_key[*line, ahead, ALL].cell) for ahead in horizons)] for line in lines
-    ]
-    for title, figure in (("always the commonest cell", "majority"), ("true place outside of the nine", "outside")):
-        rows.append([title, *(_format_percent(getattr(by_key[*first, ahead, ALL], figure)) for ahead in horizons)])
-    rows.append(["n", *(f"{by_key[*first, ahead, ALL].n:,}" for ahead in horizons)])
-    if published:
-        for model, shares in CELL_ACCURACY.items():
-            known = dict(zip(CELL_ACCURACY_S, shares, strict=True))
-            rows.append([f"{model}, published", *(_format_percent(known.get(ahead)) for ahead in horizons)])
-    _show_table(terminal, "right cell, %", [f"{ahead:g} s" for ahead in horizons], rows)
-    last = horizons[-1]
-    rows = [
-        [_name_line(*line), *(_format_percent(by_key[*line, last, name].cell) for name in strata)] for line in lines
-    ]
-    rows.append(["n", *(f"{by_key[*first, last, name].n:,}" for name in strata)])
-    _show_table(terminal, f"right cell at {last:g} s, %", strata, rows)
-    rows = [
-        [_name_line(*line), _format_percent(own.row), _format_percent(own.lane), _format_percent(own.cell_clipped)]
-        for line in lines
-        for own in [by_key[*line, last, ALL]]
-    ]
-    _show_table(terminal, f"at {last:g} s, %", ["right row", "right column", "cell, outer ones endless"], rows)
-
-
-def _name_line(model: str, column: str) -> str:
-    return model if column == "place" else f"{model} + {column}"
-
-
-def _format_percent(share: float | None) -> str:
-    return format_number(share, scale=100)
-
-
-def _show_table(terminal: Terminal, title: str, headings: list[str], rows: list[list[Any]]) -> None:
-    """Print names in the first column and figures in the others."""
-    print_table(terminal, ["", *headings], [list(map(str, row)) for row in rows], title=title)

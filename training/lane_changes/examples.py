@@ -260,13 +260,15 @@ def _find_offsets(folder: TensorFolder, row: Integers) -> Floats:
     return offset
 
 
-def label_samples(folder: TensorFolder, part: str, settings: LaneForestSettings) -> LabelledSamples:
+def label_samples(folder: TensorFolder, part: str | None, settings: LaneForestSettings) -> LabelledSamples:
     """Find the samples of a part whose maneuver, whole future and change of speed are known, and their strata.
+
+    None stands for all parts.
 
     The same samples serve all scores: cells need the horizon alone, but are scored by maneuver, too.
     """
     maneuvers = find_maneuvers(folder, start_s=settings.start_s, tolerance_m=settings.tolerance_m)
-    everything = folder.samples_of(part)
+    everything = np.arange(len(folder.sample_row)) if part is None else folder.samples_of(part)
     row = folder.sample_row[everything].astype(np.intp)
     back = min(round(SPEED_CHANGE_S * folder.protocol.rate_hz), folder.protocol.history_ticks - 1)
     gained_mps = folder.speed_mps[row] - folder.speed_mps[row - back]

@@ -72,8 +72,8 @@ def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:
     scenes = np.arange(len(observed.history))
     known = observed.history_mask.sum(axis=2)
     ego, found = find_egos(observed, known)
-    target_motion = _fit_motion(observed.history[:, 0], known[:, 0], rate_hz)
-    ego_motion = _fit_motion(observed.history[scenes, ego], known[scenes, ego], rate_hz)
+    target_motion = fit_motion(observed.history[:, 0], known[:, 0], rate_hz)
+    ego_motion = fit_motion(observed.history[scenes, ego], known[scenes, ego], rate_hz)
     ego_at = observed.history[scenes, ego, -1].astype(np.float64)
     centre, width = observed.lanes[:, 1, 0].astype(np.float64), observed.lanes[:, 1, 1].astype(np.float64)
     speed, accel, lateral_speed, _, heading, yaw_rate = target_motion - ego_motion
@@ -131,7 +131,7 @@ def shift_targets(features: Singles, shift_m: npt.NDArray[np.floating]) -> Singl
     return shifted
 
 
-def _fit_motion(history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> Floats:
+def fit_motion(history: Singles, known: npt.NDArray[np.integer], rate_hz: int) -> Floats:
     """Fit the last FIT_S of histories (M, H, 2), of which the last `known` (M,) positions are known.
 
     Returns:

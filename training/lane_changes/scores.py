@@ -54,8 +54,10 @@ class CellScore:
 
     The `column` is that of the model's own `place`, or the `forest`'s. `cell`, `row` and `lane` are samples in the
     predicted cell, row and column; a true place outside the nine is never right, but in `cell_clipped`, where outer
-    columns and rows have no end. `majority` is the most frequent true cell: what a constant prediction reaches.
-    `own_lane` and `outside` are true places in the own column, and outside the nine cells.
+    columns and rows have no end. `one_against_rest` is the mean, over the nine cells, of the share of samples that are
+    rightly said to be in that cell or not: a wrong cell costs two ninths. `majority` is the most frequent true cell:
+    what a constant prediction reaches. `own_lane` and `outside` are true places in the own column, and outside the nine
+    cells.
     """
 
     model: str
@@ -67,6 +69,7 @@ class CellScore:
     row: float | None
     lane: float | None
     cell_clipped: float | None
+    one_against_rest: float | None
     majority: float | None
     own_lane: float | None
     outside: float | None
@@ -159,7 +162,7 @@ def evaluate_grid(
         own = find_cells(place_m, straight_m, targets)
         joined = np.stack([forest_column, own[..., 1]], axis=-1)
         for source, predicted in (("place", own), ("forest", joined)):
-            cells += _score_cells(name, source, predicted, true, forest.horizons_s, strata)
+            cells += score_cells(name, source, predicted, true, forest.horizons_s, strata)
     maneuvers = [score_maneuvers(name, decided[of, 0], samples.maneuver[of]) for name, of in strata.items()]
     return GridScores(cells, maneuvers, found.left_out, found.reasons)
 
@@ -205,11 +208,12 @@ def score_maneuvers(stratum: str, decided: Bytes, label: Bytes) -> ManeuverScore
     return ManeuverScore(stratum, len(label), _mean(right), recall, balanced, majority)
 
 
-def _score_cells(
+def score_cells(
     model: str, source: str, own: Codes, true: Codes, horizons_s: tuple[float, ...], strata: Mapping[str, Flags]
 ) -> Iterator[CellScore]:
     """Score predicted columns and rows (S, T, 2): one score for each horizon and stratum."""
-    true_cell = number_cells(true[..., 0], true[..., 1])
+    true_cell, own_cell = (number_cells(codes[..., 0], codes[..., 1]) for codes in (true, own))
+    confused = (own_cell != true_cell) * ((own_cell >= 0) + (true_cell >= 0).astype(np.float64))  # of nine cells
     right = (own == true) & (np.abs(true) < OUTSIDE)
     clipped = (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1)
     for horizon, seconds in enumerate(horizons_s):
@@ -223,6 +227,7 @@ def _score_cells(
                 row=_mean(right[of, horizon, 1]),
                 lane=_mean(right[of, horizon, 0]),
                 cell_clipped=_mean(clipped[of, horizon]),
+                one_against_rest=1 - float(confused[of, horizon].mean()) / 9 if len(cells) else None,
                 majority=int(inside.max()) / len(cells) if len(cells) else None,
                 own_lane=_mean(true[of, horizon, 0] == 0),
                 outside=_mean(cells < 0),

@@ -98,12 +98,18 @@ class EncoderDecoder(PlaceNetwork):
         return positions
 
 
-def decode_recursively(network: Any, states: tuple[Tensor, Tensor], steps: int) -> Tensor:  # noqa: ANN401  (a network of these layers)
-    """Decode places (B, steps, 2), each from the one before, at first from 0; in training as in prediction.
+def decode_recursively(
+    network: Any,  # noqa: ANN401  (a network of these layers)
+    states: tuple[Tensor, Tensor],
+    steps: int,
+    first: Tensor | None = None,
+) -> Tensor:
+    """Decode places (B, steps, 2), each from the one before, at first from `first` (B, 1, 2) or 0.
 
-    The network has the layers `embedding_of_place`, `decoder` (an LSTM with these states), `output` and `place`.
+    In training as in prediction. The network has the layers `embedding_of_place`, `decoder` (an LSTM with these
+    states), `output` and `place`.
     """
-    place = states[0].new_zeros(states[0].shape[1], 1, 2)
+    place = states[0].new_zeros(states[0].shape[1], 1, 2) if first is None else first
     places = []
     for _ in range(steps):
         decoded, states = network.decoder(torch.relu(network.embedding_of_place(place)), states)

@@ -2,6 +2,7 @@
 
 `samples` cuts histories and futures and splits them; `models` and `networks` predict positions, `maneuvers` lane
 changes; `training` fits; `scores` and `collisions` judge; `feeds` compares what the ego perceives with the truth.
+`overhead` makes such samples of overhead tracks, on which `as_published` compares the publication's method with ours.
 
 Positions are relative to the ego AT THE SAME MOMENT, in its frame then: x ahead, y to the right of its centre, m. So
 the ego is at (0, 0) throughout, two predicted cells overlap where they touch, and what the ego itself does during the

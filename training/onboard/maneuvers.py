@@ -38,8 +38,8 @@ AT = np.array(V2V.scored_ticks) - 1
 class ManeuverForest:
     """Forest with 1 + T outputs, the maneuver within the horizon and the column at each scored tick.
 
-    `chosen` are positions in NAMES, `coefficients` those of all features with the maneuvers on the training part, and
-    `matrix` those of all of CORRELATED with each other.
+    Where it learned the maneuver alone, there is one output. `chosen` are positions in NAMES, `coefficients` those of
+    all features with the maneuvers on the training part, and `matrix` those of all of CORRELATED with each other.
     """
 
     classifier: Any  # scikit-learn's RandomForestClassifier, whose import takes a second
@@ -49,17 +49,18 @@ class ManeuverForest:
     examples: int
 
     def count_votes(self, samples: Samples) -> Integers:
-        """Count the trees that vote for keep, left and right: (B, 1 + T, 3)."""
-        given = describe_samples(samples)[:, self.chosen]
-        votes = np.zeros((len(samples), 1 + len(AT), len(LATERAL_MANEUVERS)), dtype=np.int64)
+        """Count the trees that vote for keep, left and right: (B, 1 + T, 3), or (B, 1, 3)."""
+        given, outputs = describe_samples(samples)[:, self.chosen], self.classifier.n_outputs_
+        known = self.classifier.classes_ if outputs > 1 else [self.classifier.classes_]
+        votes = np.zeros((len(samples), outputs, len(LATERAL_MANEUVERS)), dtype=np.int64)
         for tree in self.classifier.estimators_ if len(samples) else ():
-            decided = tree.predict(given).astype(np.intp)  # positions in the forest's classes
-            for output, classes in enumerate(self.classifier.classes_):
+            decided = tree.predict(given).astype(np.intp).reshape(-1, outputs)  # positions in the forest's classes
+            for output, classes in enumerate(known):
                 votes[np.arange(len(samples)), output, classes[decided[:, output]].astype(np.intp)] += 1
         return votes
 
     def decide(self, samples: Samples) -> Bytes:
-        """Decide by majority: (B, 1 + T) maneuvers; of equally many votes the first of keep, left and right counts."""
+        """Decide by majority: (B, 1 + T) or (B, 1); of equally many votes the first of keep, left and right counts."""
         decided: Bytes = self.count_votes(samples).argmax(axis=-1).astype(np.uint8)
         return decided
 
@@ -84,8 +85,12 @@ def correlate_pairs(samples: Samples) -> Floats:
     return matrix
 
 
-def fit_forest(samples: Samples, seed: int, examples: int = MOST_EXAMPLES) -> ManeuverForest:
+def fit_forest(
+    samples: Samples, seed: int, examples: int = MOST_EXAMPLES, *, maneuver_alone: bool = False
+) -> ManeuverForest:
     """Fit a forest on samples of the training part: drawn evenly from the four groups, mirrored and shifted.
+
+    It learns the maneuver and the column at each scored tick, or the `maneuver_alone`.
 
     Raises:
         TracklakeError: all samples have the same maneuver, or nothing correlates with it.
@@ -104,12 +109,14 @@ def fit_forest(samples: Samples, seed: int, examples: int = MOST_EXAMPLES) -> Ma
     from sklearn.ensemble import RandomForestClassifier
 
     larger = augment_samples(drawn, random)
-    column = np.clip(find_cells(larger, larger.place_m)[..., 0], -1, 1)
-    ahead = np.where(column == 0, KEEP, np.where(column < 0, LEFT, RIGHT))
+    learned = larger.maneuver
+    if not maneuver_alone:
+        column = np.clip(find_cells(larger, larger.place_m)[..., 0], -1, 1)
+        learned = np.column_stack([learned, np.where(column == 0, KEEP, np.where(column < 0, LEFT, RIGHT))])
     classifier = RandomForestClassifier(
         n_estimators=TREES, criterion="entropy", min_samples_leaf=LEAF, random_state=seed, n_jobs=1
     )
-    classifier.fit(describe_samples(larger)[:, chosen], np.column_stack([larger.maneuver, ahead]))
+    classifier.fit(describe_samples(larger)[:, chosen], learned)
     return ManeuverForest(classifier, chosen, table, correlate_pairs(drawn), len(drawn))
 
 

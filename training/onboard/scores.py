@@ -78,10 +78,8 @@ def _find_right(own: Codes, true: Codes) -> Floats:
 
 
 def _summarise(model: str, samples: Samples, figures: Mapping[str, Floats]) -> Iterator[OnboardScore]:
-    strata: dict[str, Flags] = {ALL: np.ones(len(samples), dtype=np.bool_)}
-    strata |= {name: samples.stratum == number for number, name in enumerate(STRATA)}
     trajectory = samples.trajectory
-    for stratum, of in strata.items():
+    for stratum, of in group_samples(samples).items():
         present = np.unique(trajectory[of], return_inverse=True)[1]
         bounds = {name: bootstrap_mean(figures[name][of], present) for name in ("mae_m", "cell")}
         for at, seconds in enumerate(V2V.scored_s):
@@ -126,9 +124,13 @@ def count_confusion(model: Forecaster, samples: Samples) -> Integers:
 def score_forest(forest: ManeuverForest, samples: Samples) -> list[ManeuverScore]:
     """Score the maneuvers by majority, over all samples and each stratum."""
     decided = forest.decide(samples)[:, 0]
-    groups = {ALL: np.ones(len(samples), dtype=np.bool_)}
-    groups |= {name: samples.stratum == number for number, name in enumerate(STRATA)}
-    return [score_maneuvers(name, decided[of], samples.maneuver[of]) for name, of in groups.items()]
+    return [score_maneuvers(name, decided[of], samples.maneuver[of]) for name, of in group_samples(samples).items()]
+
+
+def group_samples(samples: Samples) -> dict[str, Flags]:
+    """Find the samples of each stratum, (B,) each; those of ALL come first."""
+    everything = {ALL: np.ones(len(samples), dtype=np.bool_)}
+    return everything | {name: samples.stratum == number for number, name in enumerate(STRATA)}
 
 
 @dataclass(frozen=True)
@@ -142,11 +144,13 @@ class OnboardLearningPoint:
     eval_n: int
 
 
-def learn_curve(parts: Parts, seed: int, sizes: Sequence[int] = SIZES) -> list[OnboardLearningPoint]:
-    """Fit forests on growing draws from the training part, and score each on both parts."""
+def learn_curve(
+    parts: Parts, seed: int, sizes: Sequence[int] = SIZES, *, maneuver_alone: bool = False
+) -> list[OnboardLearningPoint]:
+    """Fit forests on growing draws from the training part, and score each on both parts; see `fit_forest`."""
     points = []
     for size in sorted({min(size, len(parts.train)) for size in sizes}):
-        forest = fit_forest(parts.train, seed, size)
+        forest = fit_forest(parts.train, seed, size, maneuver_alone=maneuver_alone)
         scored = [score_forest(forest, part)[0] for part in (parts.train, parts.eval)]
         (train, train_n), (eval_, eval_n) = ((own.accuracy or 0.0, own.n) for own in scored)
         points.append(OnboardLearningPoint(forest.examples, train, train_n, eval_, eval_n))

@@ -35,8 +35,13 @@ Progress = Callable[[float, float], None]
 """Called after every epoch with the share that is done, 0 to 1, and the epoch's loss."""
 
 
-def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progress | None = None) -> "FeatureNetwork":
-    """Train a network on the training part, with its mirrored and shifted copies; on a CPU the seed decides all."""
+def train_network(
+    name: str, parts: Parts, config: TrainConfig, progress: Progress | None = None, *, anchored: bool = True
+) -> "FeatureNetwork":
+    """Train a network on the training part, with its mirrored and shifted copies; on a CPU the seed decides all.
+
+    Anchored, it predicts deviations from straight places, else places.
+    """
     import torch
 
     builder, recipe = find_network(name)
@@ -47,15 +52,15 @@ def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progre
     epochs, size = config.epochs or recipe.epochs, config.batch_size or recipe.batch_size
     random = np.random.default_rng(config.seed)
     train = augment_samples(parts.train, random)
-    straight = predict_straight(train, V2V.horizon_ticks)
+    output_m = train.place_m - predict_straight(train, V2V.horizon_ticks) if anchored else train.place_m
     threads = torch.get_num_threads()
     torch.set_num_threads(config.threads or threads)
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            network: FeatureNetwork = getattr(networks, builder)(V2V.horizon_ticks)
-            feature, deviation = torch.from_numpy(train.feature), torch.from_numpy(train.place_m - straight)
-            network.standardise(feature, deviation)
+            network: FeatureNetwork = getattr(networks, builder)(V2V.horizon_ticks, anchored=anchored)
+            feature, output = torch.from_numpy(train.feature), torch.from_numpy(output_m)
+            network.standardise(feature, output)
             network.to(device).train()
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate or recipe.learning_rate)
             for epoch in range(epochs):
@@ -63,7 +68,7 @@ def train_network(name: str, parts: Parts, config: TrainConfig, progress: Progre
                 order = torch.from_numpy(random.permutation(len(train)))
                 for first in range(0, len(train), size):
                     numbers = order[first : first + size]
-                    given, true = feature[numbers].to(device), deviation[numbers].to(device)
+                    given, true = feature[numbers].to(device), output[numbers].to(device)
                     loss = ((network(given) - true) / network.scale_m).square().mean()
                     optimizer.zero_grad(set_to_none=True)
                     loss.backward()
@@ -92,8 +97,8 @@ def run_network(network: "FeatureNetwork", samples: Samples) -> Singles:
     with torch.no_grad():
         feature = torch.from_numpy(samples.feature)
         pieces = [network(feature[first : first + BATCH]).numpy() for first in range(0, max(1, len(samples)), BATCH)]
-    places: Singles = predict_straight(samples, V2V.horizon_ticks) + np.concatenate(pieces)
-    return places
+    output: Singles = np.concatenate(pieces)
+    return predict_straight(samples, V2V.horizon_ticks) + output if network.anchored else output
 
 
 def describe_run(model: str, parts: Parts, config: TrainConfig | None = None) -> dict[str, Any]:
