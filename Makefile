@@ -4,7 +4,7 @@
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
 # make onboard-study   what an on-board view costs: docs/onboard-view.md (a quarter of an hour)
-# make study   every model under every protocol, three seeds: docs/results.md (hours)
+# make study   models on recorded and generated traffic, with intervals: docs/results.md (hours; pieces: --plan)
 # make docs    pages derived from the code
 # make clean   removes the environment and caches, never data
 #
@@ -62,7 +62,7 @@ bench: install
 	@for file in $(filter-out $(wildcard benchmarks/study*.py),$(wildcard benchmarks/*.py)); do echo "== $$file"; $(BIN)/python $$file $(ARGS) || exit 1; done
 
 study: install
-	$(BIN)/python benchmarks/study.py $(ARGS)
+	PYTHONPATH=benchmarks $(BIN)/python -m study $(ARGS)
 
 onboard-study: install
 	$(BIN)/python benchmarks/study_onboard.py $(ARGS)

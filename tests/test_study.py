@@ -1,120 +1,226 @@
-"""The study's judgement and tables, on figures made by hand. The study itself takes an hour and is no test."""
+"""The study: a tiny one from raw file to page, pooled figures by hand, and what the committed pages may say."""
 
-import sys
+import gzip
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
+from study.__main__ import main, run_arms
+from study.jobs import SCORES, Job, Lake, Workshop, list_jobs
+from study.page import render_pages
+from study.plan import PIECES, Arm, Learner, Source, estimate_piece, make_quick
+from study.results import Results, UnprovenError, judge
+from study.tables import TABLES, pool_scores, read_table, select_complete
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-
-
-@pytest.fixture(autouse=True)
-def _at_the_studys_place(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    yield
-    for name in [name for name in sys.modules if name.startswith("study_")]:
-        del sys.modules[name]
-
-
-def rows(figures, *, n=1000, seconds=2.0):
-    """One row per (model, seed) of RMSE."""
-    return pl.DataFrame(
-        [
-            {
-                "model": model,
-                "seed": seed,
-                "dataset": "all",
-                "group": "all",
-                "average": "samples",
-                "seconds": seconds,
-                "n": n,
-                "rmse_m": value,
-            }
-            for model, values in figures.items()
-            for seed, value in enumerate(values)
-        ]
-    )
+DOCS = Path(__file__).parents[1] / "docs"
+TEMPLATES = Path(__file__).parents[1] / "benchmarks" / "study"
+TINY = Arm(
+    "tiny",
+    Source("Six vehicles.", file="tiny.csv.gz", lane_ft=12.0),
+    ("constant-velocity",),
+    (Learner("lstm", 2, 200, epochs=1),),
+    settings={
+        "TRACKLAKE_SPLIT": "time-blocks",
+        "TRACKLAKE_SPLITS": '["time-blocks"]',
+        "TRACKLAKE_SPLIT_BLOCK_S": "20",
+        "TRACKLAKE_RECONSTRUCT": "false",
+    },
+    folds=(0, 1),
+)
 
 
-def claim(*better, worse, equal=False):
-    from study_plan import Claim
+def write_traffic(file):
+    """Write vehicles that speed up and slow down, three for 20 s and three 8 s later, in the excerpt's columns."""
+    vehicle = np.repeat(np.arange(6), 200)
+    frame = np.tile(np.arange(200), 6) + 280 * (vehicle // 3)
+    y_ft = 60 * (vehicle % 3) + 4 * (frame % 280) - 6 * np.cos(frame / 20 + vehicle)
+    columns = {"Vehicle_ID": 1 + vehicle, "Frame_ID": 100 + frame, "Total_Frames": np.full(1200, 200)}
+    columns |= {"Global_Time": 1118846980200 + 100 * (100 + frame), "Local_X": 6.0 + 12 * (vehicle % 3)}
+    columns |= {"Local_Y": y_ft.round(3), "v_Vel": (40 + 3 * np.sin(frame / 20 + vehicle)).round(2)}
+    columns |= dict.fromkeys(("v_Acc", "Space_Headway", "Time_Headway"), np.zeros(1200))
+    file.write_bytes(gzip.compress(pl.DataFrame(columns).write_csv().encode()))
 
-    return Claim("one", "csp", better, worse, ("rmse_m",), (2.0,), equal=equal)
+
+@pytest.fixture(scope="module")
+def tiny(command, tmp_path_factory, plain_flows):  # noqa: ARG001  (a fixture cannot use another by a mark)
+    """A tiny study: its workshop, and the folder of its tables."""
+    data, work, docs = (tmp_path_factory.mktemp(name) for name in ("data", "work", "docs"))
+    write_traffic(data / TINY.source.file)
+
+    def call(words, environment):
+        done = command.here(*words, **environment)
+        assert done.code in (0, 3), done.err + done.out
+        calls.append(words[0])
+        return done.code
+
+    calls = []
+    workshop = Workshop(work, data, at_once=1, call=call)
+    run_arms([TINY], workshop, docs, only_gather=False)
+    assert not workshop.failed
+    return workshop, docs, calls
+
+
+def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
+    workshop, docs, _ = tiny
+    seeds = read_table(docs, "seeds").filter(group="all", dataset="all")
+    assert seeds.group_by("model").agg(pl.col("seed").n_unique()).sort("model").rows() == [
+        ("constant-velocity", 1),
+        ("lstm", 2),
+    ]
+    lakes = workshop.find_lakes(TINY)
+    stated = read_table(docs, "lakes").to_dicts()
+    for lake, row in zip(lakes, stated, strict=True):
+        (file,) = lake.root.glob("tensors/*/*/index.json")
+        index = json.loads(file.read_text())
+        assert row["protocol_digest"] == index["protocol"]["digest"]
+        assert row["split_digest"] == index["split_recipe"]["digest"]
+        assert [block["part"] for block in index["blocks"]][lake.fold] == "eval"
+        assert row["eval"] == index["samples_by_part"]["eval"] > 0
+    assert stated[0]["split_digest"] != stated[1]["split_digest"]
+    # Of all folds, and as the commands' own tables have it: 1 s ahead, by the slow way.
+    jobs = [job for job in list_jobs(lakes) if job.model == "lstm" and job.seed == 1]
+    rows = [pl.read_csv(job.scores / SCORES).row(0, named=True) for job in jobs]
+    rmse = (sum(row["n"] * row["rmse_m"] ** 2 for row in rows) / sum(row["n"] for row in rows)) ** 0.5
+    assert {row["seconds"] for row in rows} == {1.0}
+    assert seeds.filter(model="lstm", seed=1, seconds=1.0)["rmse_m"].to_list() == pytest.approx([rmse], abs=1e-5)
+    found = read_table(docs, "comparisons").filter(figure="rmse_m", seconds=1.0, dataset="all").row(0, named=True)
+    assert found["a_value"] == pytest.approx(seeds.filter(model="lstm", seconds=1.0)["rmse_m"].mean(), abs=1e-4)
+    assert found["low"] <= found["difference"] <= found["high"]
+
+
+def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tiny):
+    workshop, docs, calls = tiny
+    calls.clear()
+    run_arms([TINY], workshop, docs, only_gather=False)
+    assert calls == ["run", "run"]
+    more = replace(TINY, learners=(replace(TINY.learners[0], seeds=3),))
+    jobs = list(list_jobs(workshop.find_lakes(more)))
+    assert [(job.model, job.seed, job.lake.fold) for job in jobs if not job.scores.exists()] == [
+        ("lstm", 2, 0),
+        ("lstm", 2, 1),
+    ]
+    assert len(select_complete(jobs, 2)) == 6  # a seed that lacks a fold is left out
+
+
+def test_pages_of_a_study_print_its_digests_and_call_nothing_better_without_an_interval(tiny, monkeypatch):
+    _, docs, _ = tiny
+    piece = replace(PIECES[0], name="tiny", arms=(TINY,))
+    for module in ("study.page", "study.results"):
+        monkeypatch.setattr(f"{module}.PIECES", (piece,))
+    page = render_pages(Results.read(docs))["results.md"]
+    for digest in read_table(docs, "lakes")["tensors"]:
+        assert f"| {digest} |" in page
+    assert "### tiny" in page
+    check_verdicts(page)
+
+
+def test_the_identity_of_a_run_is_its_settings_and_its_tensors():
+    lake = Lake(TINY, 0, Path("lakes/a"), "digest", {})
+    job = Job(lake, "lstm", TINY.learners[0], 0)
+    others = [
+        replace(job, seed=1),
+        replace(job, learner=replace(TINY.learners[0], epochs=2)),
+        replace(job, learner=replace(TINY.learners[0], options=("--set", "hidden=24"))),
+        replace(job, lake=replace(lake, digest="other")),
+        replace(job, lake=replace(lake, root=Path("lakes/b"))),
+    ]
+    assert len({own.identity for own in (job, *others)}) == 6
+    assert replace(job, learner=replace(TINY.learners[0], seeds=8)).identity == job.identity
+
+
+def test_errors_of_folds_are_pooled_by_their_samples(tmp_path):
+    """3 samples with 2 m and 1 sample with 4 m: the root of (3 * 4 + 16) / 4; means by samples, too."""
+    jobs = [Job(Lake(TINY, fold, tmp_path / "lakes" / str(fold), str(fold)), "lstm") for fold in (0, 1)]
+    for job, (n, rmse) in zip(jobs, ((3, 2.0), (1, 4.0)), strict=True):
+        job.scores.mkdir(parents=True)
+        row = {"average": "samples", "dataset": "all", "group": "all", "seconds": 1.0, "n": n}
+        figures = dict.fromkeys(name for name in TABLES["seeds"] if name.endswith(("_m", "_nats", "_accuracy")))
+        figures |= {"rmse_m": rmse, "mae_m": rmse, "nll_nats": None}
+        pl.DataFrame([row | figures, row | figures | {"group": "findings=error"}]).write_csv(job.scores / SCORES)
+    (pooled,) = pool_scores(jobs).to_dicts()
+    assert pooled["rmse_m"] == pytest.approx((28 / 4) ** 0.5)
+    assert pooled["mae_m"] == pytest.approx(10 / 4)
+    assert (pooled["n"], pooled["nll_nats"], pooled["seed"]) == (4, None, None)
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "outcome"),
-    [
-        ((1.0, 1.1, 1.2), (1.3, 1.4, 1.5), "better"),
-        ((1.0, 1.1, 1.2), (1.1,), "mixed"),  # against one that does not learn; as good as it is not better
-        ((1.4, 1.5, 1.6), (1.3, 1.4, 1.5), "worse"),
-        ((1.0, 1.0, 4.0), (1.5, 1.5, 1.5), "mixed"),  # the worse mean, but better for two seeds of three
-        ((1.0, 1.5, 2.0), (1.1, 1.4, 2.1), "mixed"),  # seed against seed, not against the others' mean
-    ],
+    ("low", "high", "says"),
+    [(-0.2, -0.1, "better"), (0.1, 0.2, "worse"), (-0.1, 0.2, "no difference shown"), (-0.1, 0.0, "no difference")],
 )
-def test_a_comparison_is_of_seed_with_seed(ours, theirs, outcome):
-    from study_claims import compare
-
-    (found,) = compare(claim("a", worse="b"), rows({"a": ours, "b": theirs}), seeds=3)
-    assert found["outcome"] == outcome
-    assert found["mean"] == pytest.approx(sum(ours) / 3)
-    assert found["limit"] == pytest.approx(sum(theirs) / len(theirs))
-
-
-def test_a_claim_holds_only_where_every_comparison_does():
-    from study_claims import verdict
-
-    assert verdict(claim("a", worse="b"), [5, 0, 0]) == "yes"
-    assert verdict(claim("a", worse="b"), [4, 1, 0]) == "mixed"
-    assert verdict(claim("a", worse="b", equal=True), [4, 1, 0]) == "yes"
-    assert verdict(claim("a", worse="b", equal=True), [4, 0, 1]) == "no"
-    assert verdict(claim("a", worse="b"), [0, 0, 0]) == "no samples"
+def test_better_is_said_only_where_the_interval_excludes_zero(low, high, says):
+    assert judge(low, high).startswith(says)
+    row = {"arm": "tiny", "model": "lstm", "against": "constant-velocity", "dataset": "all", "figure": "rmse_m"}
+    row |= {"seconds": 1.0, "difference": (low + high) / 2, "low": low, "high": high}
+    results = Results({"comparisons": pl.DataFrame([row])})
+    names = ("tiny", "lstm", "constant-velocity", 1.0)
+    assert results.prove(says, *names).startswith(says)
+    for other in {"better", "worse"} - {says}:
+        with pytest.raises(UnprovenError, match=r"`lstm` against `constant-velocity` at 1 s is"):
+            results.prove(other, *names)
+    with pytest.raises(UnprovenError, match="not measured"):
+        results.prove("better", "tiny", "lstm", "kalman-cv", 1.0)
 
 
-def test_a_missing_seed_is_no_result():
-    from study_claims import compare
-
-    with pytest.raises(ValueError, match="expected 3 seeds, got 2"):
-        compare(claim("a", worse="b"), rows({"a": (1.0, 1.1), "b": (2.0,)}), seeds=3)
+INTERVAL = re.compile(r"(better|worse) (?:\()?([+-][\d.]+)[^()]*?\(?(?:95 % interval )?([+-][\d.]+) to ([+-][\d.]+)")
 
 
-def test_few_samples_say_nothing():
-    from study_claims import compare
-    from study_tables import show
+def check_verdicts(text):
+    """Every verdict stands beside an interval that excludes zero, on the side that it says; returns their number."""
+    found = INTERVAL.findall(text)
+    assert len(found) == len(re.findall(r"(?:better|worse) (?:\()?[+-]", text))
+    for says, *numbers in found:
+        _, low, high = map(float, numbers)
+        assert low <= high
+        assert high <= 0 if says == "better" else low >= 0
+    return len(found)
 
-    assert compare(claim("a", worse="b"), rows({"a": (1.0,) * 3, "b": (2.0,)}, n=29), seeds=3) == []
-    one = pl.DataFrame({"n": [29], "seeds": [3], "rmse_m": [1.234], "rmse_m_sd": [0.1]})
-    assert show(one, "rmse_m") == "-"
-    assert show(one.with_columns(n=30), "rmse_m") == "1.23 ± 0.10"
-    assert show(one.with_columns(n=30, seeds=1, rmse_m_sd=None), "rmse_m") == "1.23"
+
+def test_committed_pages_are_those_of_the_committed_tables():
+    results = Results.read(DOCS)
+    pages = render_pages(results)
+    for name, page in pages.items():
+        assert (DOCS / name).read_text() == page, f"`make study ARGS=--render` writes docs/{name}"
+        check_verdicts(page)
 
 
-def test_cells_of_a_run_are_counted_once_and_beside_the_forest_of_its_seed():
-    from study_forest import summarise_cells
+def test_every_number_of_the_discussion_is_in_the_tables():
+    """Decimals alone: numbers of seconds, sites and shares of intervals are whole."""
+    tables = Results.read(DOCS).tables
+    key = ("arm", "model", "dataset", "group", "seconds")
+    figures = [name for name in TABLES["seeds"] if name not in (*key, "seed", "n")]
+    means = tables["seeds"].group_by(key).agg(pl.col(figures).mean(), pl.col(figures).std().name.suffix("_sd"))
+    differences = tables["comparisons"].select("difference", "low", "high")
+    known = {f"{value:.2f}" for row in means.drop(key).rows() for value in row if value is not None}
+    known |= {f"{value:+.2f}" for row in differences.rows() for value in row if value is not None}
+    said = re.findall(r"(?<![\w.])[+-]?\d+\.\d+", (DOCS / "results-discussion.md").read_text())
+    assert set(said) <= known
 
-    def cell(model, column, share):
-        shares = {"cell": share, "cell_clipped": share, "lane": share, "row": share}
-        beside = {"majority": 0.5, "outside": 0.1, "own_lane": 0.9}
-        where = {"model": model, "column": column, "stratum": "all", "seconds": 2.0, "n": 100}
-        return where | shares | beside
 
-    # Two forests; what a run's place says does not depend on them.
-    records = {
-        forest: [
-            cell("ctrv", "place", 0.3),
-            cell("ctrv", "forest", 0.4 + forest / 10),
-            cell("net-seed0", "place", 0.6),
-            cell("net-seed1", "place", 0.8),
-            cell("net-seed0", "forest", 0.7 + forest / 10),
-            cell("net-seed1", "forest", 0.1 + forest / 10),
-        ]
-        for forest in (0, 1)
-    }
-    found = {(own["model"], own["column"]): own for own in summarise_cells(records).to_dicts()}
-    assert found["ctrv", "place"]["seeds"] == 1
-    assert found["net", "place"]["seeds"] == 2
-    assert found["net", "place"]["cell"] == pytest.approx(0.7)
-    assert found["net", "place"]["cell_sd"] == pytest.approx(0.2 / 2**0.5)
-    assert found["ctrv", "forest"]["cell"] == pytest.approx(0.45)
-    assert found["net", "forest"]["cell"] == pytest.approx((0.7 + 0.2) / 2)  # run 0 by forest 0, run 1 by forest 1
+def test_the_discussion_claims_nothing_outside_the_tables():
+    """Numbers and verdicts come from expressions; the text around them has none of its own."""
+    text = (TEMPLATES / "results-discussion.md.j2").read_text()
+    plain = re.sub(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", "", text, flags=re.DOTALL)
+    assert not re.findall(r"(?<![\w-])[+-]?\d+\.\d+", plain)
+    assert not re.findall(r"\b(better|worse|beats?|ahead|outperforms?|wins?|loses?)\b", plain)
+
+
+def test_the_plan_stays_within_four_hours_and_names_every_arm_once():
+    names = [arm.name for piece in PIECES for arm in piece.arms]
+    assert len(set(names)) == len(names)
+    assert sum(map(estimate_piece, PIECES)) < 240
+    assert sum(map(estimate_piece, map(make_quick, PIECES))) < 20
+
+
+def test_the_plan_is_printed_and_an_unknown_piece_refused(capsys, tmp_path):
+    assert main(["--plan"]) == 0
+    said = capsys.readouterr().out
+    assert all(piece.name in said for piece in PIECES)
+    with pytest.raises(SystemExit):
+        main(["--only", "nothing"])
+    # Without recordings and lakes there is nothing to say, and no page claims otherwise.
+    assert main(["--gather", "--work", str(tmp_path), "--docs", str(tmp_path / "docs"), "--data", str(tmp_path)]) == 0
+    assert "Not run yet" in (tmp_path / "docs" / "results.md").read_text()

@@ -1,0 +1,228 @@
+"""Lakes, trainings and scores of the study: each is made once and found again by its own settings and inputs."""
+
+import csv
+import gzip
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import polars as pl
+
+from study.plan import Arm, Learner, Source, estimate_run
+from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake.files import MODELS, TENSORS
+from tracklake.schemas.tensors import INDEX_FILE
+from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.runs.run_folder import digest_tensors
+
+ROOT = Path(__file__).resolve().parents[2]
+NOTES, SCORES, VEHICLES = "jobs.csv", "scores.csv", "vehicles.parquet"
+"""Files of the study's folder: what was run, and of each run its scores and its errors by vehicle."""
+DONE = (0, 3)
+"""Exit codes of a command that did its work; 3: some files or lines were refused, as those of a sample are meant to."""
+
+Call = Callable[[list[str], dict[str, str]], int]
+"""Runs a command of tracklake, with variables of the environment; returns its exit code."""
+
+
+@dataclass(frozen=True)
+class Lake:
+    """One fold of an arm: its folder, the digest of its tensors and their index."""
+
+    arm: Arm
+    fold: int | None
+    root: Path
+    digest: str = ""
+    index: Mapping[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the lake: its arm, and the block that is left out."""
+        return self.arm.name if self.fold is None else f"{self.arm.name} {self.fold}"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Settings of the lake."""
+        left_out = {} if self.fold is None else {"TRACKLAKE_SPLIT_EVAL_BLOCK": str(self.fold)}
+        return {**self.arm.settings, **left_out}
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options by which a command finds the lake."""
+        return ("--lake", str(self.root), "--protocol", self.arm.protocol)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A model on a lake: trained with a seed where it learns, and scored."""
+
+    lake: Lake
+    model: str
+    learner: Learner | None = None
+    seed: int | None = None
+
+    @property
+    def identity(self) -> str:
+        """Digest of all that decides the weights: settings of the training, and tensors."""
+        own = self.learner
+        training = [own.model, own.samples, own.epochs, own.options, self.seed] if own else [self.model]
+        return make_digest([self.lake.root.name, self.lake.digest, training])
+
+    @property
+    def run(self) -> str:
+        """Name of the run in its lake."""
+        return f"{self.model}-seed{self.seed}-{self.identity}" if self.learner else self.model
+
+    @property
+    def run_folder(self) -> Path:
+        """Folder of the run in its lake."""
+        return self.lake.root / MODELS / self.run
+
+    @property
+    def scores(self) -> Path:
+        """Folder of its scores, which exists once they are complete."""
+        return self.lake.root.parents[1] / "scores" / self.identity
+
+    @property
+    def seconds(self) -> float:
+        """Estimate of the time it takes."""
+        return estimate_run(self.learner) if self.learner else 0.0
+
+
+def make_digest(what: object) -> str:
+    """Digest plain values."""
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def call_command(words: list[str], environment: dict[str, str]) -> int:
+    """Run a command of tracklake on one thread, in a process of its own."""
+    own = {**os.environ, **environment, "OMP_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, "-m", "tracklake.pipeline.cli.app", *words], env=own, check=False).returncode
+
+
+class Workshop:
+    """The study's folder, and how its commands are run; every command is noted in jobs.csv with commit and seconds."""
+
+    def __init__(self, work: Path, data: Path, *, at_once: int = 2, call: Call = call_command) -> None:
+        self.work, self.data, self.at_once, self.call, self.lock = work, data, at_once, call, Lock()
+        self.failed: list[str] = []
+        said = [
+            subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+            for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        ]
+        self.commit = f"{said[0]}{'+changes' if said[1] else ''}"
+
+    def run(self, *words: object, environment: Mapping[str, str] | None = None) -> bool:
+        """Run a command and note it; a failure is kept in `failed`."""
+        command = [*map(str, words), "--quiet"]
+        began = time.monotonic()
+        done = self.call(command, dict(environment or {})) in DONE
+        shown, took = " ".join(["tracklake", *command[:-1]]), time.monotonic() - began
+        self.work.mkdir(parents=True, exist_ok=True)
+        with self.lock, (self.work / NOTES).open("a", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerow([f"{took:.1f}", self.commit, "done" if done else "failed", shown])
+        print(f"{took:7.1f} s  {shown}{'' if done else '  FAILED'}", flush=True)
+        if not done:
+            self.failed.append(shown)
+        return done
+
+    def has(self, source: Source) -> bool:
+        """Whether the recordings of a source are at hand, or are generated."""
+        return not source.file or (self.data / source.file).is_file()
+
+    def find_lakes(self, arm: Arm) -> list[Lake]:
+        """Find the lakes of an arm, without a digest where they are not made yet."""
+        if not self.has(arm.source):
+            return []
+        raw = digest_file(self.data / arm.source.file) if arm.source.file else list(arm.source.sample)
+        lakes = [Lake(arm, fold, Path()) for fold in arm.folds or (None,)]
+        named = [(lake, make_digest([raw, arm.source.lane_ft, arm.protocol, lake.environment])) for lake in lakes]
+        return [read_lake(replace(lake, root=self.work / "lakes" / digest)) for lake, digest in named]
+
+    def make_lake(self, lake: Lake) -> Lake:
+        """Make a lake's tensors, or bring them up to date."""
+        lake.root.parent.mkdir(parents=True, exist_ok=True)
+        source = self.provide(lake.arm.source)
+        if source and self.run("run", source, *lake.options, environment=lake.environment):
+            return read_lake(lake)
+        return lake
+
+    def provide(self, source: Source) -> Path | None:
+        """Return the raw file or the generated sample of a source; None where it could not be made."""
+        if not source.file:
+            out = self.work / "sources" / make_digest(source.sample)
+            made = (out / "truth.parquet").exists() or self.run("sample", "--out", out, *source.sample)
+            return out if made else None
+        raw = self.data / source.file
+        if not source.lane_ft:
+            return raw
+        out = self.work / "sources" / raw.name.removesuffix(".gz")
+        if not out.exists():
+            out.parent.mkdir(parents=True, exist_ok=True)
+            fill_lanes(raw, source.lane_ft).write_csv(out)
+        return out
+
+    def work_on(self, jobs: Iterable[Job]) -> None:
+        """Train and score what is not done yet, the shortest first."""
+        left = sorted((job for job in jobs if not job.scores.exists()), key=lambda job: job.seconds)
+        with ThreadPoolExecutor(self.at_once) as pool:
+            list(pool.map(self.finish, left))
+
+    def finish(self, job: Job) -> None:
+        """Train one run, or go on with one that was interrupted, and score it."""
+        lake, own = job.lake, job.learner
+        if own and not (job.run_folder / "metrics.json").exists():
+            begun = (job.run_folder.with_name(f".{job.run}.unfinished") / "checkpoint.pt").exists()
+            how = ("--seed", job.seed, "--samples-per-epoch", own.samples, "--epochs", own.epochs, *own.options)
+            words = ("train", own.model, *lake.options, "--name", job.run, *how, "--threads", 1)
+            if not self.run(*words, *(("--resume",) if begun else ()), environment=lake.environment):
+                return
+        aside = job.scores.with_name(f"{job.scores.name}.unfinished")
+        shutil.rmtree(aside, ignore_errors=True)
+        aside.mkdir(parents=True)
+        files = ("--out", aside / SCORES, "--vehicle-errors", aside / VEHICLES)
+        if self.run("evaluate", job.run, *lake.options, "--no-published", *files, environment=lake.environment):
+            aside.rename(job.scores)
+
+
+def list_jobs(lakes: Iterable[Lake]) -> Iterator[Job]:
+    """List the jobs of lakes whose tensors are there."""
+    for lake in lakes:
+        if lake.index is not None:
+            yield from (Job(lake, model) for model in lake.arm.plain)
+            for own in lake.arm.learners:
+                yield from (Job(lake, own.name, own, seed) for seed in range(own.seeds))
+
+
+def read_lake(lake: Lake) -> Lake:
+    """Add digest and index of a lake's tensors, where it has some."""
+    commit = load(lake.root).commits.get(TENSORS) if lake.root.exists() else None
+    if commit is None or commit.info["path"] is None:
+        return lake
+    folder = TensorFolder.open(lake.root / commit.info["path"])
+    index = json.loads((folder.path / INDEX_FILE).read_text(encoding="utf-8"))
+    return replace(lake, digest=digest_tensors(folder), index=index)
+
+
+@cache
+def digest_file(file: Path) -> str:
+    """Digest the content of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+
+
+def fill_lanes(raw: Path, lane_ft: float, lanes: int = 6) -> pl.DataFrame:
+    """Read a file of NGSIM as text and add the lane, counted from the left edge; nothing else of it is changed."""
+    lane = (pl.col("Local_X").cast(pl.Float64) / lane_ft).floor().clip(0, lanes - 1) + 1
+    content = gzip.decompress(raw.read_bytes()) if raw.suffix == ".gz" else raw.read_bytes()
+    return pl.read_csv(content, infer_schema=False).with_columns(Lane_ID=lane.cast(pl.Int64))

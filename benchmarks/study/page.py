@@ -1,0 +1,138 @@
+"""docs/results.md, its figure and docs/results-discussion.md, made of the committed tables and nothing else."""
+
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from study.figure import draw_errors
+from study.plan import PIECES, Arm, estimate_piece
+from study.results import Results, grid, judge
+from tracklake.schemas.evaluations import EVERYTHING
+from tracklake.schemas.files import write_file
+
+FIGURES = {
+    "rmse_m": "RMSE, m",
+    "rmse_longitudinal_m": "RMSE along the road, m",
+    "rmse_lateral_m": "RMSE across the road, m",
+    "nll_nats": "negative log-likelihood, nats",
+}
+PAGES = ("results.md", "results-discussion.md")
+
+
+def write_pages(docs: Path) -> None:
+    """Write both pages and the figure of the tables in the same folder, and the tables where nothing was run yet."""
+    results = Results.read(docs)
+    for name, table in results.tables.items():
+        if not (docs / f"results-{name}.csv").exists():
+            table.write_csv(docs / f"results-{name}.csv")
+    for name, content in render_pages(results).items():
+        write_file(docs / name, content.encode())
+    drawn = results.tables["seeds"].filter(dataset=EVERYTHING, group=EVERYTHING)
+    if drawn.height:
+        write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
+
+
+def render_pages(results: Results) -> dict[str, str]:
+    """Render both pages, by name; UnprovenError where a text claims what no interval shows."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    templates = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    has = set(results.tables["seeds"]["arm"])
+    given = {
+        "results": results,
+        "pieces": [piece for piece in PIECES if any(arm.name in has for arm in piece.arms)],
+        "missing": [piece for piece in PIECES if not any(arm.name in has for arm in piece.arms)],
+        "has": has,
+        "figures": FIGURES,
+        "estimate": estimate_piece,
+        **{own.__name__: partial(own, results) for own in TABLES_OF_ARM},
+    }
+    return {name: templates.get_template(f"{name}.j2").render(given) for name in PAGES}
+
+
+def lay_out_lakes(results: Results, arm: Arm) -> str:
+    """Lay out the tensors of an arm, with the digests that their index states."""
+    columns = ("lake", "protocol", "protocol_digest", "split", "split_digest", "tensors", "train", "val", "eval")
+    rows = results.of_arm("lakes", arm.name).select(columns).rows()
+    return grid([name.replace("_", " ") for name in columns], ([_format(value) for value in row] for row in rows))
+
+
+def lay_out_training(results: Results, arm: Arm) -> str:
+    """Lay out what each model learned from, as means over its runs."""
+    columns = ("weights", "steps", "samples_seen", "supervised_positions", "seconds", "samples_per_s")
+    body = []
+    for model in results.list_models(arm.name):
+        runs = results.of_arm("runs", arm.name).filter(model=model)
+        if runs.height:
+            means = runs.select(pl.col(columns).mean()).row(0)
+            body.append([f"`{model}`", str(runs["seed"].n_unique()), *map(_format, means)])
+    heads = ("weights", "steps", "samples seen", "positions supervised", "s", "samples a second")
+    return grid(["model", "seeds", *heads], body)
+
+
+def lay_out_errors(results: Results, arm: Arm, figure: str) -> str:
+    """Lay out a figure by model and horizon; empty where no model has it."""
+    seconds = results.list_seconds(arm.name)
+    shown = {
+        model: [results.show(arm.name, model, at, figure) for at in seconds] for model in results.list_models(arm.name)
+    }
+    body = [[f"`{model}`", *row] for model, row in shown.items() if set(row) != {"-"}]
+    if not body:
+        return ""
+    first = results.list_models(arm.name)[0]
+    counts = [results.select(arm.name, first, at)["n"] for at in seconds]
+    body.append(["samples", *(_format(count[0]) for count in counts)])
+    return grid(["model", *(f"{at:g} s" for at in seconds)], body)
+
+
+def lay_out_differences(results: Results, arm: Arm, figure: str) -> str:
+    """Lay out each network's difference to the best plain model of every horizon, and those of the arm's pairs."""
+    seconds = results.list_seconds(arm.name)
+    best = {at: results.find_baseline(arm.name, at, figure) for at in seconds}
+    learned = [own.name for own in arm.learners if own.name in results.list_models(arm.name)]
+    rows = [(model, "best without training", best) for model in learned]
+    rows += [(model, f"`{against}`", dict.fromkeys(seconds, against)) for model, against in arm.pairs]
+    body = []
+    for model, title, against in rows:
+        found = [results.compare(arm.name, model, against[at] or "", at, figure) for at in seconds]
+        if any(found):
+            body.append([f"`{model}`", title, *(_format_difference(own) for own in found)])
+    return grid(["model", "against", *(f"{at:g} s" for at in seconds)], body) if body else ""
+
+
+def lay_out_maneuvers(results: Results, arm: Arm) -> str:
+    """Lay out RMSE at the last horizon by true maneuver; along the road where nothing is known across it."""
+    last = results.list_seconds(arm.name)[-1]
+    rows = results.of_arm("seeds", arm.name).filter(seconds=last, dataset=EVERYTHING)
+    figure = "rmse_m" if rows["rmse_m"].count() else "rmse_longitudinal_m"
+    groups = [name for name in rows["group"].unique(maintain_order=True) if name != EVERYTHING]
+    body = [
+        [f"`{model}`", *(results.show(arm.name, model, last, figure, group=group) for group in groups)]
+        for model in results.list_models(arm.name)
+    ]
+    shown = [number for number in range(1, 1 + len(groups)) if any(row[number] != "-" for row in body)]
+    heads = ["model", *groups]
+    return grid([heads[0], *(heads[n] for n in shown)], ([row[0], *(row[n] for n in shown)] for row in body))
+
+
+TABLES_OF_ARM = (lay_out_lakes, lay_out_training, lay_out_errors, lay_out_differences, lay_out_maneuvers)
+"""Functions that the templates call with an arm."""
+
+
+def _format(value: object) -> str:
+    """Format a cell: a dash for null, whole numbers with thousands."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def _format_difference(found: dict[str, float] | None) -> str:
+    """Format a difference and its interval, after the verdict where there is one."""
+    if found is None:
+        return "-"
+    if found["low"] is None:
+        return f"{found['difference']:+.2f}"
+    says = judge(found["low"], found["high"])
+    verdict = f"{says} " if says in ("better", "worse") else ""
+    return f"{verdict}{found['difference']:+.2f} ({found['low']:+.2f} to {found['high']:+.2f})"

@@ -1,0 +1,113 @@
+"""Figures of the committed tables as the pages print them; differences are called better or worse by interval alone."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from study.plan import PIECES, Arm
+from study.tables import TABLES, read_table
+from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.evaluations import EVERYTHING
+
+UNITS = {"nll_nats": " nats"}
+FEW = 30
+"""Figures over fewer samples are not shown."""
+
+
+class UnprovenError(TracklakeError):
+    """A page claims a difference whose interval includes zero, or that was not measured."""
+
+
+def judge(low: float | None, high: float | None) -> str:
+    """Judge a difference of errors by its interval."""
+    if low is None or high is None:
+        return "no interval"
+    return "better" if high < 0 else "worse" if low > 0 else "no difference shown"
+
+
+def grid(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """Lay out a table in Markdown."""
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in body)])
+
+
+@dataclass(frozen=True)
+class Results:
+    """The committed tables, by name."""
+
+    tables: dict[str, pl.DataFrame]
+
+    @classmethod
+    def read(cls, docs: Path) -> "Results":
+        """Read them from their folder."""
+        return cls({name: read_table(docs, name) for name in TABLES})
+
+    def of_arm(self, name: str, arm: str) -> pl.DataFrame:
+        """Select an arm's rows of a table."""
+        return self.tables[name].filter(pl.col("arm") == arm)
+
+    def list_models(self, arm: str) -> list[str]:
+        """List the models that an arm has scores of, in the plan's order."""
+        own = find_arm(arm)
+        known = (*own.plain, *(learner.name for learner in own.learners))
+        return [name for name in known if name in set(self.of_arm("seeds", arm)["model"])]
+
+    def list_seconds(self, arm: str) -> list[float]:
+        """List an arm's horizons."""
+        seconds: list[float] = self.of_arm("seeds", arm)["seconds"].unique().sort().to_list()
+        return seconds
+
+    def select(
+        self, arm: str, model: str, seconds: float, dataset: str = EVERYTHING, group: str = EVERYTHING
+    ) -> pl.DataFrame:
+        """Select a model's rows of all seeds at a horizon."""
+        rows = self.of_arm("seeds", arm)
+        return rows.filter(model=model, seconds=seconds, dataset=dataset, group=group)
+
+    def show(self, arm: str, model: str, seconds: float, figure: str = "rmse_m", **part: str) -> str:
+        """Show the mean over seeds, with its standard deviation where there are several; a dash where it is unknown."""
+        rows = self.select(arm, model, seconds, **part)
+        if rows.is_empty() or rows[figure].has_nulls() or rows["n"].min() < FEW:
+            return "-"
+        spread = f" ± {rows[figure].std():.2f}" if rows.height > 1 else ""
+        return f"{rows[figure].mean():.2f}{spread}"
+
+    def find_baseline(self, arm: str, seconds: float, figure: str) -> str | None:
+        """Find the plain model with the smallest error at a horizon; None where none has the figure."""
+        rows = self.of_arm("seeds", arm).filter(
+            pl.col("model").is_in(find_arm(arm).plain),
+            pl.col(figure).is_not_null(),
+            seconds=seconds,
+            dataset=EVERYTHING,
+            group=EVERYTHING,
+        )
+        return rows.sort(figure, "model")["model"][0] if rows.height else None
+
+    def compare(
+        self, arm: str, model: str, against: str, seconds: float, figure: str, dataset: str = EVERYTHING
+    ) -> dict[str, float] | None:
+        """Return the comparison of two models; None where it was not made."""
+        rows = self.of_arm("comparisons", arm)
+        found = rows.filter(model=model, against=against, seconds=seconds, figure=figure, dataset=dataset)
+        return found.row(0, named=True) if found.height else None
+
+    def prove(self, what: str, arm: str, model: str, against: str, seconds: float, figure: str = "rmse_m") -> str:
+        """State that a model is `better` or `worse` than another, or that `no difference` is shown, with the interval.
+
+        Raises:
+            UnprovenError: the interval says something else.
+        """
+        found = self.compare(arm, model, against, seconds, figure)
+        says = judge(found["low"], found["high"]) if found else "not measured"
+        if found is None or not says.startswith(what):
+            raise UnprovenError(f"{arm}: `{model}` against `{against}` at {seconds:g} s is {says}, and not `{what}`")
+        unit = UNITS.get(figure, " m")
+        bounds = " to ".join(f"{found[name]:+.2f}" for name in ("low", "high"))
+        return f"{says} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
+
+
+def find_arm(name: str) -> Arm:
+    """Find an arm of the plan by its name."""
+    return next(arm for piece in PIECES for arm in piece.arms if arm.name == name)

@@ -1,0 +1,166 @@
+"""The study's committed tables: what was scored, compared and trained, on which tensors."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from study.jobs import SCORES, VEHICLES, Job, Lake
+from study.plan import Arm
+from tracklake.schemas.comparisons import COMPARED_FIGURES
+from tracklake.schemas.evaluations import EVERYTHING
+from tracklake.training.comparison.bootstrap import compare_errors
+
+TEXT, WHOLE, NUMBER = pl.String(), pl.Int64(), pl.Float64()
+KEY = {"arm": TEXT, "model": TEXT, "seed": WHOLE}
+SQUARED = ("rmse_m", "rmse_longitudinal_m", "rmse_lateral_m")
+MEANS = ("mae_m", "ade_m", "nll_nats", "lateral_accuracy", "longitudinal_accuracy")
+TABLES: dict[str, dict[str, pl.DataType]] = {
+    "seeds": {
+        **KEY,
+        **{"dataset": TEXT, "group": TEXT, "seconds": NUMBER, "n": WHOLE},
+        **dict.fromkeys((*SQUARED, *MEANS), NUMBER),
+    },
+    "comparisons": {
+        **{"arm": TEXT, "model": TEXT, "against": TEXT, "dataset": TEXT, "figure": TEXT, "seconds": NUMBER},
+        **dict.fromkeys(("n", "vehicles", "a_seeds", "b_seeds"), WHOLE),
+        **dict.fromkeys(("a_value", "b_value", "difference", "low", "high"), NUMBER),
+    },
+    "runs": {
+        **KEY,
+        "lake": TEXT,
+        **dict.fromkeys(("weights", "train_samples", "steps", "samples_seen", "supervised_positions"), WHOLE),
+        **dict.fromkeys(("seconds", "samples_per_s", "best_epoch", "validation_loss"), NUMBER),
+    },
+    "curves": {**KEY, "lake": TEXT, "epoch": WHOLE, "phase": TEXT, "loss": NUMBER, "validation_loss": NUMBER},
+    "lakes": {
+        **dict.fromkeys(("arm", "lake", "protocol", "protocol_digest", "split", "split_digest", "tensors"), TEXT),
+        **dict.fromkeys(("train", "val", "eval"), WHOLE),
+    },
+}
+"""Columns of docs/results-NAME.csv. `seeds` has one row per arm, model, seed, part of the data and horizon; the seed is
+null where nothing was drawn."""
+
+DIGITS = 5
+"""Decimals of the committed tables."""
+
+
+def read_table(docs: Path, name: str) -> pl.DataFrame:
+    """Read a committed table; one that is missing has no rows."""
+    file = docs / f"results-{name}.csv"
+    return pl.read_csv(file, schema=TABLES[name]) if file.exists() else pl.DataFrame(schema=TABLES[name])
+
+
+def update_tables(docs: Path, arm: Arm, lakes: Sequence[Lake], jobs: Sequence[Job]) -> None:
+    """Replace an arm's rows of the committed tables by what is scored; an arm without scores keeps its rows."""
+    done = select_complete(jobs, len(lakes))
+    if not done:
+        return
+    errors = read_errors(done)
+    found = {
+        "seeds": pool_scores(done),
+        "comparisons": pl.DataFrame(list(compare_models(arm, errors)), schema=TABLES["comparisons"]),
+        "runs": pl.DataFrame([describe_run(job) for job in done if job.learner], schema=TABLES["runs"]),
+        "curves": pl.concat([pl.DataFrame(schema=TABLES["curves"]), *(read_curve(job) for job in done if job.learner)]),
+        "lakes": pl.DataFrame([describe_lake(lake) for lake in lakes], schema=TABLES["lakes"]),
+    }
+    for name, table in found.items():
+        kept = read_table(docs, name).filter(pl.col("arm") != arm.name)
+        whole = pl.concat([kept, table.select(*TABLES[name])]).with_columns(pl.selectors.float().round(DIGITS))
+        whole.write_csv(docs / f"results-{name}.csv")
+
+
+def select_complete(jobs: Sequence[Job], folds: int) -> list[Job]:
+    """Select the scored jobs of those models and seeds that are scored in all folds."""
+    scored = [job for job in jobs if job.scores.exists()]
+    counts: dict[tuple[str, int | None], int] = {}
+    for job in scored:
+        counts[job.model, job.seed] = counts.get((job.model, job.seed), 0) + 1
+    return [job for job in scored if counts[job.model, job.seed] == folds]
+
+
+def pool_scores(jobs: Iterable[Job]) -> pl.DataFrame:
+    """Pool the scores of all folds: means by the number of samples, roots last; of groups, the last horizon alone."""
+    read = pl.concat(
+        pl.read_csv(job.scores / SCORES, infer_schema_length=None)
+        .filter(average="samples")
+        .select(
+            pl.lit(job.lake.arm.name).alias("arm"),
+            pl.lit(job.model).alias("model"),
+            pl.lit(job.seed, WHOLE).alias("seed"),
+            "dataset",
+            "group",
+            pl.col("seconds", *SQUARED, *MEANS).cast(NUMBER),
+            pl.col("n").cast(WHOLE),
+        )
+        for job in jobs
+    )
+    last = pl.col("seconds") == pl.col("seconds").max()
+    shown = (pl.col("group") == EVERYTHING) | (last & ~pl.col("group").str.starts_with("findings"))
+    weighted = {name: pl.col(name) ** 2 for name in SQUARED} | {name: pl.col(name) for name in MEANS}
+    pooled = {
+        name: pl.when(pl.col(name).is_not_null().all()).then((figure * pl.col("n")).sum() / pl.col("n").sum())
+        for name, figure in weighted.items()
+    }
+    return (
+        read.filter(shown, pl.col("n") > 0)
+        .group_by(*KEY, "dataset", "group", "seconds", maintain_order=True)
+        .agg(pl.col("n").sum(), **pooled)
+        .with_columns(pl.col(SQUARED).sqrt())
+    )
+
+
+def read_errors(jobs: Iterable[Job]) -> dict[str, pl.DataFrame]:
+    """Read the errors by vehicle of every model, over all its folds and seeds."""
+    errors: dict[str, list[pl.DataFrame]] = {}
+    for job in jobs:
+        errors.setdefault(job.model, []).append(pl.read_parquet(job.scores / VEHICLES))
+    return {model: pl.concat(own) for model, own in errors.items()}
+
+
+def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dict[str, Any]]:
+    """Compare every network with every plain model, and the arm's pairs, on everything and on each dataset."""
+    learned = [own.name for own in arm.learners]
+    for model, against in (*product(learned, arm.plain), *arm.pairs):
+        if model not in errors or against not in errors:
+            continue
+        datasets = errors[model]["dataset"].unique().sort().to_list()
+        for dataset in (EVERYTHING, *(datasets if len(datasets) > 1 else ())):
+            two = [errors[name] for name in (model, against)]
+            if dataset != EVERYTHING:
+                two = [own.filter(dataset=dataset) for own in two]
+            named = {"arm": arm.name, "model": model, "against": against, "dataset": dataset}
+            for figure, sums in COMPARED_FIGURES.items():
+                if not any(own[column].has_nulls() for own in two for column in sums):
+                    yield from (named | {"figure": figure} | row for row in compare_errors(*two, figure).to_dicts())
+
+
+def describe_run(job: Job) -> dict[str, Any]:
+    """Describe a training by its metrics.json."""
+    metrics = json.loads((job.run_folder / "metrics.json").read_text(encoding="utf-8"))
+    best = metrics.get("best") or {}
+    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
+    kept = {name: metrics.get(name) for name in TABLES["runs"] if name not in named}
+    return named | kept | {"best_epoch": best.get("epoch"), "validation_loss": best.get("validation_loss")}
+
+
+def read_curve(job: Job) -> pl.DataFrame:
+    """Read losses by epoch of a training that stops by its validation loss."""
+    log = pl.read_csv(job.run_folder / "epochs.csv")
+    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
+    rows = log.with_columns(pl.lit(value).alias(name) for name, value in named.items())
+    return rows.select(pl.col(name).cast(dtype) for name, dtype in TABLES["curves"].items()).drop_nulls()
+
+
+def describe_lake(lake: Lake) -> dict[str, Any]:
+    """Describe the tensors of a lake by their index."""
+    index = lake.index or {}
+    recipe, protocol = index["split_recipe"] or {}, index["protocol"]
+    return {
+        **{"arm": lake.arm.name, "lake": lake.name, "tensors": lake.digest, "split": index["split"]},
+        **{"protocol": protocol["name"], "protocol_digest": protocol["digest"], "split_digest": recipe.get("digest")},
+        **index["samples_by_part"],
+    }
