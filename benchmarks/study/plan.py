@@ -79,7 +79,7 @@ class Piece:
     arms: tuple[Arm, ...]
 
 
-PLAIN = ("constant-velocity", "kalman-cv")
+PLAIN = ("constant-velocity", "damped-velocity", "kalman-cv")
 SPEEDS = {
     "lstm": 10_500,
     "v-lstm": 4_000,
