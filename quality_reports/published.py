@@ -22,17 +22,21 @@ TOTALS = {name: (totals["vehicles"], totals["entries"]) for name, totals in PUBL
 
 # fmt: off
 PUBLISHED = (
-    ("highd", None, 110_516, 39_725_708, 9.63, 28.73, 39.38, 28.14, 6.91, 0, 0, None, 0),
-    ("ngsim", None, 11_779, 8_665_320, 0.0, 7.31, 17.23, 7.50, 4.48, 1_238, 31_436, 440_641, 389),
-    ("ngsim", "i-80-1600", *TOTALS["i-80-1600"], 0.89, 7.48, 18.48, 7.72, 4.06, 205, 3_474, 105_293, 8),
-    ("ngsim", "i-80-1700", *TOTALS["i-80-1700"], 0.0, 4.88, 15.24, 5.62, 3.89, 319, 10_632, 69_244, 93),
-    ("ngsim", "i-80-1715", *TOTALS["i-80-1715"], 0.0, 4.23, 13.74, 4.83, 3.62, 353, 11_650, 78_189, 194),
-    ("ngsim", "us-101-0750", *TOTALS["us-101-0750"], 1.33, 11.96, 19.56, 11.43, 4.53, 120, 1_912, 70_785, 13),
-    ("ngsim", "us-101-0805", *TOTALS["us-101-0805"], 0.22, 9.15, 15.91, 8.94, 4.09, 139, 1_800, 56_347, 37),
-    ("ngsim", "us-101-0820", *TOTALS["us-101-0820"], 0.49, 8.03, 14.68, 7.84, 3.67, 102, 1_968, 60_783, 44),
+    ("highd", None, 110_516, 39_725_708, 9.63, 28.73, 39.38, 28.14, 6.91, 0, 0, None, 0, None),
+    ("ngsim", None, 11_779, 8_665_320, 0.0, 7.31, 17.23, 7.50, 4.48, 1_238, 31_436, 440_641, 389, 29.05),
+    ("ngsim", "i-80-1600", *TOTALS["i-80-1600"], 0.89, 7.48, 18.48, 7.72, 4.06, 205, 3_474, 105_293, 8, None),
+    ("ngsim", "i-80-1700", *TOTALS["i-80-1700"], 0.0, 4.88, 15.24, 5.62, 3.89, 319, 10_632, 69_244, 93, None),
+    ("ngsim", "i-80-1715", *TOTALS["i-80-1715"], 0.0, 4.23, 13.74, 4.83, 3.62, 353, 11_650, 78_189, 194, None),
+    ("ngsim", "us-101-0750", *TOTALS["us-101-0750"], 1.33, 11.96, 19.56, 11.43, 4.53, 120, 1_912, 70_785, 13, None),
+    ("ngsim", "us-101-0805", *TOTALS["us-101-0805"], 0.22, 9.15, 15.91, 8.94, 4.09, 139, 1_800, 56_347, 37, None),
+    ("ngsim", "us-101-0820", *TOTALS["us-101-0820"], 0.49, 8.03, 14.68, 7.84, 3.67, 102, 1_968, 60_783, 44, None),
 )
 # fmt: on
-"""Values of `PublishedFigures`, in the order of its keys; None where there is no figure."""
+"""Values of `PublishedFigures`, in the order of its keys; None where there is no figure.
+
+The text of Hamalainen (2020) says 28.99 m/s for NGSIM's maximum, its table 29.05. It says 747 vehicles of I-80 with a
+negative headway, its table 877, the sum of the three recordings here.
+"""
 
 WHOLE = {
     "highd": tuple(f"{number:02d}" for number in range(1, 61)),

@@ -251,6 +251,7 @@ class PublishedFigures(TypedDict):
     headway_entries: Annotated[int | None, "entries of negative headway"]
     acceleration_entries: Annotated[int | None, "entries of high acceleration"]
     slow_vehicles: Annotated[int | None, "vehicles at a low constant speed"]
+    max_mps: Annotated[float | None, "greatest of these speeds; null where none is known to us"]
 
 
 class IncomparableRecording(TypedDict):

@@ -25,6 +25,12 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.sources.highd_plan import announce_subsets
 from tracklake.pipeline.transforms.splits.allocation import allocate_flow_balanced
+from tracklake.pipeline.transforms.splits.published import (
+    PUBLISHED_SPLITS,
+    PublishedSplit,
+    compare_published,
+    select_published,
+)
 from tracklake.pipeline.transforms.splits.tables import Allocation
 from tracklake.schemas.files import write_output
 from tracklake.schemas.origin import describe_synthetic
@@ -55,6 +61,14 @@ def split(
     exclude: Annotated[
         list[str] | None, typer.Option("--exclude", metavar="SUBSET", help="With --plan: leave it out; repeatable.")
     ] = None,
+    published: Annotated[
+        str | None,
+        typer.Option(
+            "--published",
+            metavar="NAME",
+            help=f"With --plan of a whole dataset: compare with a published split: {', '.join(PUBLISHED_SPLITS)}.",
+        ),
+    ] = None,
     format: Annotated[str, typer.Option("--format", help="With --plan: table, csv or json.")] = "table",
     out: Annotated[Path | None, typer.Option("--out", help="With --plan: write the csv or json to this file.")] = None,
     protocol: ProtocolOption = None,
@@ -66,19 +80,28 @@ def split(
     with command(quiet=quiet, json=json) as terminal:
         settings = read_settings(lake=lake, workers=workers, protocol=protocol)
         if plan is None:
-            if exclude or out is not None or format != "table":
-                raise typer.BadParameter("--exclude, --format and --out go with --plan FOLDER")
+            if exclude or published or out is not None or format != "table":
+                raise typer.BadParameter("--exclude, --published, --format and --out go with --plan FOLDER")
             report_result(terminal, settings, run_steps(terminal, settings, ("split",)), headline=False)
             return
         require_choice("--format", format, FORMATS)
+        if published is not None:
+            require_choice("--published", published, tuple(PUBLISHED_SPLITS))
         if out is not None and format == "table":
             raise typer.BadParameter("--format table goes to the terminal only: with --out, choose csv or json")
         refuse_lake(out)
-        _plan_split(terminal, settings, plan, exclude or [], format, out)
+        known = None if published is None else PUBLISHED_SPLITS[published]
+        _plan_split(terminal, settings, plan, exclude or [], known, format, out)
 
 
 def _plan_split(
-    terminal: Terminal, settings: Settings, folder: Path, exclude: list[str], form: str, out: Path | None
+    terminal: Terminal,
+    settings: Settings,
+    folder: Path,
+    exclude: list[str],
+    published: PublishedSplit | None,
+    form: str,
+    out: Path | None,
 ) -> None:
     """Print how the recordings of a folder would be split; nothing is written into a lake."""
     try:
@@ -92,7 +115,8 @@ def _plan_split(
     if unknown:
         known = announced.subsets["subset"].to_list()
         raise typer.BadParameter(f"--exclude {', '.join(unknown)}: no such subset; there are {', '.join(known)}")
-    subsets = announced.subsets.filter(~pl.col("subset").is_in(exclude))
+    subsets = announced.subsets if published is None else select_published(announced.subsets, published)
+    subsets = subsets.filter(~pl.col("subset").is_in(exclude))
     if subsets.is_empty():
         raise SourceError(f"{folder}: no recording whose metadata can be used, so there is nothing to plan.")
     trained = settings.get_protocol().train_share
@@ -101,11 +125,13 @@ def _plan_split(
     parts = subsets.join(allocation.splits.select("dataset", "subset", "part"), on=["dataset", "subset"])
     terminal.print_origin(describe_synthetic(dict(subsets.select("subset", "origin").iter_rows())))
     parts = parts.select(SHOWN).sort("dataset", "subset")
-    _show_plan(terminal, parts, allocation, form, out)
+    beside = None if published is None else compare_published(allocation.balance, published)
+    _show_plan(terminal, parts, allocation, beside, form, out)
     record: dict[str, Any] = {
         "splits": parts.to_dicts(),
         "balance": allocation.balance.to_dicts(),
         "notes": [ESTIMATED],
+        "published": beside,
         "refused": list(announced.refusals),
     }
     terminal.print_json(record)
@@ -113,7 +139,14 @@ def _plan_split(
         raise typer.Exit(REFUSED)
 
 
-def _show_plan(terminal: Terminal, parts: pl.DataFrame, allocation: Allocation, form: str, out: Path | None) -> None:
+def _show_plan(
+    terminal: Terminal,
+    parts: pl.DataFrame,
+    allocation: Allocation,
+    beside: dict[str, Any] | None,
+    form: str,
+    out: Path | None,
+) -> None:
     """Print or write the table, and print how the parts compare."""
     if form != "table" and not (terminal.as_json and out is None):
         text = parts.write_csv() if form == "csv" else parts.write_json() + "\n"
@@ -137,4 +170,11 @@ def _show_plan(terminal: Terminal, parts: pl.DataFrame, allocation: Allocation, 
         )
     for reason in allocation.relaxations.values():
         terminal.print_line(f"note: relaxed: {reason}", style="dim")
-    terminal.print_line(f"note: {ESTIMATED}", style="dim")
+    if beside is not None:
+        flows = ", ".join(f"{part} {own['mean']} +- {own['std']}" for part, own in beside["published"].items())
+        terminal.print_line(
+            f"published for these {beside['carriageways']} carriageways: {flows}, apart by "
+            f"{beside['published_difference']}; here apart by {beside['difference']:.6f}. {beside['reference']}"
+        )
+    for note in (ESTIMATED, *(beside["notes"] if beside is not None else ())):
+        terminal.print_line(f"note: {note}", style="dim")

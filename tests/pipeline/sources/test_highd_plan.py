@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import zipfile
+from dataclasses import replace
 
 import pytest
 from highd_files import VEHICLES, meta_row, vehicle_row, write_recording
@@ -14,6 +15,7 @@ from tracklake.pipeline.cli.app import app
 from tracklake.pipeline.ingest.discovery import recognise
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.sources.highd_plan import announce_subsets
+from tracklake.pipeline.transforms.splits.published import PUBLISHED_SPLITS
 
 
 def write_metadata(folder, number="01", **given):
@@ -101,6 +103,39 @@ def test_what_is_excluded_is_not_there(run, tmp_path):
     assert [row["subset"] for row in csv.DictReader(io.StringIO(found))] == ["01-lower"]
     refused = run(tmp_path, "--exclude", "25-upper")
     assert (refused.exit_code, "no such subset" in refused.stderr) == (2, True)
+
+
+def test_a_published_split_is_compared_on_its_whole_dataset_alone(run, tmp_path, monkeypatch):
+    for number in ("01", "02", "03"):
+        frames = [vehicle_row(vehicle, 4, 2, 10 * int(number) + vehicle, 1 + vehicle % 2) for vehicle in range(1, 11)]
+        write_metadata(tmp_path, number=number, meta=meta_row(int(number), vehicles=10), vehicles=frames)
+    excerpt = run(tmp_path, "--published", "highd-2020")
+    assert (excerpt.exit_code, excerpt.stdout) == (1, "")
+    assert "is of 110,516 vehicles with 39,725,708 rows; got 30 with " in " ".join(excerpt.stderr.split())
+    plain = json.loads(run(tmp_path, "--json").stdout)
+    assert plain["published"] is None
+    rows = sum(row["weight"] for row in plain["splits"])
+    known = replace(PUBLISHED_SPLITS["highd-2020"], vehicles=30, entries=rows, excluded=("02-upper",))
+    monkeypatch.setitem(PUBLISHED_SPLITS, "highd-2020", known)
+    found = json.loads(run(tmp_path, "--published", "highd-2020", "--json").stdout)
+    assert [row["subset"] for row in found["splits"]] == ["01-lower", "01-upper", "02-lower", "03-lower", "03-upper"]
+    beside = found["published"]
+    assert (beside["carriageways"], beside["published_difference"]) == (5, 0.002)
+    mean = {}
+    for part in ("train", "eval"):
+        own = [row for row in found["splits"] if row["part"] == part]
+        mean[part] = sum(row["weight"] * row["vehicles_per_lane_s"] for row in own) / sum(row["weight"] for row in own)
+    assert beside["difference"] == pytest.approx(abs(mean["train"] - mean["eval"]), abs=1e-9)
+    shown = run(tmp_path, "--published", "highd-2020").stdout
+    assert "published for these 5 carriageways: train 0.349 +- 0.076, eval 0.351 +- 0.075, apart by 0.002" in shown
+    assert "its text says 57 subsets where 117 carriageways remain" in " ".join(shown.split())
+    assert run(tmp_path, "--published", "highd-2019").exit_code == 2
+
+
+def test_a_published_split_goes_with_a_plan(tmp_path):
+    refused = CliRunner().invoke(app, ["split", "--lake", str(tmp_path), "--published", "highd-2020"])
+    assert refused.exit_code == 2
+    assert "--published" in refused.stderr
 
 
 @pytest.mark.parametrize(
