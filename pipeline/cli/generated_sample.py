@@ -13,6 +13,8 @@ from tracklake.pipeline.synthetic import (
     DEFAULT_MINUTES,
     DEFAULT_NOISE,
     NOISE_MODELS,
+    TRAFFICS,
+    UNIFORM,
     SampleSummary,
     write_sample,
 )
@@ -67,12 +69,14 @@ def write_generated(
     terminal: Terminal,
     formats: list[str] | None = None,
     noise: list[str] | None = None,
+    traffic: str = UNIFORM,
 ) -> SampleSummary:
     """Write the generated sample into a folder."""
     for name in formats or ():
         require_choice("--format", name, ALL_FORMATS)
     for name in noise or ():
         require_choice("--noise", name, NOISE_MODELS)
+    require_choice("--traffic", traffic, TRAFFICS)
     if not formats and find_missing("onboard"):
         formats = [name for name in DEFAULT_FORMATS if name != DRIVES]
         terminal.print_line("without drives, which need the extra [onboard]", style="dim")
@@ -83,5 +87,6 @@ def write_generated(
             minutes=DEFAULT_MINUTES if minutes is None else minutes,
             seed=1 if seed is None else seed,
             noise=tuple(noise) if noise else DEFAULT_NOISE,
+            traffic=traffic,
             progress=lambda text: terminal.print_line(text, style="dim"),
         )

@@ -10,6 +10,7 @@ from tracklake.pipeline.cli.console import find_command
 from tracklake.pipeline.cli.generated_sample import write_generated
 from tracklake.pipeline.cli.options import JsonOption, MinutesOption, QuietOption, SeedOption
 from tracklake.pipeline.lake import refuse_lake
+from tracklake.pipeline.synthetic import UNIFORM
 
 
 def sample(
@@ -23,6 +24,12 @@ def sample(
             "--noise", help="smooth (default), autocorrelated, handover, quantised; repeatable: errors add up."
         ),
     ] = None,
+    traffic: Annotated[
+        str,
+        typer.Option(
+            "--traffic", help="uniform, or varied-idm, varied-krauss: drivers, lane changes and waves drawn at random."
+        ),
+    ] = UNIFORM,
     minutes: MinutesOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -31,7 +38,7 @@ def sample(
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
     with command(quiet=quiet, json=json) as terminal:
         refuse_lake(out)
-        summary = write_generated(out, minutes, seed, terminal, formats=format, noise=noise)
+        summary = write_generated(out, minutes, seed, terminal, formats=format, noise=noise, traffic=traffic)
         terminal.print_line(
             f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)"
         )

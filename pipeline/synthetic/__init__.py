@@ -9,6 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from tracklake.pipeline.synthetic.build import README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
+from tracklake.pipeline.synthetic.drivers import TRAFFICS, UNIFORM
 from tracklake.pipeline.synthetic.noise import NOISE_MODELS, SMOOTH
 from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
 from tracklake.pipeline.synthetic.sumo import SumoError
@@ -27,6 +28,8 @@ __all__ = [
     "DEFAULT_MINUTES",
     "DEFAULT_NOISE",
     "NOISE_MODELS",
+    "TRAFFICS",
+    "UNIFORM",
     "SampleSummary",
     "SumoError",
     "write_sample",
@@ -50,6 +53,7 @@ def write_sample(
     minutes: float = DEFAULT_MINUTES,
     seed: int = 1,
     noise: tuple[str, ...] = DEFAULT_NOISE,
+    traffic: str = UNIFORM,
     progress: Callable[[str], None] | None = None,
 ) -> SampleSummary:
     """Write a sample: raw files, `truth.parquet`, `true_tracks.parquet` and a README.
@@ -57,8 +61,8 @@ def write_sample(
     The folder appears whole or not at all: the files are written to a hidden folder, which is renamed. Some of
     ALL_FORMATS are written into `out`, which is missing, empty, or holds only an earlier sample, which is replaced.
     Recordings last 0.4 to 1.9 times `minutes`; the same seed, formats and minutes give the same bytes. `noise` are some
-    of NOISE_MODELS, whose errors add up; with none, positions are exact but for the defects. `progress` is called with
-    a description of each step.
+    of NOISE_MODELS, whose errors add up; with none, positions are exact but for the defects. `traffic` is one of
+    TRAFFICS. `progress` is called with a description of each step.
 
     Raises:
         UsageError: an argument is invalid, or `out` holds other files.
@@ -74,6 +78,8 @@ def write_sample(
     models = tuple(name for name in NOISE_MODELS if name in noise)
     if unknown := [name for name in noise if name not in models]:
         raise UsageError(f"noise: expected some of {', '.join(NOISE_MODELS)}, got {', '.join(unknown)}")
+    if traffic not in TRAFFICS:
+        raise UsageError(f"traffic: expected one of {', '.join(TRAFFICS)}, got {traffic}")
     out = Path(out).absolute()
     _require_replaceable(out)
     began = time.perf_counter()
@@ -81,7 +87,7 @@ def write_sample(
     aside, old = name_unfinished(out), name_unfinished(out)
     aside.mkdir()
     try:
-        rows, recordings = build_sample(aside, formats, minutes, seed, models, progress or (lambda _: None))
+        rows, recordings = build_sample(aside, formats, minutes, seed, models, traffic, progress or (lambda _: None))
         _require_replaceable(out)
         if out.exists():
             out.rename(old)

@@ -1,8 +1,9 @@
 """Steps of making a sample: simulate, add noise, inject defects, write files, read them back, list the truth."""
 
+import math
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,6 +12,7 @@ import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
 from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, true_tracks, truth
+from tracklake.pipeline.synthetic.drivers import UNIFORM
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.scenarios import (
     DRIVES,
@@ -36,7 +38,7 @@ README_FILE = "README.md"
 README = """# A generated sample
 
 These files have the raw formats of highD and NGSIM, but were not recorded: SUMO simulated the traffic, and tracking
-noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes, {noise} noise).
+noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes, {noise}).
 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
@@ -67,6 +69,7 @@ def build_sample(
     minutes: float,
     seed: int,
     noise: tuple[str, ...],
+    traffic: str,
     progress: Callable[[str], None],
 ) -> tuple[int, int]:
     """Write a whole sample into an empty folder; the arguments are those of `write_sample`.
@@ -85,7 +88,10 @@ def build_sample(
         if kind in formats
     ]
     driven = DRIVES in formats
-    jobs = _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
+    jobs = [
+        replace(job, traffic=replace(job.traffic, drivers=traffic))
+        for job in _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
+    ]
     progress(f"simulating {len(jobs)} carriageways")
     clean = _simulate_all(home, jobs, seed, progress)
     found = truth.Found()
@@ -112,12 +118,16 @@ def build_sample(
         tracks = _number_vehicles(pair, clean)
         rows += drives.write_drive(folder, drive, tracks[drive.subset], pair[0].road.rate_hz, seed)
     progress("writing the truth")
-    truth.build_truth(rows + truth.list_counts(found)).write_parquet(folder / TRUTH_FILE)
+    # What each rule has to find is counted where today's tests compare it; the loops take as long as all the rest.
+    counted = found if traffic == UNIFORM else replace(found, entries={})
+    truth.build_truth(rows + truth.list_counts(counted)).write_parquet(folder / TRUTH_FILE)
     pl.concat([pl.DataFrame(schema=true_tracks.TRUE_TRACKS_SCHEMA), *true]).sort(
         "dataset", "subset", "vehicle_id", "frame"
     ).write_parquet(folder / TRUE_TRACKS_FILE)
     named = " and ".join(noise) or "no"
-    (folder / README_FILE).write_text(README.format(seed=seed, minutes=minutes, noise=named), encoding="utf-8")
+    named += " noise" if traffic == UNIFORM else f" noise, {traffic} traffic"
+    text = README.format(seed=seed, minutes=minutes, noise=named)
+    (folder / README_FILE).write_text(text, encoding="utf-8")
     lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
     count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
     return lines, count + driven * len(drives.SCENARIOS)
@@ -222,7 +232,19 @@ def _damage_tracks(
         }
         for each in injected.defects
     ]  # fmt: skip
-    return injected.tracks, _list_first_frames(tracks, job) + declared
+    return injected.tracks, _list_first_frames(tracks, job) + _list_lane_changes(tracks, job) + declared
+
+
+def _list_lane_changes(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
+    changes = tracks.drop_nulls("change_begin").select("vehicle", "change_begin", "change_end", "change_side").unique()
+    return [
+        {
+            "kind": "lane_change", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
+            "file": job.file, "vehicle_id": vehicle, "name": "left" if side < 0 else "right",
+            "first_frame": math.ceil(begin), "last_frame": math.floor(end), "value": (end - begin) / job.road.rate_hz,
+        }
+        for vehicle, begin, end, side in changes.sort("vehicle", "change_begin").iter_rows()
+    ]  # fmt: skip
 
 
 def _list_line_defects(

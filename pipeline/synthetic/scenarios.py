@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from tracklake.pipeline.synthetic.drivers import UNIFORM
+
 DRIVES = "drives"
 """Format of instrumented vehicles: a folder of logs each."""
 FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES)
@@ -78,6 +80,7 @@ class Traffic:
         bottleneck_mps: speed in the zone behind the window that holds the traffic up; None = free flow.
         pulsing: for 15 of every 40 s that zone admits hardly any vehicles, which causes waves of standing traffic.
         ramp_arrivals: vehicles per second on the on-ramp, where there is one.
+        drivers: one of TRAFFICS; in varied traffic every bottleneck causes waves, at random times.
     """
 
     arrivals: float
@@ -86,6 +89,7 @@ class Traffic:
     pulsing: bool = False
     ramp_arrivals: float = 0.0
     plan: Plan = field(default_factory=Plan)
+    drivers: str = UNIFORM
 
     @property
     def warm_up_s(self) -> float:

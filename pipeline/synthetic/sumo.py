@@ -6,15 +6,25 @@ loaded into this process.
 
 import os
 import subprocess
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import polars as pl
 
+from tracklake.pipeline.synthetic.drivers import (
+    UNIFORM,
+    VARIED,
+    VEHICLE_TYPES,
+    WAVE_PAUSE_S,
+    WAVE_SELDOM_PAUSE_S,
+    VehicleType,
+    draw_types,
+    draw_waves,
+)
+from tracklake.pipeline.synthetic.lane_changes import draw_courses, move_across
 from tracklake.pipeline.synthetic.scenarios import RAMP_VISIBLE_M, WEAVE_BEGINS_M, WEAVE_ENDS_M, Road, Traffic
+from tracklake.schemas.arrays import Floats
 from tracklake.schemas.errors import TracklakeError
 
 APPROACH_M = 500.0
@@ -23,39 +33,14 @@ MARGIN_M = 40.0
 BEYOND_M = 160.0
 BOTTLENECK_M = 300.0
 RAMP_M = 300.0
-LANE_CHANGE_S = 4.0
+LANE_CHANGE_S, VARIED_LANE_CHANGE_S = 4.0, 6.0
+"""Time for which a lane changer keeps both lanes, in s; in varied traffic not that of the change itself."""
 PULSE_EVERY_S, PULSE_S, PULSE_MPS = 40.0, 15.0, 0.2
 SUMO_LANE_M = 3.2
 """Width of SUMO's own lanes, in which posLat is measured, whatever the recorded road is given, in m."""
 MERGE_M = 80.0
 """Length over which the on-ramp's lane approaches the auxiliary lane, in m."""
 
-
-@dataclass(frozen=True)
-class VehicleType:
-    """A kind of vehicle: NGSIM's class, size, weight among its class, and attributes of SUMO's vType (driver model)."""
-
-    name: str
-    v_class: int
-    length_m: float
-    width_m: float
-    weight: float
-    model: str
-
-
-_CAR = 'vClass="passenger" accel="1.6" decel="2.6" minGap="2" lcSpeedGain="8" lcKeepRight="1.5" lcAssertive="1.3"'
-_VAN = 'vClass="passenger" accel="1.2" decel="2.5" minGap="2.2" lcSpeedGain="5"'
-_TRUCK = 'vClass="truck" accel="0.7" decel="2.2" minGap="2.6" tau="1.6" maxSpeed="24.6"'
-VEHICLE_TYPES = (
-    VehicleType("hatchback", 2, 4.1, 1.7, 0.3, f'{_CAR} tau="1.0" speedFactor="normc(0.95,0.10,0.7,1.3)"'),
-    VehicleType("saloon", 2, 4.6, 1.8, 0.4, f'{_CAR} tau="1.1" speedFactor="normc(1.0,0.12,0.7,1.4)"'),
-    VehicleType("estate", 2, 5.0, 1.9, 0.18, f'{_CAR} tau="1.3" speedFactor="normc(1.05,0.12,0.7,1.4)"'),
-    VehicleType("van", 2, 6.0, 2.1, 0.1, f'{_VAN} tau="1.3" speedFactor="normc(0.9,0.08,0.7,1.2)"'),
-    VehicleType("motorcycle", 1, 2.3, 0.8, 0.02, f'{_CAR} tau="1.2" speedFactor="normc(1.0,0.1,0.7,1.3)"'),
-    VehicleType("lorry", 3, 9.6, 2.5, 0.4, f'{_TRUCK} speedFactor="normc(0.9,0.06,0.7,1.1)"'),
-    VehicleType("articulated", 3, 16.5, 2.5, 0.5, f'{_TRUCK} speedFactor="normc(0.85,0.04,0.7,1.0)"'),
-    VehicleType("road_train", 3, 18.7, 2.5, 0.1, f'{_TRUCK} speedFactor="normc(0.82,0.03,0.7,0.95)"'),
-)
 
 TRACK_SCHEMA = {
     "vehicle": pl.Int32(),
@@ -69,9 +54,14 @@ TRACK_SCHEMA = {
     "v_class": pl.Int8(),
     "length": pl.Float64(),
     "width": pl.Float64(),
+    "change_begin": pl.Float64(),
+    "change_end": pl.Float64(),
+    "change_side": pl.Int8(),
 }
 """Tracks inside the generator: x_m of the front from the window's entrance along the direction of travel, y_m from
-the left edge to the right, m/s and m/s2 along the direction of travel, lane 1 leftmost; sorted by vehicle, frame."""
+the left edge to the right, m/s and m/s2 along the direction of travel, lane 1 leftmost; sorted by vehicle, frame.
+In varied traffic the lane change that the vehicle is in: its frames, which need not be whole ones or of the window,
+and its side (-1 left, 1 right); null otherwise."""
 
 
 _RUNNING: set["subprocess.Popen[str]"] = set()
@@ -163,34 +153,30 @@ def write_network(home: Path, folder: Path, road: Road, traffic: Traffic) -> Non
     _call(home, "netconvert", [*arguments, "--no-internal-links", "--no-turnarounds"])
 
 
-def write_demand(folder: Path, road: Road, traffic: Traffic, seconds: float) -> None:
-    """Write vehicle types and Poisson arrivals to `routes.xml`, the bottleneck's pulses to `signs.xml`."""
-    types = []
-    for kind in VEHICLE_TYPES:
-        of_class = traffic.trucks if kind.v_class == 3 else 1 - traffic.trucks
-        types.append(
-            f'<vType id={quoteattr(kind.name)} carFollowModel="IDM" length="{kind.length_m}" width="{kind.width_m}" '
-            f'probability="{of_class * kind.weight}" {kind.model}/>'
-        )
+def write_demand(
+    folder: Path, road: Road, traffic: Traffic, seconds: float, types: tuple[VehicleType, ...], waves: Floats
+) -> None:
+    """Write vehicle types and Poisson arrivals to `routes.xml`, the bottleneck's waves (W, 3) to `signs.xml`."""
+    shares = (traffic.trucks if kind.v_class == 3 else 1 - traffic.trucks for kind in types)
+    listed = [kind.format_xml(share * kind.weight) for kind, share in zip(types, shares, strict=True)]
     flow = 'type="mix" begin="0" end="{end}" departLane="random" departSpeed="{speed}"'.format(
         end=seconds, speed="desired" if traffic.bottleneck_mps is None else "avg"
     )
     flows = [f'<flow id="main" {flow} from="approach" to="bottleneck" period="exp({traffic.arrivals * road.lanes})"/>']
     if road.ramp:
         flows.append(f'<flow id="ramp" {flow} from="ramp" to="bottleneck" period="exp({traffic.ramp_arrivals})"/>')
-    text = "\n".join(["<routes>", '<vTypeDistribution id="mix">', *types, "</vTypeDistribution>", *flows, "</routes>"])
+    text = "\n".join(["<routes>", '<vTypeDistribution id="mix">', *listed, "</vTypeDistribution>", *flows, "</routes>"])
     (folder / "routes.xml").write_text(text + "\n", encoding="utf-8")
     signs = []
-    if traffic.pulsing and traffic.bottleneck_mps is not None:
+    if traffic.bottleneck_mps is not None and len(waves):
         lanes = " ".join(f"bottleneck_{lane}" for lane in range(road.lanes))
-        starts = np.arange(0, seconds, PULSE_EVERY_S)
+        steps = [
+            (0.0, 1.0),
+            *((time, speed) for begin, end, wave in waves for time, speed in ((begin, wave), (end, 1.0))),
+        ]
         signs = [
             f'<variableSpeedSign id="sign" lanes="{lanes}">',
-            *(
-                f'<step time="{start + wait}" speed="{speed}"/>'
-                for start in starts
-                for wait, speed in ((0, traffic.bottleneck_mps), (PULSE_EVERY_S - PULSE_S, PULSE_MPS))
-            ),
+            *(f'<step time="{time:g}" speed="{share * traffic.bottleneck_mps:g}"/>' for time, share in steps),
             "</variableSpeedSign>",
         ]
     text = "\n".join(["<additional>", *signs, "</additional>"])
@@ -202,9 +188,12 @@ def simulate(home: Path, folder: Path, road: Road, traffic: Traffic, *, frames: 
 
     Returns TRACK_SCHEMA; vehicles count from 1 in order of (first frame, foremost first).
     """
-    write_network(home, folder, road, traffic)
+    random = np.random.default_rng(seed)
     seconds = traffic.warm_up_s + frames / road.rate_hz
-    write_demand(folder, road, traffic, seconds)
+    types = VEHICLE_TYPES if traffic.drivers == UNIFORM else draw_types(VARIED[traffic.drivers], random)
+    keeps_s = LANE_CHANGE_S if traffic.drivers == UNIFORM else VARIED_LANE_CHANGE_S
+    write_network(home, folder, road, traffic)
+    write_demand(folder, road, traffic, seconds, types, _plan_waves(traffic, seconds, random))
     recorded = ["before", "weave", "after", "ramp"] if road.ramp else ["window"]
     (folder / "recorded.txt").write_text("".join(f"edge:{name}\n" for name in recorded), encoding="utf-8")
     _call(
@@ -214,28 +203,42 @@ def simulate(home: Path, folder: Path, road: Road, traffic: Traffic, *, frames: 
             *("-n", str(folder / "net.xml"), "-r", str(folder / "routes.xml"), "-a", str(folder / "signs.xml")),
             *("--seed", str(seed)),
             *("--step-length", str(1 / road.rate_hz), "--end", str(seconds), "--precision", "5"),
-            *("--lanechange.duration", str(LANE_CHANGE_S), "--time-to-teleport", "-1", "--no-step-log"),
+            *("--lanechange.duration", str(keeps_s), "--time-to-teleport", "-1", "--no-step-log"),
             *("--fcd-output", str(folder / "fcd.csv"), "--device.fcd.begin", str(traffic.warm_up_s)),
             *("--fcd-output.filter-edges.input-file", str(folder / "recorded.txt"), "--fcd-output.acceleration"),
             *("--fcd-output.attributes", "id,type,lane,pos,posLat,speed,speedLat,acceleration"),
+            *("--lanechange-output", str(folder / "changes.csv")),
         ],
     )
-    return read_tracks(folder / "fcd.csv", road, traffic)
+    placed = read_places(folder / "fcd.csv", road, traffic)
+    if traffic.drivers == UNIFORM:
+        placed = bend_lane_changes(placed)
+    else:
+        changes = read_changes(folder / "changes.csv", road, traffic)
+        placed = move_across(placed, draw_courses(changes, random), road, random)
+    return build_tracks(placed, road, traffic, types)
 
 
-def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
-    """Turn SUMO's floating car data (lane names and positions on them) into tracks in the window's own frame.
+def _plan_waves(traffic: Traffic, seconds: float, random: np.random.Generator) -> Floats:
+    """Plan the bottleneck's waves, as `draw_waves` returns them: every PULSE_EVERY_S, or at random."""
+    if traffic.bottleneck_mps is None:
+        return np.empty((0, 3))
+    if traffic.drivers != UNIFORM:
+        return draw_waves(seconds, WAVE_PAUSE_S if traffic.pulsing else WAVE_SELDOM_PAUSE_S, random)
+    ends = PULSE_EVERY_S + np.arange(0, seconds if traffic.pulsing else 0, PULSE_EVERY_S)
+    return np.stack([ends - PULSE_S, ends, np.full_like(ends, PULSE_MPS / traffic.bottleneck_mps)], axis=1)
 
-    SUMO moves a lane changer sideways at constant speed; the way from centre line to centre line is bent into an
-    S (3 p^2 - 2 p^3), which crosses the marking at the same moment.
-    """
+
+def _number_lanes(road: Road, traffic: Traffic, name: str) -> pl.Expr:
+    """Compute the number of SUMO's lane `name`: 1 is the leftmost; the on-ramp has that of the auxiliary lane."""
+    outermost = {edge: lanes for edge, _, _, lanes, _ in _edges(road, traffic)} | {"ramp": road.lanes + 1}
+    edge, index = (pl.col(name).str.extract(pattern) for pattern in (r"^(.*)_\d+$", r"_(\d+)$"))
+    return edge.replace_strict(outermost, return_dtype=pl.Int16) - index.cast(pl.Int16)
+
+
+def read_places(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
+    """Read SUMO's floating car data of the window, sorted by time, with places and lanes in the window's own frame."""
     begins = {name: begin for name, begin, _, _, _ in _edges(road, traffic)} | {"ramp": WEAVE_BEGINS_M - RAMP_M}
-    outermost = {name: lanes for name, _, _, lanes, _ in _edges(road, traffic)} | {"ramp": road.lanes + 2}
-    kinds = pl.DataFrame(
-        [(kind.name, kind.v_class, kind.length_m, kind.width_m) for kind in VEHICLE_TYPES],
-        schema={"type": pl.String, "v_class": pl.Int8, "length": pl.Float64, "width": pl.Float64},
-        orient="row",
-    )
     raw = pl.read_csv(
         path,
         separator=";",
@@ -246,30 +249,67 @@ def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
         schema_overrides={"timestep_time": pl.Float64, "vehicle_id": pl.String, "vehicle_type": pl.String},
     ).rename(lambda name: name.removeprefix("vehicle_"))  # fmt: skip
     edge = pl.col("lane").str.extract(r"^(.*)_\d+$")
-    index = pl.col("lane").str.extract(r"_(\d+)$").cast(pl.Int16)
-    placed = raw.with_columns(
-        edge=edge,
-        frame=((pl.col("timestep_time") - traffic.warm_up_s) * road.rate_hz).round().cast(pl.Int32) + 1,
+    return raw.with_columns(
+        time=pl.col("timestep_time"),
+        frame=_count_frames(pl.col("timestep_time"), road, traffic).round().cast(pl.Int32),
         x=edge.replace_strict(begins, return_dtype=pl.Float64) + pl.col("pos"),
-        number=edge.replace_strict(outermost, return_dtype=pl.Int16) - index,
+        number=_number_lanes(road, traffic, "lane"),
+        on_ramp=edge == "ramp",
     ).filter(pl.col("x").is_between(0, road.window_m, closed="left"))
-    on_ramp = placed["edge"].to_numpy() == "ramp"
-    x = placed["x"].to_numpy()
-    # Lane centres stand at whole numbers: 0 is the leftmost lane's.
+
+
+def read_changes(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
+    """Read when vehicles cross a marking, anywhere on the road, as `draw_courses` takes it."""
+    raw = pl.read_csv(path, separator=";", columns=["change_id", "change_time", "change_from", "change_to"])
+    return raw.select(
+        id="change_id",
+        time=pl.col("change_time").cast(pl.Float64),
+        start=_number_lanes(road, traffic, "change_from"),
+        target=_number_lanes(road, traffic, "change_to"),
+    )
+
+
+def bend_lane_changes(placed: pl.DataFrame) -> pl.DataFrame:
+    """Add the columns of `move_across` to SUMO's places, and the rate of change of `across`, `across_speed` in 1/s.
+
+    SUMO moves a lane changer sideways at constant speed; the way from centre line to centre line is bent into an
+    S (3 p^2 - 2 p^3), which crosses the marking at the same moment.
+    """
     across = placed["number"].to_numpy() - 1 - placed["posLat"].to_numpy() / SUMO_LANE_M
     lower = np.floor(across)
     part = across - lower
-    across = lower + part**2 * (3 - 2 * part)
-    lateral_speed = -placed["speedLat"].to_numpy() / SUMO_LANE_M * 6 * part * (1 - part)
-    closing = np.clip((WEAVE_BEGINS_M - x) / MERGE_M, 0, 1)
-    across = np.where(on_ramp, road.lanes + closing**2 * (3 - 2 * closing), across)
-    tracks = placed.with_columns(
-        pl.Series("y", (across + 0.5) * road.lane_width_m),
-        pl.Series("lateral_speed", lateral_speed * road.lane_width_m),
-        pl.Series("on_ramp", on_ramp),
-    ).join(kinds, on="type", how="left", maintain_order="left")
+    return placed.with_columns(
+        pl.Series("across", lower + part**2 * (3 - 2 * part)),
+        pl.Series("across_speed", -placed["speedLat"].to_numpy() / SUMO_LANE_M * 6 * part * (1 - part)),
+        *(pl.lit(None, pl.Float64).alias(name) for name in ("change_begin", "change_end", "change_side")),
+    )
+
+
+def build_tracks(placed: pl.DataFrame, road: Road, traffic: Traffic, types: tuple[VehicleType, ...]) -> pl.DataFrame:
+    """Build tracks, TRACK_SCHEMA, from places with the columns of `move_across`."""
+    kinds = pl.DataFrame(
+        [(kind.name, kind.v_class, kind.length_m, kind.width_m) for kind in types],
+        schema={"type": pl.String, "v_class": pl.Int8, "length": pl.Float64, "width": pl.Float64},
+        orient="row",
+    )
+    closing = np.clip((WEAVE_BEGINS_M - placed["x"].to_numpy()) / MERGE_M, 0, 1)
+    across = placed["across"].to_numpy()
+    on_ramp = placed["on_ramp"].to_numpy()
+    across = np.where(on_ramp, across + closing**2 * (3 - 2 * closing), across)
+    moved = placed.with_columns(pl.Series("y", (across + 0.5) * road.lane_width_m))
+    if "across_speed" in placed.columns:
+        lateral_speed = pl.col("across_speed") * road.lane_width_m
+    else:
+        lateral_speed = (pl.col("y").diff().backward_fill().over("id") * road.rate_hz).fill_null(0.0)
     visible = ~pl.col("on_ramp") | (pl.col("x") >= RAMP_VISIBLE_M)
-    tracks = tracks.filter(visible).with_columns(lane=compute_lanes(road))
+    tracks = (
+        moved.with_columns(
+            _count_frames(pl.col("change_begin", "change_end"), road, traffic), lateral_speed=lateral_speed
+        )
+        .join(kinds, on="type", how="left", maintain_order="left")
+        .filter(visible)
+        .with_columns(lane=compute_lanes(road))
+    )
     order = (
         tracks.group_by("id")
         .agg(pl.col("frame").min().alias("first"), pl.col("x").sort_by("frame").first().alias("from"))
@@ -282,6 +322,11 @@ def read_tracks(path: Path, road: Road, traffic: Traffic) -> pl.DataFrame:
         .select(pl.col(name).cast(dtype) for name, dtype in TRACK_SCHEMA.items())
         .sort("vehicle", "frame")
     )
+
+
+def _count_frames(time_s: pl.Expr, road: Road, traffic: Traffic) -> pl.Expr:
+    """Convert SUMO's time to a number of frames, of which 1 is the first."""
+    return (time_s - traffic.warm_up_s) * road.rate_hz + 1
 
 
 def compute_lanes(road: Road) -> pl.Expr:
