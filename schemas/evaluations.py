@@ -11,6 +11,9 @@ is judged by `nll_nats` alone. `average` is how n samples become one figure:
 - `samples`: the mean over them; every sample counts the same, so a vehicle that is seen for long counts more.
 - `vehicles`: the mean over each vehicle's own samples, then the mean over the vehicles; every vehicle counts the same.
 
+Where lateral positions of a row's samples are lane centres (`columns_missing` of `subsets` has y_m), its radial and
+lateral errors and NLL are null.
+
 Roots are taken last: rmse_m of `vehicles` is the root of the mean over vehicles of their mean squared distances.
 """
 

@@ -269,7 +269,10 @@ class HorizonScore(TypedDict):
     """Errors of a model at one horizon."""
 
     seconds: Annotated[float, "horizon", "s"]
-    rmse_m: Annotated[float | None, "root mean square error of the predicted position"]
+    rmse_m: Annotated[
+        float | None, "root mean square error of the predicted position; null where lateral positions are lane centres"
+    ]
+    rmse_longitudinal_m: Annotated[float | None, "the same along the road alone"]
     n: Annotated[int, "predictions behind it"]
 
 

@@ -65,7 +65,8 @@ COIFMAN = Reference(
     "Coifman and Li (2017)",
     "Coifman, B., Li, L. (2017). A critical evaluation of the Next Generation Simulation (NGSIM) vehicle trajectory "
     "dataset. Transportation Research Part B 105, 362-377.",
-    "errors known in NGSIM: negative gaps and overlapping vehicles",
+    "errors known in NGSIM: negative gaps and overlapping vehicles; I-80 tracked again, with lanes in place of lateral "
+    "positions",
     doi="10.1016/j.trb.2017.09.018",
 )
 PUNZO = Reference(

@@ -6,6 +6,9 @@ from tracklake.schemas.columns import ORIGINS, PLACE, Table, column
 
 SOURCE_FILE = pl.Struct({"file": pl.String(), "sha256": pl.String()})
 
+LANE_CENTRES = ("heading_rad", "lateral_speed_mps", "y_m")
+"""Columns of tracks that are made of lane centres, where a source has these in place of lateral positions."""
+
 SUBSETS = Table(
     "subsets",
     "One row per subset: the unit of parallelism, splitting and reporting.",
@@ -50,7 +53,10 @@ SUBSETS = Table(
             unit="m",
             nullable=True,
         ),
-        "columns_missing": column(pl.List(pl.String), "columns of tracks that the source does not have"),
+        "columns_missing": column(
+            pl.List(pl.String),
+            "columns of tracks that the source does not have; with y_m, lateral positions are lane centres",
+        ),
         "source_files": column(pl.List(SOURCE_FILE), "the raw files and their sha256"),
     },
 )

@@ -138,6 +138,7 @@ SUBSET_KEYS = {
     "lane_markings_m": "numbers or null",
     "last_lane": "a whole number",
     "width_m": "a number",
+    "lateral_positions": "text",
 }
 """Each key of a subset and the kind of its value."""
 
@@ -145,7 +146,11 @@ SUBSET_MEANING = """\
 Of each subset: origin, recorded or synthetic; centre_m (2,), the origin of int16 positions, (0, 0) for float32;
 lane_markings_m, y of each marking, null where unknown; last_lane, the rightmost lane (by the markings, else the
 highest that any entry has: knowledge of the map taken from the whole recording, later moments included); width_m of
-the carriageway (the last marking, else 12 ft a lane)."""
+the carriageway (the last marking, else 12 ft a lane); lateral_positions, recorded or lane centres: where these stand in
+place of lateral positions, errors across the road mean nothing, and scores have none."""
+
+RECORDED_POSITIONS, LANE_CENTRES = "recorded", "lane centres"
+"""Values of lateral_positions."""
 
 NOMINAL_LANE_M = 3.6576
 """Width of a lane without known markings, in metres (12 ft), for mirrored positions and the lanes of scenes."""

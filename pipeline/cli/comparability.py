@@ -1,4 +1,4 @@
-"""Whether published figures may stand beside scores: only where tracks are as recorded and recordings complete."""
+"""What scores mean on these recordings: published figures beside them, and figures that lane centres do not allow."""
 
 from pathlib import Path
 from typing import cast
@@ -11,15 +11,17 @@ from tracklake.schemas import SUBSETS
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.protocols import RECORDED
 from tracklake.schemas.quality_tracks import RecordingFacts
+from tracklake.schemas.references import COIFMAN
 from tracklake.training.data.tensor_folder import TensorFolder
 
 
 def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *, published: bool) -> tuple[str, ...]:
-    """Print what is synthetic, and which datasets have no published figures beside them and why.
+    """Print what is synthetic or has lane centres, and which datasets have no published figures beside them and why.
 
     Returns the datasets that published figures may stand beside; none unless they are wanted.
     """
     terminal.print_origin(describe_synthetic(folder.origins))
+    print_lane_centres(terminal, folder)
     if not published:
         return ()
     if (tracks := folder.protocol.tracks_from) != RECORDED:
@@ -45,3 +47,17 @@ def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *,
             more = f"; and {len(reasons) - 1} more recordings" if len(reasons) > 1 else ""
             terminal.print_line(f"note: no published figures beside {dataset} ({reasons[0]}{more})", style="dim")
     return tuple(dataset for dataset, reasons in gaps.items() if not reasons)
+
+
+def print_lane_centres(terminal: Terminal, folder: TensorFolder) -> None:
+    """Print which subsets have lane centres in place of lateral positions, with the publication of those of NGSIM."""
+    subsets = (f"{own['dataset']}/{own['subset']}" for own in folder.index["subsets"])
+    names = [name for name, centred in zip(subsets, folder.lane_centred, strict=True) if centred]
+    kept = sorted(folder.origins.keys() & names)
+    if kept:
+        cite = f" Cite with NGSIM's I-80: {COIFMAN.full}" if any(name.startswith("ngsim/i-80") for name in kept) else ""
+        terminal.print_line(
+            f"note: lateral positions of {', '.join(kept)} are lane centres: only errors along the road mean anything; "
+            f"radial and lateral ones are left out.{cite}",
+            style="dim",
+        )

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import polars as pl
 
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.score_tables import HEADINGS, HEADLINE_FIGURES
+from tracklake.pipeline.cli.score_tables import HEADINGS, find_headline
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.training.comparison.arms import compare_arms
 from tracklake.training.evaluation.evaluate import Evaluation
@@ -18,7 +18,7 @@ def show_comparisons(terminal: Terminal, evaluations: Sequence[Evaluation]) -> p
     """Compare the first model with every other one, and print the differences of the headline errors and of NLL."""
     table = compare_arms(evaluations)
     seconds = table["seconds"].unique().sort().to_list()
-    for figure in (*HEADLINE_FIGURES[evaluations[0].protocol.headline], "nll_nats"):
+    for figure in (*find_headline(evaluations[0].protocol.headline, set(table["figure"])), "nll_nats"):
         rows = table.filter(figure=figure)
         lines = [
             [name or f"{a} - {b}", *(format_number(value, 3) for value in own[column])]

@@ -1,6 +1,6 @@
 """Scores in the terminal: a line per model, then the number of samples, then published lines, marked as such."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import polars as pl
 
@@ -27,6 +27,8 @@ HEADLINE_FIGURES: Mapping[Headline, tuple[str, ...]] = {
     "mae": ("mae_m",),
 }
 """Errors that a protocol's tables show at every horizon."""
+ALONG = {"rmse_m": "rmse_longitudinal_m", "mae_m": "mae_longitudinal_m"}
+"""Errors that stand in for radial ones where lateral positions are lane centres."""
 AT_THE_END = ("rmse_longitudinal_m", "rmse_lateral_m", "ade_m", "fde_m", "nll_nats")
 """Errors shown at the last horizon only, unless they are the headline."""
 ACCURACIES = {"lateral": "lateral %", "longitudinal": "braking %"}
@@ -40,7 +42,8 @@ def show_evaluations(terminal: Terminal, one: Evaluation, table: pl.DataFrame, b
     dataset, vehicle.
     """
     table = table.filter(pl.col("seconds").is_in([tick / one.protocol.rate_hz for tick in one.protocol.scored_ticks]))
-    headline = HEADLINE_FIGURES[one.protocol.headline]
+    measured = table.filter(origin="measured")
+    headline = find_headline(one.protocol.headline, {own for own in HEADINGS if measured[own].is_not_null().any()})
     terminal.print_line(
         f"{one.part} of {one.split}, protocol {one.protocol.title}: {one.samples:,} samples of "
         f"{one.vehicles:,} vehicles",
@@ -48,7 +51,7 @@ def show_evaluations(terminal: Terminal, one: Evaluation, table: pl.DataFrame, b
     )
     everything = (pl.col("dataset") == EVERYTHING) & (pl.col("group") == EVERYTHING)
     of_samples = pl.col("average") == "samples"
-    measured, published = table.filter(origin="measured"), table.filter(origin="published")
+    published = table.filter(origin="published")
     all_samples = measured.filter(everything & of_samples)
     datasets = measured.filter(pl.col("dataset") != EVERYTHING)["dataset"].unique().sort().to_list()
     apart = datasets if len(datasets) > 1 or "dataset" in by else []
@@ -74,6 +77,12 @@ def show_evaluations(terminal: Terminal, one: Evaluation, table: pl.DataFrame, b
         for severity, (group, _) in FINDING_GROUPS.items():
             text = f"{group}: the vehicle's own findings of severity {severity} or worse in history or future"
             terminal.print_line(text, style="dim")
+
+
+def find_headline(headline: Headline, known: Collection[str]) -> list[str]:
+    """Find the known errors that tables show; those along the road where no other is known."""
+    wanted = HEADLINE_FIGURES[headline]
+    return [own for own in wanted if own in known] or [ALONG[own] for own in wanted if ALONG.get(own) in known]
 
 
 def _show_horizons(

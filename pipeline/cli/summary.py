@@ -71,7 +71,10 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         origins = {row["subset"]: row["origin"] for row in drives}
         terminal.print_origin(describe_synthetic(origins, noun="drive", maker="instrument"))
     scores = [score for score in quality["model_scores"] if score["rows"]]
-    lines |= {f"RMSE, m ({score['model']})": _format_errors(score["rows"], "rmse_m") for score in scores}
+    for score in scores:
+        radial = any(row["rmse_m"] is not None for row in score["rows"])
+        name, figure = ("RMSE", "rmse_m") if radial else ("longitudinal RMSE", "rmse_longitudinal_m")
+        lines[f"{name}, m ({score['model']})"] = _format_errors(score["rows"], figure)
     of_drives = collect_drive_scores(lake, load(lake), lambda message: terminal.print_problem(message, label="skipped"))
     lines |= {f"MAE, m ({score['model']}, drives)": _format_errors(score["rows"], "mae_m") for score in of_drives}
     width = max(map(len, lines)) + 2

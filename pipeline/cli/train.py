@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.comparability import print_lane_centres
 from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST
 from tracklake.pipeline.cli.options import (
@@ -106,7 +107,9 @@ def train(
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
-        terminal.print_origin(describe_synthetic(TensorFolder.open(tensors).narrow(dataset, recording).origins))
+        folder = TensorFolder.open(tensors).narrow(dataset, recording)
+        terminal.print_origin(describe_synthetic(folder.origins))
+        print_lane_centres(terminal, folder)
         out = found.lake / RUNS / run_name
         try:
             with explain_file_errors(out), terminal.show_training(f"train {model}") as show:

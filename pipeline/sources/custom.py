@@ -16,7 +16,7 @@ CUSTOM = Source(
     licence="that of the recordings, which tracklake does not know",
     citation="the publication of these recordings, which tracklake does not know",
     signature="any table, with --columns",
-    version=1,
+    version=2,
     detect=detect,
     group=group,
     to_canonical=partial(to_canonical, dataset="custom"),

@@ -41,6 +41,7 @@ from tracklake.schemas import references
 from tracklake.schemas.columns import FOOT_M, Dataset
 from tracklake.schemas.completeness import PUBLISHED, PUBLISHED_TOTALS, TOTAL_FRAMES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
+from tracklake.schemas.subsets import LANE_CENTRES
 
 CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
 DECIMALS = 6
@@ -66,6 +67,8 @@ FILLED_BY = {
     "Space_Headway": ("headway_recorded_m",),
 }
 """Columns of tracks that are null if a raw column is missing."""
+MIN_CENTRED_ENTRIES = 100
+"""Fewest entries of a subset, 10 s of one vehicle, that can show that lateral positions are lane centres."""
 
 
 def group(files: Sequence[RawFile]) -> Grouping:
@@ -273,6 +276,8 @@ def _to_subset(
     rows: pl.DataFrame, name: str, direction: int | None, facts: dict[str, Any], files: Sequence[RawFile]
 ) -> Subset:
     missing = {column for raw, filled in FILLED_BY.items() if rows[raw].is_null().all() for column in filled}
+    if _has_lane_centres(rows):
+        missing |= {*LANE_CENTRES}
     entries = orient_ngsim(rows, direction).select(
         *(*CONSTANTS, "x_m", "y_m", "speed_mps", "accel_mps2"),
         source_id="Vehicle_ID",
@@ -310,6 +315,16 @@ def _to_subset(
     )
 
 
+def _has_lane_centres(rows: pl.DataFrame) -> bool:
+    """Return whether each lane has one lateral position, although vehicles change lanes."""
+    if rows.height < MIN_CENTRED_ENTRIES:
+        return False
+    lanes = rows.group_by("Lane_ID").agg(least=pl.col("Local_X").min(), most=pl.col("Local_X").max())
+    if lanes.height < 2 or not lanes.select((pl.col("least") == pl.col("most")).all(ignore_nulls=False)).item():
+        return False
+    return bool(rows.group_by("Vehicle_ID").agg(changes=pl.col("Lane_ID").n_unique() > 1)["changes"].any())
+
+
 def _describe_subsets(subsets: Sequence[Subset]) -> list[str]:
     """Describe split ids and missing columns, a note each."""
     notes = []
@@ -317,9 +332,14 @@ def _describe_subsets(subsets: Sequence[Subset]) -> list[str]:
         facts = subset.facts.row(0, named=True)
         if facts["ids_split"]:
             notes.append(f"{subset.name}: {facts['ids_split']} ids stood for more than one vehicle and were split")
-        if facts["columns_missing"]:
+        if "y_m" in facts["columns_missing"]:
+            notes.append(
+                f"{subset.name}: lateral positions are lane centres (as where {references.COIFMAN.name} tracked I-80 "
+                "again): no rules on them, and no scores across the road"
+            )
+        missing = [name for name in facts["columns_missing"] if name not in LANE_CENTRES]
+        if missing:
             # Samples, and with them splits and tensors, need lanes.
-            missing = facts["columns_missing"]
             stages = "; no samples, split or tensors without lane" if "lane" in missing else ""
             notes.append(f"{subset.name}: the files have no {', '.join(missing)}; those columns are null{stages}")
     return notes
@@ -332,7 +352,7 @@ NGSIM = Source(
     citation=references.NGSIM.full,
     signature="NGSIM: 18 numbers a line separated by blanks or commas, or a header with Vehicle_ID, Frame_ID, "
     "Global_Time, Local_X, Local_Y, v_Vel",
-    version=3,
+    version=4,
     detect=detect,
     group=group,
     to_canonical=to_canonical,

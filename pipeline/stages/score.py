@@ -14,6 +14,8 @@ from tracklake.schemas.documents import read_json
 
 BASELINE = "constant-velocity"
 """Name of the model that is scored, and of its run."""
+HORIZON = ("seconds", "rmse_m", "rmse_longitudinal_m", "n")
+"""Figures of a run's metrics at one horizon that the report shows."""
 
 
 def build(reader: LakeReader, settings: Settings) -> StageResult:
@@ -48,7 +50,7 @@ def finished_runs(root: Path) -> list[Path]:
 
 
 def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Return the scores of runs made from the live tensors, by model: {model, part, rows: [{seconds, rmse_m, n}]}.
+    """Return the scores of runs made from the live tensors, by model: {model, part, rows: [{seconds, rmse_m, n, ...}]}.
 
     `skip` is called with a message for each run that is damaged or of another version.
     """
@@ -85,7 +87,7 @@ def _read_score(path: Path) -> dict[str, Any] | None:
         evaluation = read_json(path)["evaluation"]
         if evaluation is None:
             return None
-        rows = [{name: horizon[name] for name in ("seconds", "rmse_m", "n")} for horizon in evaluation["horizons"]]
+        rows = [{name: horizon[name] for name in HORIZON} for horizon in evaluation["horizons"]]
         return {"part": evaluation["part"], "rows": rows}
     except (ValueError, KeyError, TypeError) as broken:
         raise StaleRunError(f"{path}: expected what a training scored, got {broken!r}; {AGAIN}") from None

@@ -140,7 +140,7 @@ STAGE = Stage(
     after=(INGEST, "validate", "samples", "split"),
     after_reconstruction=(RECONSTRUCTION, "revalidate"),
     settings=(_describe_settings,),
-    version=6,
+    version=7,
     build=build,
     extra_inputs=_find_inputs,
 )

@@ -22,6 +22,7 @@ from tracklake.schemas.tensors import (
     INDEX_FILE,
     INDEX_KEYS,
     POSITION_STORAGES,
+    RECORDED_POSITIONS,
     STEPS_M,
     SUBSET_KEYS,
     TENSORS_VERSION,
@@ -65,6 +66,9 @@ def read_index(path: Path) -> dict[str, Any]:
     if not isinstance(index, dict) or index.get("version") != TENSORS_VERSION:
         found = index.get("version") if isinstance(index, dict) else type(index).__name__
         raise TensorError.at(file, f"expected version {TENSORS_VERSION} of tensors, got {found}")
+    for subset in index["subsets"] if isinstance(index.get("subsets"), list) else ():
+        if isinstance(subset, dict):
+            subset.setdefault("lateral_positions", RECORDED_POSITIONS)  # older tensors do not say
     _check_keys(file, index)
     _check_storage(file, index)
     return index

@@ -13,7 +13,7 @@ from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import PARTS, SEVERITIES
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.tensors import ARRAYS, NOMINAL_LANE_M, STEPS_M
+from tracklake.schemas.tensors import ARRAYS, LANE_CENTRES, NOMINAL_LANE_M, STEPS_M
 from tracklake.training.data.batches import Batch, SceneBatch
 from tracklake.training.data.checks import TensorError, map_arrays, read_index, read_protocol
 from tracklake.training.data.gathers import check_numbers, find_runs, gather_samples, gather_scenes
@@ -99,6 +99,11 @@ class TensorFolder:
     def centre_m(self) -> Floats:
         """(subsets, 2) the points that int16 positions are counted from."""
         return np.array([subset["centre_m"] for subset in self.index["subsets"]], dtype=np.float64).reshape(-1, 2)
+
+    @cached_property
+    def lane_centred(self) -> Flags:
+        """(subsets,) whether lateral positions are lane centres, so that errors across the road mean nothing."""
+        return np.array([own["lateral_positions"] == LANE_CENTRES for own in self.index["subsets"]], dtype=np.bool_)
 
     @cached_property
     def run_size_m(self) -> Singles:

@@ -167,6 +167,8 @@ def measure_errors(
     for what, sums in tally.sums.items():
         if not np.isfinite(sums).all():
             raise NotFiniteError(name, "densities" if what == "nll" else "positions")
+    subset = folder.run_subset[folder.runs_of(folder.sample_row[samples])]
+    tally.drop_lateral(strata.of_sample[folder.lane_centred[subset]])
     at = seconds if seconds is not None else [tick / protocol.rate_hz for tick in protocol.scored_ticks]
     return Evaluation(
         model=name,
@@ -195,17 +197,23 @@ def _list_vehicle_sums(folder: TensorFolder, samples: Integers, tally: Tally, se
         "nll_nats": "nll",
     }
     vehicles = subsets.with_columns(pl.Series("vehicle_id", folder.run_vehicle_id[run]))
-    return pl.concat(
-        vehicles.with_columns(
-            pl.lit(float(ahead)).alias("seconds"),
-            pl.Series("n", sums["n"][:, at], dtype=pl.Int64, strict=False),
-            *(
-                pl.Series(column, sums[name][:, at]) if name in sums else pl.lit(None, dtype=pl.Float64).alias(column)
-                for column, name in columns.items()
-            ),
+    return (
+        pl.concat(
+            vehicles.with_columns(
+                pl.lit(float(ahead)).alias("seconds"),
+                pl.Series("n", sums["n"][:, at], dtype=pl.Int64, strict=False),
+                *(
+                    pl.Series(column, sums[name][:, at])
+                    if name in sums
+                    else pl.lit(None, dtype=pl.Float64).alias(column)
+                    for column, name in columns.items()
+                ),
+            )
+            for at, ahead in enumerate(seconds)
         )
-        for at, ahead in enumerate(seconds)
-    ).filter(pl.col("n") > 0)
+        .fill_nan(None)
+        .filter(pl.col("n") > 0)
+    )
 
 
 def measure_latency(

@@ -166,6 +166,11 @@ class Tally:
             total = self.sums.setdefault(name, np.zeros(self._shape))
             total[present] += np.add.reduceat(values[order], first, axis=0)
 
+    def drop_lateral(self, stratum: Integers) -> None:
+        """Make the sums that depend on lateral positions NaN in some strata: those have lane centres in their place."""
+        for name in LATERAL_SUMS & self.sums.keys():
+            self.sums[name][stratum] = np.nan
+
     def score(self, seconds: Sequence[float], rate_hz: int) -> tuple[Score, ...]:
         """Compute the figures of every dataset, group and average at some horizons.
 
@@ -212,6 +217,8 @@ ROOTS = {
     "rmse_lateral_m": ("lateral2",),
 }
 """Figures that are roots of means, and the summands behind each."""
+LATERAL_SUMS = frozenset({"lateral2", "lateral", "distance", "average_distance", "nll"})
+"""Summands that depend on lateral positions."""
 MEANS = {
     "mae_m": "distance",
     "mae_longitudinal_m": "longitudinal",
@@ -244,7 +251,8 @@ def _score_group(
             figures: dict[str, float] = {}
             if total_n[at]:
                 roots = {name: float(np.sqrt(sum(means[own][at] for own in owns))) for name, owns in ROOTS.items()}
-                figures = roots | {name: float(means[own][at]) for name, own in MEANS.items() if own in means}
+                found = roots | {name: float(means[own][at]) for name, own in MEANS.items() if own in means}
+                figures = {name: value for name, value in found.items() if not np.isnan(value)}
             yield Score(dataset, group, average, float(ahead), int(total_n[at]), int(vehicles[at]), **figures)
 
 

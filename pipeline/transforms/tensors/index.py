@@ -10,7 +10,7 @@ import polars as pl
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.protocols import Protocol
-from tracklake.schemas.tensors import NOMINAL_LANE_M, TENSORS_VERSION
+from tracklake.schemas.tensors import LANE_CENTRES, NOMINAL_LANE_M, RECORDED_POSITIONS, TENSORS_VERSION
 
 
 def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[str, Any]:
@@ -26,6 +26,7 @@ def describe_subset(facts: Mapping[str, Any], tensors: SubsetTensors) -> dict[st
         "lane_markings_m": list(markings) if markings else None,
         "last_lane": last_lane,
         "width_m": float(markings[-1]) if markings else last_lane * NOMINAL_LANE_M,
+        "lateral_positions": LANE_CENTRES if "y_m" in facts.get("columns_missing", ()) else RECORDED_POSITIONS,
     }
 
 

@@ -6,6 +6,7 @@ import re
 from io import StringIO
 from unittest import mock
 
+import numpy as np
 import polars as pl
 import pytest
 from rich.console import Console
@@ -50,6 +51,20 @@ def test_scores_of_synthetic_data_say_so_and_have_no_published_rows(command, lak
     assert out.startswith("Synthetic data: all")
     assert "note: no published figures beside ngsim (us-101-20050615-093000: it is synthetic" in out
     assert "published [" not in out
+
+
+def test_lane_centres_are_announced_and_errors_along_the_road_shown(command, lake):
+    centred = property(lambda folder: np.ones(len(folder.index["subsets"]), dtype=bool))
+    with mock.patch("tracklake.training.data.tensor_folder.TensorFolder.lane_centred", centred):
+        models = ("constant-velocity", "ctrv", "--compare")
+        done = command.here("evaluate", *models, "--lake", lake.root, "--dataset", "ngsim")
+    assert done.code == 0, done.err
+    said = " ".join(done.out.split())
+    assert "difference of longitudinal RMSE, m" in said
+    assert "are lane centres: only errors along the road mean anything" in said
+    assert "longitudinal RMSE, m" in said
+    assert not any(line.startswith("RMSE, m") for line in done.out.splitlines())
+    assert "lateral RMSE" not in said
 
 
 @pytest.mark.usefixtures("comparable")

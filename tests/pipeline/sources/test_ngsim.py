@@ -20,6 +20,7 @@ from tracklake.pipeline.sources.ngsim import NGSIM
 from tracklake.pipeline.sources.ngsim_dialects import find_site, name_recording
 from tracklake.pipeline.sources.source import SourceError
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas.subsets import LANE_CENTRES
 
 PEACHTREE_1600 = 1163030300
 TWO = [
@@ -140,6 +141,29 @@ def test_columns_that_are_missing_are_null_and_named(tmp_path):
         "us-101-0750: the files have no accel_mps2, follower_id, gap_m, headway_recorded_m, lane, leader_id; those "
         "columns are null; no samples, split or tensors without lane"
     )
+
+
+@pytest.mark.parametrize(
+    ("rows", "last", "centred"),
+    [
+        ([(1, 1, 6), (1, 2, 18), (2, 2, 18)], 100, True),
+        ([(1, 1, 6), (1, 2, 18), (2, 2, 18)], 99, False),
+        ([(1, 1, 6), (2, 2, 18), (2, 2, 18)], 100, False),  # nobody changes lanes: all may have driven straight on
+        ([(1, 1, 6), (1, 2, 18), (2, 2, 18), (2, 2, 18.1)], 100, False),
+        ([(1, 2, 18), (1, 2, 18), (2, 2, 18)], 100, False),
+        ([(1, 1, 6), (1, 2, 18), (2, "", 18)], 100, True),
+    ],
+)
+def test_lane_centres_are_no_lateral_positions(tmp_path, rows, last, centred):
+    """Stretches of (vehicle, lane, Local_X in ft): with one position per lane, a change of lanes is a jump."""
+    each = ((frame, rows[frame * len(rows) // last]) for frame in range(last))
+    written = [ngsim_row(own, frame, Lane_ID=lane, Local_X=x) for frame, (own, lane, x) in each]
+    canonical = ngsim(tmp_path, as_csv(written))
+    (subset,) = canonical.subsets
+    found = subset.facts["columns_missing"].item().to_list()
+    assert [name for name in found if name in LANE_CENTRES] == (sorted(LANE_CENTRES) if centred else [])
+    assert any("lateral positions are lane centres" in note for note in canonical.notes) == centred
+    assert not any("y_m; those columns are null" in note for note in canonical.notes)
 
 
 def test_columns_of_no_meaning_may_be_unnamed_repeated_or_called_line(tmp_path):

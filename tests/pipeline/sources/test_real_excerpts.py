@@ -30,6 +30,19 @@ def read(tmp_path_factory):
     return lambda name: _read(folder / name, excerpt(name))
 
 
+def test_i80_as_coifman_and_li_tracked_it_has_lane_centres(read):
+    name = "../i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz"
+    found, (spilled,) = read(name)
+    assert (spilled.rows_read, spilled.rejects.height, list(found)) == (215_244, 0, ["i-80-1600"])
+    (subset,) = found["i-80-1600"].subsets
+    assert subset.vehicles.height == 2_283
+    assert "y_m" in subset.facts["columns_missing"].item()
+    (lanes,) = subset.tracks.select(pl.struct("lane", "y_m").n_unique()).row(0)
+    assert lanes == subset.tracks["lane"].n_unique() == 7
+    (us_101,) = read("us101_0750_290_vehicles.csv.gz")[0]["us-101-0750"].subsets
+    assert "y_m" not in us_101.facts["columns_missing"].item()
+
+
 @pytest.mark.parametrize(
     ("name", "rows", "recordings"),
     [

@@ -231,7 +231,10 @@ def test_scores_stand_beside_their_n(open_lake):
         {"model": "constant velocity", "part": "eval", "rows": [{"seconds": 1, "rmse_m": 0.731, "n": 12345}]},
         {"model": "LSTM", "part": "eval", "rows": [{"seconds": 5.0, "rmse_m": float("nan"), "n": 0}]},
     ]
+    centred = {"seconds": 1, "rmse_m": None, "rmse_longitudinal_m": 0.417, "n": 5}
+    scores.append({"model": "on lane centres", "part": "eval", "rows": [centred]})
     report = build_report(open_lake(), {}, scores=scores)
+    assert ">0.42 <small>along</small><" in report.html
     assert report.quality["model_scores"][1]["rows"] == [{"seconds": 5.0, "rmse_m": None, "n": 0}]
     assert ">0.73<" in report.html
     assert ">12,345<" in report.html

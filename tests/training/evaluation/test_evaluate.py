@@ -1,5 +1,6 @@
 """Errors derived by hand, constant velocity, and what an evaluation refuses."""
 
+import json
 import math
 import subprocess
 import sys
@@ -53,6 +54,48 @@ def two_samples(folder):
     samples = pl.concat([sample_at(1, 2, subset="b"), sample_at(2, 2, subset="b")])
     nothing = ("a", pl.DataFrame(schema=CLOCK), SAMPLES.empty(), NEIGHBORS.empty())
     return write(folder, [nothing, ("b", clock, samples, NEIGHBORS.empty())], BOTH)
+
+
+@pytest.mark.parametrize("stored", ["lane centres", "recorded", None])
+def test_lane_centres_leave_errors_along_the_road_alone(tmp_path, stored):
+    folder = two_samples(tmp_path / "tensors")
+    index = json.loads((folder / "index.json").read_text())
+    for subset in index["subsets"]:
+        assert subset.pop("lateral_positions") == "recorded"
+        subset |= {} if stored is None else {"lateral_positions": stored}  # older tensors do not say
+    (folder / "index.json").write_text(json.dumps(index))
+    result = evaluate("constant-velocity", folder, tmp_path / "models")
+    known = stored != "lane centres"
+    errors = VEHICLE_ERRORS.validate(result.to_vehicle_errors(), where="here")
+    for row in (*result.horizons, *errors.iter_rows(named=True)):
+        figures = row if isinstance(row, dict) else vars(row)
+        lateral = {name for name in figures if name.endswith(("_m", "_m2")) and "longitudinal" not in name}
+        assert len(lateral) in (2, 6)
+        assert {figures[name] is not None for name in lateral} == {known}
+    assert result.horizons[0].rmse_longitudinal_m == pytest.approx(3 / math.sqrt(2), rel=1e-6)
+    assert result.horizons[0].mae_longitudinal_m == pytest.approx(3 / 2, rel=1e-6)
+    assert errors["squared_longitudinal_m2"].sum() == pytest.approx(3**2, rel=1e-6)
+
+
+def test_lane_centres_of_one_recording_leave_those_of_others(tmp_path):
+    """Vehicle 1 of `b` is recorded and 3 m off along the road; vehicle 2 of `c` is at lane centres."""
+    past = [(-4.0, -1.0), (-2.0, -0.5), (0.0, 0.0)]
+    moved = track(1, [*past, (2.0, 0.5), (7.0, 5.0)]), track(2, [*past, (2.0, 0.5), (4.0, 2.0)])
+    tables = [
+        (subset, clock, sample_at(number, 2, subset=subset), NEIGHBORS.empty())
+        for number, (subset, clock) in enumerate(zip("bc", moved, strict=True), 1)
+    ]
+    parts = pl.concat([split_row("b", "eval"), split_row("c", "eval")])
+    folder = TensorFolder.open(write(tmp_path / "tensors", tables, parts))
+    folder.index["subsets"][1]["lateral_positions"] = "lane centres"
+    both, recorded, centred = (
+        evaluate("constant-velocity", own, tmp_path).horizons[0]
+        for own in (folder, folder.narrow(recording="b"), folder.narrow(recording="c"))
+    )
+    assert (both.rmse_m, both.n) == (None, 2)
+    assert both.rmse_longitudinal_m == pytest.approx(3 / math.sqrt(2), rel=1e-6)
+    assert (recorded.rmse_m, recorded.rmse_lateral_m) == (pytest.approx(5, rel=1e-6), pytest.approx(4, rel=1e-6))
+    assert (centred.rmse_m, centred.rmse_longitudinal_m) == (None, pytest.approx(0, abs=1e-6))
 
 
 def test_errors_of_constant_velocity_by_hand(tmp_path):

@@ -240,7 +240,7 @@ def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
     assert index["protocol"]["digest"] == P.digest
     unmarked = {
         "dataset": "highd", "subset": "a", "origin": "recorded", "frame_rate_hz": 25.0, "centre_m": [0, 0],
-        "lane_markings_m": None, "last_lane": 2, "width_m": 7.3152,
+        "lane_markings_m": None, "last_lane": 2, "width_m": 7.3152, "lateral_positions": "recorded",
     }  # fmt: skip
     assert index["subsets"][0] == unmarked
     assert index["subsets"][1] == unmarked | {
