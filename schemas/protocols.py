@@ -23,6 +23,9 @@ FILTERED_TRACKS: TracksFrom = "filtered"
 RECONSTRUCTED_TRACKS: TracksFrom = "reconstructed"
 """Names of the tracks as recorded, and of those with filtered and with reconstructed positions."""
 
+GRID_CELL_M = 4.572
+"""Length in m of a cell of the published 13 x 3 grid: 15 feet."""
+
 LAST_LANES = {"us-101": 6}
 """Highest lane by site in the script of convolutional social pooling, where lanes with higher numbers count as it."""
 
@@ -47,6 +50,7 @@ class Protocol:
         fold_lanes: whether lanes beyond LAST_LANES count as the last one, for maneuvers and neighbors.
         tracks_from: which tracks samples and positions are of: recorded, filtered by past entries alone, or
             reconstructed from all entries.
+        grid_cell_m: length of a cell of the grid of neighbors; it reaches six of them ahead and behind.
     """
 
     name: str
@@ -62,6 +66,7 @@ class Protocol:
     headline: Headline = "rmse"
     fold_lanes: bool = False
     tracks_from: TracksFrom = RECORDED
+    grid_cell_m: float = GRID_CELL_M
 
     @property
     def title(self) -> str:
@@ -105,9 +110,11 @@ class Protocol:
     @property
     def _parameters(self) -> dict[str, object]:
         """Parameters that are hashed: those that came later only where they are not as everything was before."""
-        before = {"fold_lanes": False, "tracks_from": RECORDED}
-        return {name: value for name, value in asdict(self).items() if name not in before or value != before[name]}
+        return {name: value for name, value in asdict(self).items() if name not in LATER or value != LATER[name]}
 
+
+LATER = {"fold_lanes": False, "tracks_from": RECORDED, "grid_cell_m": GRID_CELL_M}
+"""Parameters that protocols did not have at first, and what they were then."""
 
 CSP = Protocol(name="csp", fold_lanes=True)
 

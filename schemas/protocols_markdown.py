@@ -13,7 +13,8 @@ Derived from `schemas/protocols.py`; do not edit (`make docs` writes it).
 A protocol is a named recipe of sampling, split and metrics, hashed: two figures are comparable only where the
 digests of their protocols agree. `tracklake run SOURCE --protocol NAME` makes samples, split and tensors of it (the
 setting `protocol`, or TRACKLAKE_PROTOCOL); `train`, `evaluate` and `export` take the same flag. The settings
-`min_future_s`, `drop_error_findings`, `nearest`, `split` and `tracks_from` change a protocol, and its digest with it.
+`min_future_s`, `drop_error_findings`, `nearest`, `grid_cell_m`, `split` and `tracks_from` change a protocol, and its
+digest with it.
 `v2v-2021` is for drives: `tracklake onboard` uses it, `--protocol` does not take it.
 """
 

@@ -21,7 +21,7 @@ from tracklake.schemas.split_recipes import SPLIT_NAMES, TIME_BLOCKS, SplitName,
 from tracklake.schemas.text import suggest_name
 from tracklake.schemas.traffic import SAFETY_THRESHOLDS
 
-PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "split", "tracks_from")
+PROTOCOL_SETTINGS = ("min_future_s", "drop_error_findings", "nearest", "grid_cell_m", "split", "tracks_from")
 """Names of the settings that replace a protocol's own values."""
 
 
@@ -91,6 +91,13 @@ class DeclaredSettings(BaseModel):
     )
     nearest: int | None = Field(
         None, ge=0, le=100, description="nearest vehicles listed with each sample, 0 = none; none: the protocol's"
+    )
+    grid_cell_m: float | None = Field(
+        None,
+        ge=1,
+        le=100,
+        description="cell of the 13 x 3 grid of neighbors, m, which reaches six cells ahead and behind; none: the "
+        "protocol's",
     )
     validation_part: bool = Field(
         False,

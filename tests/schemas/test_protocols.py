@@ -20,6 +20,7 @@ CHANGED = {
     "headline": "mae",
     "fold_lanes": False,
     "tracks_from": "reconstructed",
+    "grid_cell_m": 9.144,
 }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from pydantic import FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError, 
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.errors import MORE_FILES, FileAccessError, TracklakeError
-from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.protocols import LATER, Protocol
 from tracklake.schemas.tensors import (
     ARRAYS,
     INDEX_FILE,
@@ -112,7 +112,7 @@ def _check_storage(file: Path, index: dict[str, Any]) -> None:
 def read_protocol(path: Path, index: dict[str, Any]) -> Protocol:
     """Read the protocol whose parameters, those of this version, the index holds with their digest."""
     file, digest = path / INDEX_FILE, index["protocol"].get("digest")
-    parameters: dict[str, Any] = {"tracks_from": "recorded"} | {  # tensors without it are older than that choice
+    parameters: dict[str, Any] = LATER | {  # tensors without one of them are older than that choice
         name: tuple(value) if isinstance(value, list) else value  # JSON has no tuples
         for name, value in index["protocol"].items()
         if name != "digest"

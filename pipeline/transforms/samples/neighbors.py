@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from tracklake.pipeline.transforms.samples.threads import map_in_threads
 from tracklake.schemas.arrays import Flags, Integers, find_run_starts
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.protocols import GRID_CELL_M
 from tracklake.schemas.samples import CELLS
 
 ROWS = 13
@@ -18,10 +19,6 @@ COLUMNS = CELLS // ROWS
 UNITS_PER_M = 10_000_000
 """Units of position per m. A millimetre and a thousandth of a foot are whole numbers of units, so that 'exclusive' and
 'half away from zero' are exact."""
-CELL_UNITS = 45_720_000
-"""Length of a cell in units: 4.572 m, 15 feet."""
-REACH_UNITS = 274_320_000
-"""Distance in units within which vehicles are neighbors: 27.432 m, 90 feet, exclusive."""
 CHUNK_ROWS = 1 << 15
 """Origins whose pairs are made at once; their arrays stay in the processor's cache."""
 
@@ -58,11 +55,13 @@ class _Line:
     stretch on either side of a tick's lanes.
 
     Args:
+        cell: length of a cell of the grid in units.
         position: (N,) index on the line of each row of the clock.
         beside: (N, 2) index of the first entry within reach in the left and in the right lane.
         within: (N, 4) number of entries within reach: in the left lane, behind, ahead, in the right lane.
     """
 
+    cell: int
     stretch: int
     location: Integers
     vehicle_id: NDArray[np.int32]
@@ -71,14 +70,14 @@ class _Line:
     within: NDArray[np.unsignedinteger]
 
 
-def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighborhood:
+def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None, *, cell_m: float = GRID_CELL_M) -> Neighborhood:
     """Find the neighbors of each origin and their cells in its 13 x 3 grid (DESIGN section 7).
 
-    A neighbor has an entry at the same tick, in the same or an adjacent lane, nearer than 27.432 m (90 ft, exclusive)
-    along the road. row = round(dx / 4.572 m) + 6, halves away from zero; cell = 13 * column + row, columns left, own,
-    right; row 12 is ahead. Of the vehicles in one cell, the nearest by abs(dx), then by id, keeps it. Then the others,
-    again the nearest first, move to the nearest free cell of their column; of two equally near cells to the one
-    towards which their dx points (ahead for dx = 0).
+    A neighbor has an entry at the same tick, in the same or an adjacent lane, nearer than six cells (27.432 m, 90 ft,
+    where `cell_m` is 4.572 m; exclusive) along the road. row = round(dx / cell_m) + 6, halves away from zero;
+    cell = 13 * column + row, columns left, own, right; row 12 is ahead. Of the vehicles in one cell, the nearest by
+    abs(dx), then by id, keeps it. Then the others, again the nearest first, move to the nearest free cell of their
+    column; of two equally near cells to the one towards which their dx points (ahead for dx = 0).
 
     The clock has vehicle_id, tick, x_m, lane: one row per (vehicle, tick), in any order. Entries without a lane neither
     are nor have neighbors. `origins` are (N,) flags, None = all; every row can be a neighbor.
@@ -89,12 +88,12 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighbo
     has_lane = clock["lane"].is_not_null()
     if not has_lane.all():
         wanted = has_lane.to_numpy() if origins is None else origins & has_lane.to_numpy()
-        return find_neighbors(clock.filter(has_lane), wanted[has_lane.to_numpy()])
+        return find_neighbors(clock.filter(has_lane), wanted[has_lane.to_numpy()], cell_m=cell_m)
     rows = np.arange(clock.height) if origins is None else np.flatnonzero(origins)
     if not rows.size:
         return Neighborhood(pl.DataFrame(schema=NEIGHBOR_DTYPES), collisions=0, crowded_out=0)
 
-    line = _build_line(clock)
+    line = _build_line(clock, cell_m)
     vehicle_id, tick = clock["vehicle_id"].to_numpy(), clock["tick"].to_numpy()
 
     def search_chunk(start: int) -> Neighborhood:
@@ -124,13 +123,13 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None) -> Neighbo
 
 
 def count_collisions(clock: pl.DataFrame) -> int:
-    """Count the vehicles whose cell is taken by a nearer one, in the grids of all entries.
+    """Count the vehicles whose cell is taken by a nearer one, in the grids of all entries, as published of 4.572 m.
 
     The clock has vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order.
     """
     if clock.is_empty():
         return 0
-    line = _build_line(clock)
+    line = _build_line(clock, GRID_CELL_M)
 
     def count_chunk(start: int) -> int:
         origins = np.arange(start, min(start + CHUNK_ROWS, clock.height), dtype=np.int32)
@@ -139,11 +138,13 @@ def count_collisions(clock: pl.DataFrame) -> int:
     return sum(map_in_threads(count_chunk, range(0, clock.height, CHUNK_ROWS)))
 
 
-def _build_line(clock: pl.DataFrame) -> _Line:
+def _build_line(clock: pl.DataFrame, cell_m: float) -> _Line:
     """Sort the entries by (tick, lane, x) and find which others each can reach."""
     x_m, lane, tick = clock["x_m"].to_numpy(), clock["lane"].to_numpy(), clock["tick"].to_numpy()
     lanes = int(lane.max()) - int(lane.min()) + 3
-    stretch = round((float(x_m.max()) - float(x_m.min())) * UNITS_PER_M) + REACH_UNITS + 2
+    cell = round(cell_m * UNITS_PER_M)
+    reach = ROWS // 2 * cell
+    stretch = round((float(x_m.max()) - float(x_m.min())) * UNITS_PER_M) + reach + 2
     if (int(tick.max()) - int(tick.min()) + 1) * lanes * stretch >= 1 << 62:
         raise TracklakeError(
             f"ticks {tick.min()} to {tick.max()}, lanes {lane.min()} to {lane.max()} and x_m {x_m.min()} to "
@@ -158,13 +159,13 @@ def _build_line(clock: pl.DataFrame) -> _Line:
     position = np.empty_like(order)
     position[order] = np.arange(order.size, dtype=np.int32)
     largest_scene = int(clock["tick"].value_counts()["count"].to_numpy().max())
-    beside, within = _find_reach(location, stretch, largest_scene)
+    beside, within = _find_reach(location, stretch, reach, largest_scene)
     vehicle_id = clock["vehicle_id"].to_numpy()[order]
-    return _Line(stretch, location, vehicle_id, position, beside, within)
+    return _Line(cell, stretch, location, vehicle_id, position, beside, within)
 
 
 def _find_reach(
-    location: Integers, stretch: int, largest_scene: int
+    location: Integers, stretch: int, reach: int, largest_scene: int
 ) -> tuple[NDArray[np.int32], NDArray[np.unsignedinteger]]:
     """Find `_Line.beside` and `_Line.within`, whose numbers are at most the size of the largest scene."""
     beside = np.empty((location.size, 2), np.int32)
@@ -173,13 +174,13 @@ def _find_reach(
     def search_chunk(start: int) -> None:
         chunk = slice(start, start + CHUNK_ROWS)
         # Only the part of the line that the chunk can reach is searched: it stays in the processor's cache.
-        far = stretch + REACH_UNITS
+        far = stretch + reach
         first, end = np.searchsorted(location, (location[chunk][0] - far, location[chunk][-1] + far))
         near = location[first:end]
         left, own, right = (
             (
-                first + np.searchsorted(near, alongside - REACH_UNITS, side="right"),
-                first + np.searchsorted(near, alongside + REACH_UNITS, side="left"),
+                first + np.searchsorted(near, alongside - reach, side="right"),
+                first + np.searchsorted(near, alongside + reach, side="left"),
             )
             for alongside in (location[chunk] - stretch, location[chunk], location[chunk] + stretch)
         )
@@ -228,7 +229,7 @@ def _find_pairs(line: _Line, at: NDArray[np.int32]) -> _Pairs:
     other = (starts - (np.cumsum(lengths) - lengths))[run] + np.arange(run.size)
     dx = line.location[other] - alongside[run]
     # Half a cell is added, less a unit behind where halves round down: floor(..) then counts cells from row 0.
-    row = (2 * dx + (ROWS * CELL_UNITS - (dx < 0))) // (2 * CELL_UNITS)
+    row = (2 * dx + (ROWS * line.cell - (dx < 0))) // (2 * line.cell)
     return _Pairs(run // 4, columns[run % 4], row.astype(np.int8), other, dx)
 
 

@@ -94,7 +94,8 @@ def draw_samples(
     nearest = find_nearest(clock, protocol.nearest, kept) if protocol.nearest else pl.lit(None)
     samples = samples.with_columns(nearest.alias("nearest"))
     clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
-    return _build_tables(clock.height, samples, drops, find_neighbors(clock, kept), all_collisions, names)
+    neighbors = find_neighbors(clock, kept, cell_m=protocol.grid_cell_m)
+    return _build_tables(clock.height, samples, drops, neighbors, all_collisions, names)
 
 
 def _count_all_collisions(tracks: pl.DataFrame, first_frame: int, frame_rate_hz: float) -> int | None:

@@ -87,7 +87,10 @@ def test_the_protocol_is_read_as_it_was_written(tmp_path):
         (lambda folder: (folder / INDEX_FILE).write_text("[]"), "expected version 5 of tensors, got list"),
         (change_index(version=1), "expected version 5 of tensors, got 1; run `tracklake tensors` again"),
         (drop_key, "index.json: lacks blocks, subsets: width_m; run"),
-        (change_index(protocol={"name": "x"}), "expected a protocol of drop_error_findings, .*, got name"),
+        (
+            change_index(protocol={"name": "x"}),
+            "expected a protocol of drop_error_findings, .*, got fold_lanes, grid_cell_m, name",
+        ),
         (change_index(storage="float16"), "expected storage float32 or .*, got 'float16'"),
         (change_index(max_error_m=[0.2, 0.0]), "rounding error along the road of at most 0.001 m for float32, got 0.2"),
         (lambda folder: (folder / "lane.npy").unlink(), "lane.npy: cannot be read"),

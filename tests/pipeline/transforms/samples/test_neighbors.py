@@ -13,7 +13,6 @@ from tracklake.pipeline.transforms.samples.neighbors import NEIGHBOR_DTYPES, cou
 from tracklake.schemas.errors import TracklakeError
 
 CELL_M = Fraction("4.572")
-REACH_M = Fraction("27.432")
 INT32_MAX = 2**31 - 1
 
 
@@ -170,7 +169,14 @@ def test_too_wide_a_span_is_refused():
         find_neighbors(clock)
 
 
-def slow_neighbors(entries):
+def test_a_longer_cell_reaches_farther_with_as_many_rows():
+    """30 feet, 9.144 m: 20 m are 2.19 cells, 54.863 m 5.9999; 54.864 m are no longer within reach."""
+    clock = make_clock([(1, 0, 100.0, 2), (2, 0, 120.0, 2), (3, 0, 154.863, 1), (4, 0, 45.136, 3), (5, 0, 45.137, 3)])
+    found = find_neighbors(clock, np.arange(5) == 0, cell_m=9.144).neighbors
+    assert dict(found.select("cell", "neighbor_id").iter_rows()) == {13 + 8: 2, 12: 3, 26: 5}
+
+
+def slow_neighbors(entries, cell_m=CELL_M):
     """One origin after the other, in exact arithmetic (x in thousandths)."""
     rows, collisions, crowded_out = [], 0, 0
     for vehicle, tick, x, lane in entries:
@@ -180,8 +186,8 @@ def slow_neighbors(entries):
                 dx = Fraction(other_x - x, 1000)
                 if (other, other_tick) == (vehicle, tick) or other_tick != tick or other_lane - lane != column - 1:
                     continue
-                if abs(dx) < REACH_M:
-                    half_up = int(abs(dx) / CELL_M + Fraction(1, 2))
+                if abs(dx) < 6 * cell_m:
+                    half_up = int(abs(dx) / cell_m + Fraction(1, 2))
                     home.append((abs(dx), other, 6 + (half_up if dx > 0 else -half_up), dx))
             home.sort()
             cells, movers = {}, []
@@ -216,21 +222,26 @@ ENTRIES = st.lists(
 
 
 @settings(max_examples=30, deadline=None)
-@given(ENTRIES, st.randoms(use_true_random=False), st.sampled_from([1, 3, 1 << 14]))
-def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_chunks(entries, random, chunk_rows):
-    expected, collisions, crowded_out = slow_neighbors(entries)
+@given(
+    ENTRIES,
+    st.randoms(use_true_random=False),
+    st.sampled_from([1, 3, 1 << 14]),
+    st.sampled_from(["4.572", "9.144", "1", "7.3"]),
+)
+def test_agrees_with_a_loop_over_origins_whatever_the_order_and_the_chunks(entries, random, chunk_rows, cell_m):
+    expected, collisions, crowded_out = slow_neighbors(entries, Fraction(cell_m))
     shuffled = list(entries)
     random.shuffle(shuffled)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "CHUNK_ROWS", chunk_rows)
         clock = make_clock([(v, t, x / 1000, lane) for v, t, x, lane in shuffled])
-        found, counted = find_neighbors(clock), count_collisions(clock)
+        found, counted = find_neighbors(clock, cell_m=float(cell_m)), count_collisions(clock)
     names = ("vehicle_id", "tick", "cell", "neighbor_id")
     rows = found.neighbors.sort("vehicle_id", "tick", "cell")
     assert rows.select(names).rows() == [row[:4] for row in expected]
     assert rows["dx_m"].to_list() == [float(np.float32(float(row[4]))) for row in expected]
     assert (found.collisions, found.crowded_out) == (collisions, crowded_out)
-    assert counted == collisions
+    assert counted == slow_neighbors(entries)[1]  # as published, whatever the cell
 
 
 @pytest.mark.parametrize("grain_mm", [1, 2_000])
