@@ -22,6 +22,7 @@ from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.train import DivergedError, TrainConfig, train
 
+LSTM = {"hidden": 16, "anchoring": "both"}
 FEW = TrainConfig(steps=9, log_steps=2)
 
 
@@ -64,7 +65,7 @@ def test_what_is_written_says_how_it_came_about(learned):
     folder, metrics, _ = learned
     assert json.loads((folder / "run" / "metrics.json").read_text()) == metrics
     config = json.loads((folder / "run" / "config.json").read_text())
-    assert (config["model"], config["parameters"], config["split"]) == ("lstm", {"hidden": 16}, "mine")
+    assert (config["model"], config["parameters"], config["split"]) == ("lstm", LSTM, "mine")
     assert config["train_subsets"] == ["highd/a"]
     assert config["protocol"]["digest"] == CSP.digest
     assert (config["training"]["steps"], config["training"]["seed"], config["training"]["epochs"]) == (60, 0, None)

@@ -19,6 +19,10 @@ MAX_PARAMETER = 2048
 AS_PUBLISHED = "as_published"
 """Parameter that sets others, so that a network's inputs, outputs and loss are those of its publication."""
 
+ANCHORING, RESIDUAL = "anchoring", "residual"
+"""Parameter that names the axes on which a network's outputs are counted from constant velocity, and its former name:
+`residual` true stands for `both`, false for `none`."""
+
 Reads = Literal["grid", "scene"]
 """Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
@@ -108,15 +112,22 @@ class Model:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Names that may be set, with their defaults: the parameters and, where there is one, `as_published`."""
-        return {**self.parameters, **({AS_PUBLISHED: False} if self.published else {})}
+        """Names that may be set, with their defaults: the parameters, and what sets them by other names."""
+        others = {AS_PUBLISHED: False} if self.published else {}
+        return {**self.parameters, **others, **({RESIDUAL: True} if ANCHORING in self.parameters else {})}
 
     def complete(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return what is given with the other parameters as published (`as_published`) or by default."""
-        if not self.published:
-            return {**self.parameters, **given}
         changes = dict(given)
-        as_published = changes.pop(AS_PUBLISHED, False)
+        if ANCHORING in self.parameters and RESIDUAL in changes:
+            residual = changes.pop(RESIDUAL)
+            _check_parameter(f"model `{self.name}`: parameter `{RESIDUAL}`", residual, bool)
+            if ANCHORING in changes:
+                raise UsageError(
+                    f"model `{self.name}`: `{RESIDUAL}` is the former name of `{ANCHORING}`; give one of them"
+                )
+            changes[ANCHORING] = "both" if residual else "none"
+        as_published = changes.pop(AS_PUBLISHED, False) if self.published else False
         _check_parameter(f"model `{self.name}`: parameter `{AS_PUBLISHED}`", as_published, bool)
         return {**self.parameters, **(self.published if as_published else {}), **changes}
 
@@ -149,14 +160,14 @@ KIM, CHOI = references.KIM.name, references.CHOI.name
 
 _SQUARED = (Phase("mse", 8),)
 _CONVOLUTIONAL = Recipe((Phase("mse", 5), Phase("nll", 3)))
-_RESIDUAL, _UNANCHORED = {"residual": True}, {"residual": False}
-_POOLING = {**_RESIDUAL, "short_histories": True, "maneuver_loss": "categorical"}
+_ANCHORED, _UNANCHORED = {ANCHORING: "both"}, {ANCHORING: "none"}
+_POOLING = {**_ANCHORED, "short_histories": True, "maneuver_loss": "categorical"}
 _ATTENTION = {
     "hidden": 128,
     "dropout": 0.7,
     "nll_weight": 1.0,
     "distance_weight": 1.0,
-    **_RESIDUAL,
+    **_ANCHORED,
     "inputs": "deviations",
     "sizes": True,
     "lanes": "adjacent",
@@ -197,7 +208,7 @@ _MODELS = (
         "",
         ".lstms",
         "DeviationLstm",
-        {"hidden": 48},
+        {"hidden": 48, **_ANCHORED},
         recipe=Recipe(_SQUARED, learning_rate=4e-3, optimizer="adamw", schedule="cosine", max_gradient_norm=5.0),
     ),
     Model(
@@ -206,7 +217,7 @@ _MODELS = (
         DEO,
         ".social_pooling",
         "VanillaLstm",
-        _RESIDUAL,
+        _ANCHORED,
         recipe=_CONVOLUTIONAL,
         published=_UNANCHORED,
         differs="metres instead of feet",
@@ -217,7 +228,7 @@ _MODELS = (
         CHOI,
         ".lstms",
         "StackedLstm",
-        {"hidden": 128, **_RESIDUAL},
+        {"hidden": 128, **_ANCHORED},
         recipe=Recipe(_SQUARED),
         published={"hidden": 256, **_UNANCHORED},
         differs="positions alone instead of twelve features",
@@ -228,7 +239,7 @@ _MODELS = (
         CHOI,
         ".lstms",
         "EncoderDecoder",
-        {**_RESIDUAL, "recursive": False},
+        {**_ANCHORED, "recursive": False},
         recipe=Recipe(_SQUARED, batch_size=100),
         published={**_UNANCHORED, "recursive": True},
         differs="positions alone instead of twelve features",

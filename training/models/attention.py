@@ -16,7 +16,7 @@ from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.models.constant_velocity import velocity_ticks
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
 from tracklake.training.models.inputs import NEAREST
-from tracklake.training.models.network import Network, check_choice, check_phase, to_numpy
+from tracklake.training.models.network import Network, check_choice, check_phase, find_anchored, to_numpy
 from tracklake.training.models.prediction import Prediction
 
 VEHICLE_WIDTH, LANE_WIDTH = 16, 4
@@ -136,7 +136,7 @@ class SceneAttention(Network):
 
     Differences: positions are given as last position, velocity and deviations (`describe_vehicles`) unless `inputs` is
     `positions`; of all lanes only those at the ego unless `lanes` is `all`; and means are counted from every vehicle's
-    own constant velocity unless `residual` is False; an untrained network predicts it.
+    own constant velocity, and an untrained network predicts it, unless `anchoring` is `none` (or one axis).
 
     Args:
         hidden: width of the hidden layers in the vehicle embedding and before the output; 0: none.
@@ -160,7 +160,7 @@ class SceneAttention(Network):
         dropout: float = 0.7,
         nll_weight: float = 1.0,
         distance_weight: float = 1.0,
-        residual: bool = True,
+        anchoring: str = "both",
         inputs: str = "deviations",
         sizes: bool = True,
         lanes: str = "adjacent",
@@ -180,10 +180,11 @@ class SceneAttention(Network):
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)
         self.nll_weight, self.distance_weight = nll_weight, distance_weight
-        self.residual = residual
         ahead = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)
         self.ahead: Tensor
         self.register_buffer("ahead", ahead, persistent=False)
+        self.anchored: Tensor
+        self.register_buffer("anchored", find_anchored(anchoring), persistent=False)
         encoded = 2 * VEHICLE_WIDTH
         common = partial(MultiHeadAttention, heads=heads, dropout=dropout)
         ticks = protocol.history_ticks
@@ -193,7 +194,7 @@ class SceneAttention(Network):
         self.lane_attention = common(VEHICLE_WIDTH, LANE_WIDTH, head_width=LANE_HEAD_WIDTH)
         self.decoder = common(encoded, encoded, head_width=VEHICLE_HEAD_WIDTH)
         self.out = perceptron(encoded, hidden, 5 * protocol.horizon_ticks)
-        if residual:
+        if anchoring != "none":
             for weights in self.out[-1].parameters():
                 nn.init.zeros_(weights)
 
@@ -202,9 +203,8 @@ class SceneAttention(Network):
         decoded, _, vehicles = self._attend(observed)
         raw = torch.unflatten(self.out(decoded), -1, (len(self.ahead), 5))
         mean, sigma, rho = to_gaussian(raw.masked_fill(~self.limit(observed).vehicle_mask[..., None, None], 0.0))
-        if self.residual:
-            mean = mean + vehicles.place_m[..., None, :] + vehicles.velocity[..., None, :] * self.ahead[:, None]
-        return mean, sigma, rho
+        place_m, velocity = vehicles.place_m * self.anchored, vehicles.velocity * self.anchored
+        return mean + place_m[..., None, :] + velocity[..., None, :] * self.ahead[:, None], sigma, rho
 
     def supervised(self, observed: ObservedScene[Tensor], truth: Truth[Tensor]) -> Tensor:
         """Return the known positions (B, V, F) of the vehicles that the training sees, or of the ego alone."""

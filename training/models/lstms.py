@@ -23,10 +23,11 @@ class DeviationLstm(PlaceNetwork):
     deviation, summed up over the ticks. The last layer starts at zero: an untrained network predicts constant velocity.
     """
 
-    def __init__(self, protocol: Protocol, *, hidden: int = 48) -> None:
+    def __init__(self, protocol: Protocol, *, hidden: int = 48, anchoring: str = "both") -> None:
         super().__init__()
         self.rate_hz = protocol.rate_hz
         self.ticks = velocity_ticks(protocol)
+        self.straight = Straight(protocol, anchoring=anchoring)
         self.steps = protocol.horizon_ticks
         self.encoder = nn.LSTM(6, hidden, batch_first=True)
         self.decoder = nn.LSTM(hidden, hidden, batch_first=True)
@@ -46,16 +47,16 @@ class DeviationLstm(PlaceNetwork):
         _, (state, cell) = self.encoder(features)
         encoding = state[-1][:, None, :].expand(-1, self.steps, -1)  # the encoding again at every step
         decoded, _ = self.decoder(encoding, (state, cell))  # (B, F, hidden)
-        ahead = torch.arange(1, self.steps + 1, device=history.device, dtype=history.dtype)
-        return velocity * ahead[:, None] + torch.cumsum(self.out(decoded), dim=1)
+        positions: Tensor = self.straight(history) + torch.cumsum(self.out(decoded), dim=1)
+        return positions
 
 
 class StackedLstm(PlaceNetwork):
     """Encodes H positions in m, and predicts F positions from its last state; as in Choi et al. 2021, but the width."""
 
-    def __init__(self, protocol: Protocol, *, hidden: int = 128, residual: bool = True) -> None:
+    def __init__(self, protocol: Protocol, *, hidden: int = 128, anchoring: str = "both") -> None:
         super().__init__()
-        self.straight = Straight(protocol, residual=residual)
+        self.straight = Straight(protocol, anchoring=anchoring)
         self.encoder = nn.LSTM(2, hidden, num_layers=2, batch_first=True)
         self.out = nn.Linear(hidden, protocol.horizon_ticks * 2)
 
@@ -75,10 +76,10 @@ class EncoderDecoder(PlaceNetwork):
     then runs step by step and carries early errors on.
     """
 
-    def __init__(self, protocol: Protocol, *, residual: bool = True, recursive: bool = False) -> None:
+    def __init__(self, protocol: Protocol, *, anchoring: str = "both", recursive: bool = False) -> None:
         super().__init__()
         self.steps = protocol.horizon_ticks
-        self.straight = Straight(protocol, residual=residual)
+        self.straight = Straight(protocol, anchoring=anchoring)
         self.embedding = nn.Linear(2, WIDTH)
         self.encoder = nn.LSTM(WIDTH, WIDTH, num_layers=2, batch_first=True)
         self.decoder = nn.LSTM(WIDTH, WIDTH, num_layers=2, batch_first=True)

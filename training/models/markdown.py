@@ -17,6 +17,10 @@ their parameters on the training part in one pass and writes a run, and `trackla
 Those without a recipe that are not fitted predict as they are. None is given the future or a true maneuver: `predict`
 gets `training.data.observed.Observed` (the sample and the neighbors in its grid) or `ObservedScene` (the sample and the
 vehicles nearest to it), and nothing else.
+
+`anchoring` names the axes on which a network's outputs are counted from constant velocity: `both`, `longitudinal`,
+`lateral` or `none`. On other axes they are counted from the last position, as published. `residual` is its former name:
+true stands for `both`, false for `none`.
 """
 
 _PUBLISHED = """\

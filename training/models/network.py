@@ -1,4 +1,4 @@
-"""The interface of the torch networks, what residual networks add to, and what their losses share."""
+"""The interface of the torch networks, what their outputs are added to, and what their losses share."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -15,6 +15,9 @@ from tracklake.training.models.constant_velocity import extrapolate, velocity_ti
 from tracklake.training.models.prediction import Prediction
 
 Result = TypeVar("Result")
+
+ANCHORINGS = {"both": (1.0, 1.0), "longitudinal": (1.0, 0.0), "lateral": (0.0, 1.0), "none": (0.0, 0.0)}
+"""Choices of the axes, along and across the road, on which outputs are counted from constant velocity."""
 
 
 class Network(nn.Module):
@@ -74,21 +77,28 @@ class PlaceNetwork(Network):
 class Straight(nn.Module):
     """The fixed positions that a network's outputs are added to; nothing in it is learned.
 
-    Residual: constant velocity, so that a network is left with braking, accelerating and changing lanes, and an error
-    of 1 % of the distance driven costs it nothing. Otherwise the sample's last position, as published.
+    On an axis that is anchored (see ANCHORINGS): constant velocity, so that a network is left with braking,
+    accelerating and changing lanes, and an error of 1 % of the distance driven costs it nothing. Otherwise the sample's
+    last position, as published.
     """
 
-    def __init__(self, protocol: Protocol, *, residual: bool) -> None:
+    def __init__(self, protocol: Protocol, *, anchoring: str) -> None:
         super().__init__()
         self.ticks = velocity_ticks(protocol)
         steps = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)[:, None]
         self.steps: Tensor
-        self.register_buffer("steps", steps if residual else torch.zeros_like(steps), persistent=False)
+        self.register_buffer("steps", steps * find_anchored(anchoring), persistent=False)  # (F, 2)
 
     def forward(self, history: Tensor) -> Tensor:
         """Return (..., F, 2) in m relative to the last position of histories (..., H, 2)."""
         positions: Tensor = extrapolate(history, self.ticks, self.steps)
         return positions
+
+
+def find_anchored(anchoring: str) -> Tensor:
+    """Return (2,) 1 for each axis, along and across the road, that is anchored, else 0."""
+    check_choice("anchoring", anchoring, tuple(ANCHORINGS))
+    return torch.tensor(ANCHORINGS[anchoring])
 
 
 def check_phase(phase: str, *known: str) -> None:

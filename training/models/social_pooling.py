@@ -35,10 +35,10 @@ class VanillaLstm(Network):
     2018), without the social tensor and its layers.
     """
 
-    def __init__(self, protocol: Protocol, *, residual: bool = True) -> None:
+    def __init__(self, protocol: Protocol, *, anchoring: str = "both") -> None:
         super().__init__()
         self.steps = protocol.horizon_ticks
-        self.straight = Straight(protocol, residual=residual)
+        self.straight = Straight(protocol, anchoring=anchoring)
         self.embedding = nn.Linear(2, 32)
         self.encoder = nn.LSTM(32, 64, batch_first=True)
         self.dynamics = nn.Linear(64, 32)
@@ -79,8 +79,8 @@ class SocialPooling(Network):
     Differences from the published code: metres, with the axis along the road first; a neighbor with a short history is
     encoded with its earliest known position repeated, where the published reader leaves its cell empty, unless
     `short_histories` is False; the cross-entropies are those of one class out of several, where it averages one binary
-    entropy per class, unless `maneuver_loss` is `binary`; means are counted from constant velocity, unless `residual`
-    is False.
+    entropy per class, unless `maneuver_loss` is `binary`; means are counted from constant velocity, unless `anchoring`
+    is `none` (or from it on one axis only).
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class SocialPooling(Network):
         protocol: Protocol,
         *,
         maneuvers: bool,
-        residual: bool = True,
+        anchoring: str = "both",
         short_histories: bool = True,
         maneuver_loss: str = "categorical",
     ) -> None:
@@ -97,7 +97,7 @@ class SocialPooling(Network):
         self.short_histories, self.binary = short_histories, maneuver_loss == "binary"
         self.steps = protocol.horizon_ticks
         self.maneuvers = maneuvers
-        self.straight = Straight(protocol, residual=residual)
+        self.straight = Straight(protocol, anchoring=anchoring)
         self.ip_emb = nn.Linear(2, 32)
         self.enc_lstm = nn.LSTM(32, 64)
         self.dyn_emb = nn.Linear(64, 32)

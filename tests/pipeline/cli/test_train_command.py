@@ -26,7 +26,7 @@ def test_options_come_to_the_training(command, lake, models):
     assert (metrics["steps"], metrics["samples_seen"]) == (3, 70)
     assert 0 < metrics["data_share"] < 1
     config = json.loads((models / "small" / "config.json").read_text())
-    assert config["parameters"] == {"hidden": 8}
+    assert config["parameters"] == {"hidden": 8, "anchoring": "both"}
     assert config["training"]["seed"] == 3
     recipe = config["recipe"]
     assert (recipe["batch_size"], recipe["learning_rate"], recipe["optimizer"]) == (32, 1.0, "adam")

@@ -107,6 +107,18 @@ def test_equals_a_slow_restatement(heads, hidden, residual, protocol):
             close(fast[:, there][:, :, keys], np.array(expected).reshape(heads, len(there), len(keys)), atol=1e-5)
 
 
+def test_anchoring_adds_constant_velocity_on_its_axes_to_every_vehicle():
+    observed, _ = wander(3, 3, 5)
+    free, both, *one = (
+        build(2, anchoring=anchoring).predict_scene(observed).mean_m
+        for anchoring in ("none", "both", "longitudinal", "lateral")
+    )
+    assert np.abs(both - free).max() > 5
+    for axis, anchored in enumerate(one):
+        close(anchored[..., axis], both[..., axis])
+        close(anchored[..., 1 - axis], free[..., 1 - axis])
+
+
 def test_raw_positions_equal_a_slow_restatement():
     observed, _ = wander(6, 3, 5)
     network = build(2, inputs="positions", residual=False)

@@ -16,7 +16,6 @@ from tracklake.training.models import MODELS, find_model
 from tracklake.training.models.network import Straight
 
 LONE = ("lstm", "v-lstm", "stacked-lstm", "lstm-encoder-decoder")
-RESIDUAL = tuple(name for name in LONE if "residual" in MODELS[name].parameters)
 PHASES = [(name, phase.loss) for name in LONE for phase in MODELS[name].recipe.phases]
 PROTOCOLS = (CSP, TWO_SECONDS)
 H, F = CSP.history_ticks, CSP.horizon_ticks
@@ -91,11 +90,11 @@ def test_every_sample_for_itself(seed, name):
 def test_straight_is_constant_velocity_or_nothing(protocol):
     history, _ = wander(np.random.default_rng(4), protocol, 6)
     plain = find_model("constant-velocity").build(protocol).predict(observe(history)).position_m
-    straight = Straight(protocol, residual=True)
+    straight = Straight(protocol, anchoring="both")
     np.testing.assert_array_equal(straight(torch.from_numpy(history)), plain)
     scene = torch.from_numpy(history).unflatten(0, (2, 3))  # vehicles of scenes
     np.testing.assert_array_equal(straight(scene), plain.reshape(2, 3, protocol.horizon_ticks, 2))
-    nothing = Straight(protocol, residual=False)(torch.from_numpy(history))
+    nothing = Straight(protocol, anchoring="none")(torch.from_numpy(history))
     np.testing.assert_array_equal(nothing, np.zeros_like(plain))
 
 
@@ -103,20 +102,36 @@ def test_straight_takes_two_ticks_at_ten_hertz():
     """x = 0, 1, 3 in the last 0.2 s: 1.5 a tick."""
     history = torch.full((1, TWO_SECONDS.history_ticks, 2), 1e6)
     history[0, -3:] = torch.tensor([[-3.0, 0.5], [-2.0, 7.0], [0.0, 0.0]])
-    places = Straight(TWO_SECONDS, residual=True)(history)[0]
+    places = Straight(TWO_SECONDS, anchoring="both")(history)[0]
     assert places[:2].tolist() == [[1.5, -0.25], [3.0, -0.5]]
 
 
-@pytest.mark.parametrize("name", RESIDUAL)
-def test_residual_shifts_the_places_and_nothing_else(name):
+@pytest.mark.parametrize("name", LONE)
+def test_anchoring_shifts_the_places_on_its_axes_and_nothing_else(name):
     history, _ = wander(np.random.default_rng(5), CSP, 4)
     plain = find_model("constant-velocity").build(CSP).predict(observe(history)).position_m
-    placed, shifted = (build(name, residual=residual).predict(observe(history)) for residual in (False, True))
-    np.testing.assert_allclose(shifted.position_m, placed.position_m + plain, atol=1e-4)
-    assert np.abs(placed.position_m).max() < 5  # untrained, it places next to nothing
-    if placed.density is not None:
-        np.testing.assert_array_equal(shifted.density.sigma_m, placed.density.sigma_m)
-        np.testing.assert_array_equal(shifted.density.correlation, placed.density.correlation)
+    free = build(name, anchoring="none").predict(observe(history))
+    assert np.abs(free.position_m).max() < 5  # untrained, it places next to nothing
+    for anchoring, axes in (("both", (1, 1)), ("longitudinal", (1, 0)), ("lateral", (0, 1))):
+        shifted = build(name, anchoring=anchoring).predict(observe(history))
+        np.testing.assert_allclose(shifted.position_m, free.position_m + plain * axes, atol=1e-4)
+        if free.density is not None:
+            np.testing.assert_array_equal(shifted.density.sigma_m, free.density.sigma_m)
+            np.testing.assert_array_equal(shifted.density.correlation, free.density.correlation)
+
+
+@pytest.mark.parametrize("name", [name for name, model in MODELS.items() if "anchoring" in model.parameters])
+def test_residual_is_the_former_name_of_anchoring(name):
+    model = MODELS[name]
+    assert [model.complete({"residual": own})["anchoring"] for own in (True, False)] == ["both", "none"]
+    assert "residual" not in model.complete({"residual": True})
+    for chosen, expected in (
+        ({"residual": "yes"}, "`residual`: expected bool"),
+        ({"residual": True, "anchoring": "both"}, "give one of them"),
+        ({"anchoring": "sideways"}, "`anchoring`: expected one of both, longitudinal, lateral, none, got 'sideways'"),
+    ):
+        with pytest.raises(UsageError, match=expected):
+            build(name, **chosen)
 
 
 def test_the_lstm_is_at_first_constant_velocity():
@@ -220,11 +235,11 @@ def test_recursive_decoder_is_its_description(residual):
 
 def test_as_published_sets_the_parameters_of_the_publication():
     published = {
-        "v-lstm": {"residual": False},
-        "stacked-lstm": {"residual": False, "hidden": 256},
-        "lstm-encoder-decoder": {"residual": False, "recursive": True},
+        "v-lstm": {"anchoring": "none"},
+        "stacked-lstm": {"anchoring": "none", "hidden": 256},
+        "lstm-encoder-decoder": {"anchoring": "none", "recursive": True},
         "cs-lstm-m": {
-            "residual": False,
+            "anchoring": "none",
             "short_histories": False,
             "maneuver_loss": "binary",
             "maneuvers": True,
@@ -234,9 +249,9 @@ def test_as_published_sets_the_parameters_of_the_publication():
         model = MODELS[name]
         assert model.complete({"as_published": True}) == expected
         assert model.complete({}) == model.complete({"as_published": False}) == dict(model.parameters)
-        assert model.settings == {**model.parameters, "as_published": False}
+        assert model.settings == {**model.parameters, "as_published": False, "residual": True}
     mixed = MODELS["stacked-lstm"].complete({"as_published": True, "hidden": 64})
-    assert mixed == {"residual": False, "hidden": 64}, "what is given itself counts"
+    assert mixed == {"anchoring": "none", "hidden": 64}, "what is given itself counts"
     assert sum(each.numel() for each in build("stacked-lstm", as_published=True).parameters()) == (
         lstm(2, 256) + lstm(256, 256) + linear(256, 25 * 2)
     )
