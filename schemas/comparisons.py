@@ -72,3 +72,99 @@ COMPARISONS = Table(
         "high": _figure("upper end of it; the models differ where 0 lies outside"),
     },
 )
+
+DENSITY_CLASSES = {
+    "0 to 7": (0.0, 7.0),
+    "7 to 11": (7.0, 11.0),
+    "11 to 16": (11.0, 16.0),
+    "16 to 22": (16.0, 22.0),
+    "22 to 28": (22.0, 28.0),
+    "28 or more": (28.0, float("inf")),
+}
+"""Classes of traffic density in vehicles per km of lane: levels of service A to F of freeways (Highway Capacity Manual
+2000, exhibit 23-2)."""
+ALL_DENSITIES = "all"
+"""Name of the class that holds all samples."""
+
+_RUN = {"run": column(pl.String, "name of the run or model")}
+_SECONDS = {"seconds": column(pl.Float64, "ahead of the sample", unit="s", gt=0)}
+_COUNTS = {
+    "n": column(pl.Int64, "samples whose position is known then", ge=0),
+    "vehicles": column(pl.Int64, "vehicles that they are of", ge=0),
+}
+_DENSITY = {
+    "density": column(
+        pl.String,
+        "class of traffic density: vehicles per km of lane at the moment of prediction, or all",
+        isin=(ALL_DENSITIES, *DENSITY_CLASSES),
+    )
+}
+
+
+def _share(description: str, *, nullable: bool = False) -> Column:
+    """Declare a column of shares."""
+    return column(pl.Float64, description, nullable=nullable, ge=0, le=1)
+
+
+def _metres(description: str, *, nullable: bool = True) -> Column:
+    """Declare a column of distances."""
+    return column(pl.Float64, description, unit="m", nullable=nullable, ge=0)
+
+
+_BOUNDS = {
+    "low": _share("lower end of the coverage's 95 % interval over vehicles; null: of one vehicle", nullable=True),
+    "high": _share("upper end of it", nullable=True),
+}
+
+CALIBRATION = Table(
+    "calibration",
+    "One row per run, horizon and probability: how many true positions lie in the region that is said to hold them.",
+    key=("run", "seconds", "level"),
+    partition=(),
+    columns={
+        **_RUN,
+        **_SECONDS,
+        "level": _share("probability of the region: the smallest one of the predicted density, with all alternatives"),
+        **_COUNTS,
+        "coverage": _share("share of true positions in it; equal to `level` where the model is calibrated"),
+        **_BOUNDS,
+    },
+)
+
+DENSITY_ERRORS = Table(
+    "density_errors",
+    "One row per run, class of traffic density and horizon: the error beside the predicted standard deviation.",
+    key=("run", "density", "seconds"),
+    partition=(),
+    columns={
+        **_RUN,
+        **_DENSITY,
+        **_SECONDS,
+        **_COUNTS,
+        "mean_density_vpkm": column(pl.Float64, "mean density of the samples", unit="veh/km", nullable=True, ge=0),
+        "rmse_longitudinal_m": _metres("as in `evaluations`"),
+        "sigma_longitudinal_m": _metres(
+            "root of the mean predicted variance along the road; null: no density is given"
+        ),
+        "rmse_lateral_m": _metres("as in `evaluations`"),
+        "sigma_lateral_m": _metres("the same across it"),
+    },
+)
+
+CONFORMAL_RADII = Table(
+    "conformal_radii",
+    "One row per run, class of traffic density, horizon and share: the radius around the prediction that holds it.",
+    key=("run", "density", "seconds", "level"),
+    partition=(),
+    columns={
+        **_RUN,
+        **_DENSITY,
+        **_SECONDS,
+        "level": _share("share of true positions that the radius is to hold"),
+        "calibration_n": column(pl.Int64, "samples, of half of the vehicles, that the radius is taken from", ge=0),
+        "radius_m": _metres("the radius; null: of too few samples"),
+        **_COUNTS,
+        "coverage": _share("share of the n samples, of the other vehicles, within it", nullable=True),
+        **_BOUNDS,
+    },
+)

@@ -1,6 +1,6 @@
 """`tracklake evaluate`: runs and models scored on one part, written as a table, beside published figures."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from io import BytesIO
 from pathlib import Path
@@ -12,7 +12,7 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.evidence import show_comparisons
+from tracklake.pipeline.cli.evidence import show_evidence
 from tracklake.pipeline.cli.options import (
     JsonOption,
     LakeOption,
@@ -36,6 +36,7 @@ from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
+from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
 from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
@@ -91,6 +92,17 @@ CompareOption = Annotated[
     bool,
     typer.Option("--compare", help="Compare the first of RUNS with the others: differences with 95 % intervals."),
 ]
+CalibrationOption = Annotated[
+    bool,
+    typer.Option(
+        "--calibration",
+        help="Show how far predicted regions hold the truth, and sigma, errors and conformal radii by traffic density.",
+    ),
+]
+EvidenceOption = Annotated[
+    Path | None,
+    typer.Option("--evidence", metavar="DIR", help="Write the tables and plots of --compare and --calibration to DIR."),
+]
 EveryTickOption = Annotated[
     bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
 ]
@@ -111,6 +123,8 @@ def evaluate(
     gain: GainOption = None,
     vehicle_errors: VehicleErrorsOption = None,
     compare: CompareOption = False,
+    calibration: CalibrationOption = False,
+    evidence: EvidenceOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -125,7 +139,10 @@ def evaluate(
             raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
         if vehicle_errors is not None and vehicle_errors.suffix != ".parquet":
             raise typer.BadParameter(f"--vehicle-errors ends with .parquet; got {vehicle_errors}")
+        if evidence is not None and not (compare or calibration):
+            raise typer.BadParameter("--evidence writes what --compare and --calibration find: give one of them")
         refuse_lake(out)
+        refuse_lake(evidence, "--evidence")
         refuse_lake(vehicle_errors, "--vehicle-errors")
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
@@ -133,12 +150,13 @@ def evaluate(
         around = NEAREST if nearest is None else nearest
         plain = part == "eval" and around == NEAREST and published and not every_tick and tensors.kept is None
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
-        for file in filter(None, (target, vehicle_errors)):
+        for file in filter(None, (target, vehicle_errors, evidence and evidence / "comparisons.csv")):
             with explain_file_errors(file.parent):
                 file.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
         names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in finished_runs(root))])
+        records = {name: SampleRecord(tensors, part) for name in names} if calibration else {}
         found = _evaluate_all(
-            terminal, names, tensors, root / MODELS, part, around, every_tick=every_tick, strict=bool(runs)
+            terminal, names, tensors, root / MODELS, part, around, records, every_tick=every_tick, strict=bool(runs)
         )
         table = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
         comparable = print_comparability(terminal, root, tensors, published=published)
@@ -154,7 +172,7 @@ def evaluate(
             terminal.print_line(describe_causality(tracks_from), style="dim")
             if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:
                 gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
-        compared = show_comparisons(terminal, found) if compare else None
+        tables = show_evidence(terminal, tensors, found, records, compare=compare, out=evidence)
         if vehicle_errors is not None:
             errors = pl.concat([VEHICLE_ERRORS.empty(), *(own.to_vehicle_errors() for own in found)])
             _write_table(vehicle_errors, VEHICLE_ERRORS.validate(errors.sort(VEHICLE_ERRORS.key), where="evaluate"))
@@ -168,7 +186,7 @@ def evaluate(
             )
         rows = table.to_dicts()
         shown = {"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target}
-        further = {"smoothing_gain": gains, "comparisons": compared}
+        further = {"smoothing_gain": gains, **tables}
         terminal.print_json(shown | {name: own.to_dicts() for name, own in further.items() if own is not None})
 
 
@@ -179,6 +197,7 @@ def _evaluate_all(
     models: Path,
     part: str,
     nearest: int,
+    records: Mapping[str, SampleRecord],
     *,
     every_tick: bool,
     strict: bool,
@@ -186,9 +205,19 @@ def _evaluate_all(
     """Score runs and models; a run that does not fit the tensors is skipped, or refused with `strict`."""
     found = []
     for name in names:
+        observe = records[name].observe if name in records else None
         try:
             found.append(
-                evaluate_model(name, tensors, models, part, nearest=nearest, with_latency=True, every_tick=every_tick)
+                evaluate_model(
+                    name,
+                    tensors,
+                    models,
+                    part,
+                    nearest=nearest,
+                    with_latency=True,
+                    every_tick=every_tick,
+                    observe=observe,
+                )
             )
         except (StaleRunError, NotFiniteError, MissingExtraError) as error:
             if strict:

@@ -190,3 +190,17 @@ def find_quantile(freedom: float) -> float:
     density = np.cos(angle) ** (freedom - 1)
     below = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
     return float(np.sqrt(freedom) * np.tan(np.interp(CONFIDENCE * below[-1], below, angle)))
+
+
+def bound_shares(hits: Floats, n: Floats) -> tuple[Floats, Floats]:
+    """Find the 95 % intervals of shares from counts (V, K) of vehicles: low and high (K,), NaN with fewer than two.
+
+    The variance is that of a ratio of sums over independent vehicles (Cochran 1977, Sampling Techniques, section 6.4).
+    """
+    total = n.sum(axis=0)
+    share = hits.sum(axis=0) / np.maximum(total, 1)
+    vehicles = (n > 0).sum(axis=0)
+    squares = ((hits - share * n) ** 2).sum(axis=0) * vehicles / np.maximum(vehicles - 1, 1)
+    quantile = [find_quantile(max(int(count) - 1, 1)) for count in vehicles]
+    half = np.where(vehicles > 1, quantile * np.sqrt(squares) / np.maximum(total, 1), np.nan)
+    return np.maximum(share - half, 0.0), np.minimum(share + half, 1.0)

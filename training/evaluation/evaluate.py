@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.origin import DataOrigin, summarise_origins
 from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
 from tracklake.training.evaluation.scores import Score, Tally, find_strata
 from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.fitting import Fit
 from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
-from tracklake.training.models.prediction import NotFiniteError
+from tracklake.training.models.prediction import NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import open_forecaster
 
 BATCH_SIZE = 256
@@ -31,6 +32,10 @@ the cache, and it takes nearly twice as long."""
 
 LATENCY_MOMENTS = 20
 """Number of moments that the median time is taken of."""
+
+
+Observer = Callable[[slice, Prediction, Truth[Any]], None]
+"""Function of the batches of an evaluation: which of the part's samples, their prediction, and their truth."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +112,13 @@ def evaluate(
     nearest: int = NEAREST,
     with_latency: bool = False,
     every_tick: bool = False,
+    observe: Observer | None = None,
 ) -> Evaluation:
     """Evaluate a trained run, or a model that is no network.
 
     `name` is a run's folder in `models`, or a model that is no network; `tensors` their folder, or the folder opened
-    (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles
-    around the ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon.
+    (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles around the ego in a scene.
+    Scores are of the protocol's seconds, or of every tick of the horizon. `observe` is called with every batch.
 
     Raises:
         TensorError: the tensors are missing or damaged.
@@ -122,7 +128,9 @@ def evaluate(
     own = open_forecaster(name, folder, Path(models), frozenset({part}))
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
-    found = measure_errors(own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds)
+    found = measure_errors(
+        own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds, observe=observe
+    )
     found = replace(found, run=own.config, fit=own.fit)
     if with_latency:
         latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
@@ -139,6 +147,7 @@ def measure_errors(
     reads: Reads = "grid",
     nearest: int = NEAREST,
     seconds: Sequence[float] | None = None,
+    observe: Observer | None = None,
 ) -> Evaluation:
     """Predict every sample of a part and sum up the errors, after `refuse_future`.
 
@@ -163,7 +172,10 @@ def measure_errors(
     for start in range(0, len(samples), BATCH_SIZE):
         chosen = slice(start, start + BATCH_SIZE)
         observed, truth = read_samples(folder, samples[chosen], reads, nearest=nearest)
-        tally.add(strata.of_sample[chosen], predictor.predict(observed), truth_of_ego(truth))
+        prediction, own_truth = predictor.predict(observed), truth_of_ego(truth)
+        tally.add(strata.of_sample[chosen], prediction, own_truth)
+        if observe is not None:
+            observe(chosen, prediction, own_truth)
     for what, sums in tally.sums.items():
         if not np.isfinite(sums).all():
             raise NotFiniteError(name, "densities" if what == "nll" else "positions")

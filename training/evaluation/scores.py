@@ -82,9 +82,7 @@ class Strata:
 
 def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     """Group samples (S_part,) by vehicle, maneuvers and findings; a vehicle in several runs counts once."""
-    run = folder.runs_of(folder.sample_row[samples])
-    subset = folder.run_subset[run].astype(np.int64)
-    vehicle = np.unique((subset << 32) | folder.run_vehicle_id[run], return_inverse=True)[1]
+    subset, vehicle = find_vehicles(folder, samples)
     findings = np.sum([folder.mark_flagged(samples, severity) for severity in FINDING_GROUPS], axis=0)
     keys = (vehicle, folder.sample_lateral[samples], folder.sample_longitudinal[samples], findings)
     counts = (1 + len(samples), len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS), 1 + len(FINDING_GROUPS))
@@ -93,6 +91,13 @@ def find_strata(folder: TensorFolder, samples: Integers) -> Strata:
     datasets, dataset = np.unique(names[subset[first]], return_inverse=True)
     vehicle, lateral, longitudinal, findings = (key[first].astype(np.int64) for key in keys)
     return Strata(of_sample, vehicle, dataset, lateral, longitudinal, findings, tuple(datasets.tolist()))
+
+
+def find_vehicles(folder: TensorFolder, samples: Integers) -> tuple[Integers, Integers]:
+    """Find the subset of each sample and its vehicle, counted from 0: (S_part,) each."""
+    run = folder.runs_of(folder.sample_row[samples])
+    subset = folder.run_subset[run].astype(np.int64)
+    return subset, np.unique((subset << 32) | folder.run_vehicle_id[run], return_inverse=True)[1]
 
 
 def find_nll(density: Density, future: Singles) -> Floats:
