@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from study.__main__ import main, run_arms
-from study.jobs import SCORES, Job, Lake, Workshop, list_jobs
+from study.jobs import SCORES, Job, Lake, Workshop
 from study.page import render_pages
 from study.plan import PIECES, Arm, Learner, Source, estimate_piece, make_quick
 from study.results import Results, UnprovenError, judge
@@ -82,12 +82,19 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
         assert row["eval"] == index["samples_by_part"]["eval"] > 0
     assert stated[0]["split_digest"] != stated[1]["split_digest"]
     # Of all folds, and as the commands' own tables have it: 1 s ahead, by the slow way.
-    jobs = [job for job in list_jobs(lakes) if job.model == "lstm" and job.seed == 1]
+    jobs = [job for job in workshop.list_jobs(TINY) if job.model == "lstm" and job.seed == 1]
     rows = [pl.read_csv(job.scores / SCORES).row(0, named=True) for job in jobs]
     rmse = (sum(row["n"] * row["rmse_m"] ** 2 for row in rows) / sum(row["n"] for row in rows)) ** 0.5
     assert {row["seconds"] for row in rows} == {1.0}
     assert seeds.filter(model="lstm", seed=1, seconds=1.0)["rmse_m"].to_list() == pytest.approx([rmse], abs=1e-5)
-    found = read_table(docs, "comparisons").filter(figure="rmse_m", seconds=1.0, dataset="all").row(0, named=True)
+    compared = read_table(docs, "comparisons").filter(figure="rmse_m", seconds=1.0, dataset="all")
+    assert compared.select("model", "against").rows() == [
+        ("constant-velocity", "-"),
+        ("lstm", "-"),
+        ("lstm", "constant-velocity"),
+    ]
+    found = compared.row(2, named=True)
+    assert found["difference"] == pytest.approx(compared["difference"][1] - compared["difference"][0], abs=2e-5)
     assert found["a_value"] == pytest.approx(seeds.filter(model="lstm", seconds=1.0)["rmse_m"].mean(), abs=1e-4)
     assert found["low"] <= found["difference"] <= found["high"]
 
@@ -98,7 +105,7 @@ def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tin
     run_arms([TINY], workshop, docs, only_gather=False)
     assert calls == ["run", "run"]
     more = replace(TINY, learners=(replace(TINY.learners[0], seeds=3),))
-    jobs = list(list_jobs(workshop.find_lakes(more)))
+    jobs = list(workshop.list_jobs(more))
     assert [(job.model, job.seed, job.lake.fold) for job in jobs if not job.scores.exists()] == [
         ("lstm", 2, 0),
         ("lstm", 2, 1),

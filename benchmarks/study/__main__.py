@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from study.jobs import ROOT, Workshop, list_jobs
+from study.jobs import ROOT, Workshop
 from study.page import write_pages
 from study.plan import PIECES, Arm, Piece, estimate_piece, make_quick
 from study.tables import update_tables
@@ -48,14 +48,12 @@ def run_arms(arms: Sequence[Arm], workshop: Workshop, docs: Path, *, only_gather
     for arm in arms:
         if not workshop.has(arm.source):
             print(f"{arm.name} left out: {workshop.data / arm.source.file} is not there; --data names its folder")
-    found = [lake for arm in arms for lake in workshop.find_lakes(arm)]
     if not only_gather:
-        found = [workshop.make_lake(lake) for lake in found]
-        workshop.work_on(list_jobs(found))
+        for lake in {root: lake for arm in arms for root, lake in workshop.list_lakes(arm).items()}.values():
+            workshop.make_lake(lake)
+        workshop.work_on(job for arm in arms for job in workshop.list_jobs(arm))
     for arm in arms:
-        lakes = [lake for lake in found if lake.arm == arm and lake.index is not None]
-        if lakes:
-            update_tables(docs, arm, lakes, list(list_jobs(lakes)))
+        update_tables(docs, arm, list(workshop.list_jobs(arm)))
 
 
 def print_plan(pieces: Sequence[Piece]) -> None:

@@ -22,13 +22,15 @@ import polars as pl
 from study.plan import Arm, Learner, Source, estimate_run
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS, TENSORS
-from tracklake.schemas.tensors import INDEX_FILE
+from tracklake.schemas.tensors import INDEX_FILE, RECORDED_POSITIONS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.runs.run_folder import digest_tensors
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTES, SCORES, VEHICLES = "jobs.csv", "scores.csv", "vehicles.parquet"
 """Files of the study's folder: what was run, and of each run its scores and its errors by vehicle."""
+LATER = {"lateral_positions": RECORDED_POSITIONS}
+"""What the index did not state of a recording at first, and what it was then: no run is made again because of it."""
 DONE = (0, 3)
 """Exit codes of a command that did its work; 3: some files or lines were refused, as those of a sample are meant to."""
 
@@ -45,11 +47,13 @@ class Lake:
     root: Path
     digest: str = ""
     index: Mapping[str, Any] | None = None
+    variant: str = ""
 
     @property
     def name(self) -> str:
-        """Name of the lake: its arm, and the block that is left out."""
-        return self.arm.name if self.fold is None else f"{self.arm.name} {self.fold}"
+        """Name of the lake: its arm, what is trained in it alone, and the block that is left out."""
+        parts = (self.arm.name, self.variant, "" if self.fold is None else f"block {self.fold}")
+        return ", ".join(part for part in parts if part)
 
     @property
     def environment(self) -> dict[str, str]:
@@ -65,29 +69,43 @@ class Lake:
 
 @dataclass(frozen=True)
 class Job:
-    """A model on a lake: trained with a seed where it learns, and scored."""
+    """A model that is scored on a lake and, where it learns, was trained with a seed on this one or another."""
 
     lake: Lake
     model: str
     learner: Learner | None = None
     seed: int | None = None
+    home: Lake | None = None
 
     @property
-    def identity(self) -> str:
+    def trained_in(self) -> Lake:
+        """The lake that it is trained in."""
+        return self.home or self.lake
+
+    @property
+    def training(self) -> str:
         """Digest of all that decides the weights: settings of the training, and tensors."""
         own = self.learner
         training = [own.model, own.samples, own.epochs, own.options, self.seed] if own else [self.model]
-        return make_digest([self.lake.root.name, self.lake.digest, training])
+        return make_digest([self.trained_in.root.name, self.trained_in.digest, training])
+
+    @property
+    def identity(self) -> str:
+        """Digest of all that decides the scores."""
+        tested = list(self.learner.tested) if self.learner else []
+        if self.home is None and not tested:
+            return self.training
+        return make_digest([self.training, self.lake.root.name, self.lake.digest, tested])
 
     @property
     def run(self) -> str:
         """Name of the run in its lake."""
-        return f"{self.model}-seed{self.seed}-{self.identity}" if self.learner else self.model
+        return f"{self.model}-seed{self.seed}-{self.training}" if self.learner else self.model
 
     @property
     def run_folder(self) -> Path:
-        """Folder of the run in its lake."""
-        return self.lake.root / MODELS / self.run
+        """Folder of the run in the lake that it is trained in."""
+        return self.trained_in.root / MODELS / self.run
 
     @property
     def scores(self) -> Path:
@@ -142,13 +160,38 @@ class Workshop:
         return not source.file or (self.data / source.file).is_file()
 
     def find_lakes(self, arm: Arm) -> list[Lake]:
-        """Find the lakes of an arm, without a digest where they are not made yet."""
+        """Find the lakes that an arm is scored on, one per fold, without a digest where they are not made yet."""
         if not self.has(arm.source):
             return []
         raw = digest_file(self.data / arm.source.file) if arm.source.file else list(arm.source.sample)
         lakes = [Lake(arm, fold, Path()) for fold in arm.folds or (None,)]
         named = [(lake, make_digest([raw, arm.source.lane_ft, arm.protocol, lake.environment])) for lake in lakes]
         return [read_lake(replace(lake, root=self.work / "lakes" / digest)) for lake, digest in named]
+
+    def find_homes(self, arm: Arm, own: Learner) -> list[Lake]:
+        """Find the lakes that a model is trained in, one per fold; none: those that it is scored on."""
+        if own.source is None and not own.settings:
+            return []
+        settings = {**arm.settings, **own.settings}
+        homes = self.find_lakes(replace(arm, source=own.source or arm.source, settings=settings))
+        return [replace(lake, variant=own.name) for lake in homes]
+
+    def list_lakes(self, arm: Arm) -> dict[Path, Lake]:
+        """List all lakes of an arm by their folders."""
+        found = [*(self.find_homes(arm, own) for own in arm.learners), self.find_lakes(arm)]
+        return {lake.root: lake for lakes in found for lake in lakes}
+
+    def list_jobs(self, arm: Arm) -> Iterator[Job]:
+        """List the jobs of an arm, as far as its tensors are there."""
+        lakes = [lake for lake in self.find_lakes(arm) if lake.index is not None]
+        yield from (Job(lake, model) for lake in lakes for model in arm.plain)
+        for own in arm.learners:
+            homes = {home.fold: home for home in self.find_homes(arm, own)}
+            for lake in lakes:
+                home = homes.get(lake.fold)
+                if home is None or home.index is not None:
+                    where = (home, None) if home and own.at_home else (lake, home)
+                    yield from (Job(where[0], own.name, own, seed, where[1]) for seed in range(own.seeds))
 
     def make_lake(self, lake: Lake) -> Lake:
         """Make a lake's tensors, or bring them up to date."""
@@ -174,35 +217,53 @@ class Workshop:
         return out
 
     def work_on(self, jobs: Iterable[Job]) -> None:
-        """Train and score what is not done yet, the shortest first."""
-        left = sorted((job for job in jobs if not job.scores.exists()), key=lambda job: job.seconds)
+        """Train and score what is not done yet: the shortest first, and of these one seed in all folds."""
+        todo = (job for job in jobs if not job.scores.exists())
+        left = sorted(todo, key=lambda job: (job.seconds, job.seed or 0, job.lake.name))
         with ThreadPoolExecutor(self.at_once) as pool:
             list(pool.map(self.finish, left))
 
     def finish(self, job: Job) -> None:
         """Train one run, or go on with one that was interrupted, and score it."""
-        lake, own = job.lake, job.learner
-        if own and not (job.run_folder / "metrics.json").exists():
-            begun = (job.run_folder.with_name(f".{job.run}.unfinished") / "checkpoint.pt").exists()
-            how = ("--seed", job.seed, "--samples-per-epoch", own.samples, "--epochs", own.epochs, *own.options)
-            words = ("train", own.model, *lake.options, "--name", job.run, *how, "--threads", 1)
-            if not self.run(*words, *(("--resume",) if begun else ()), environment=lake.environment):
-                return
+        if job.learner and not self.train(job, job.learner):
+            return
+        if job.home is not None:
+            lend_run(job)
         aside = job.scores.with_name(f"{job.scores.name}.unfinished")
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir(parents=True)
+        tested = job.learner.tested if job.learner else ()
         files = ("--out", aside / SCORES, "--vehicle-errors", aside / VEHICLES)
-        if self.run("evaluate", job.run, *lake.options, "--no-published", *files, environment=lake.environment):
+        words = ("evaluate", job.run, *job.lake.options, "--no-published", *tested, *files)
+        if self.run(*words, environment=job.lake.environment):
             aside.rename(job.scores)
 
+    def train(self, job: Job, own: Learner) -> bool:
+        """Train a run if there is none yet; returns whether there is one."""
+        if (job.run_folder / "metrics.json").exists():
+            return True
+        begun = (job.run_folder.with_name(f".{job.run}.unfinished") / "checkpoint.pt").exists()
+        how = ("--seed", job.seed, "--samples-per-epoch", own.samples, "--epochs", own.epochs, *own.options)
+        words = ("train", own.model, *job.trained_in.options, "--name", job.run, *how, "--threads", 1)
+        return self.run(*words, *(("--resume",) if begun else ()), environment=job.trained_in.environment)
 
-def list_jobs(lakes: Iterable[Lake]) -> Iterator[Job]:
-    """List the jobs of lakes whose tensors are there."""
-    for lake in lakes:
-        if lake.index is not None:
-            yield from (Job(lake, model) for model in lake.arm.plain)
-            for own in lake.arm.learners:
-                yield from (Job(lake, own.name, own, seed) for seed in range(own.seeds))
+
+def lend_run(job: Job) -> None:
+    """Copy a run into the lake that it is scored on.
+
+    Recordings of two samples have the same names. So that a run is not refused as one that was trained on what it is
+    scored on, its copy states the blocks of that lake: samples of other traffic, or clean copies of blocks of its own
+    evaluation part, are scored.
+    """
+    copy = job.lake.root / MODELS / job.run
+    if not copy.exists():
+        aside = copy.with_name(f".{copy.name}.copy")
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.copytree(job.run_folder, aside)
+        config = json.loads((aside / "config.json").read_text(encoding="utf-8"))
+        config["blocks"] = (job.lake.index or {})["blocks"]
+        (aside / "config.json").write_text(json.dumps(config), encoding="utf-8")
+        aside.rename(copy)
 
 
 def read_lake(lake: Lake) -> Lake:
@@ -212,7 +273,8 @@ def read_lake(lake: Lake) -> Lake:
         return lake
     folder = TensorFolder.open(lake.root / commit.info["path"])
     index = json.loads((folder.path / INDEX_FILE).read_text(encoding="utf-8"))
-    return replace(lake, digest=digest_tensors(folder), index=index)
+    plain = [{key: value for key, value in own.items() if LATER.get(key) != value} for own in index["subsets"]]
+    return replace(lake, digest=digest_tensors(replace(folder, index={**index, "subsets": plain})), index=index)
 
 
 @cache

@@ -32,6 +32,10 @@ class Learner:
         epochs: of each training; at most, where `--patience` is among the options.
         options: more options of `tracklake train`.
         label: name of its runs; empty = the model's name.
+        source: recordings that it is trained on, where they are others than it is scored on.
+        settings: settings of the lake that it is trained in, besides the arm's.
+        at_home: whether it is scored where it is trained, and not on the arm's lake.
+        tested: more options of `tracklake evaluate`.
     """
 
     model: str
@@ -40,6 +44,10 @@ class Learner:
     epochs: int = 8
     options: tuple[str, ...] = ()
     label: str = ""
+    source: Source | None = None
+    settings: Mapping[str, str] = field(default_factory=dict)
+    at_home: bool = False
+    tested: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

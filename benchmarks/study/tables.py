@@ -44,6 +44,10 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
 """Columns of docs/results-NAME.csv. `seeds` has one row per arm, model, seed, part of the data and horizon; the seed is
 null where nothing was drawn."""
 
+NOTHING = "-"
+"""What a model is compared with where the interval is that of its own error."""
+SUMS = pl.col("squared_longitudinal_m2", "squared_lateral_m2", "distance_m", "nll_nats")
+
 DIGITS = 5
 """Decimals of the committed tables."""
 
@@ -54,11 +58,12 @@ def read_table(docs: Path, name: str) -> pl.DataFrame:
     return pl.read_csv(file, schema=TABLES[name]) if file.exists() else pl.DataFrame(schema=TABLES[name])
 
 
-def update_tables(docs: Path, arm: Arm, lakes: Sequence[Lake], jobs: Sequence[Job]) -> None:
+def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
     """Replace an arm's rows of the committed tables by what is scored; an arm without scores keeps its rows."""
-    done = select_complete(jobs, len(lakes))
+    done = select_complete(jobs, max(1, len(arm.folds)))
     if not done:
         return
+    lakes = {lake.root: lake for job in done for lake in (job.lake, job.trained_in)}.values()
     errors = read_errors(done)
     found = {
         "seeds": pool_scores(done),
@@ -122,27 +127,34 @@ def read_errors(jobs: Iterable[Job]) -> dict[str, pl.DataFrame]:
 
 
 def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dict[str, Any]]:
-    """Compare every network with every plain model, and the arm's pairs, on everything and on each dataset."""
+    """Compare models with nothing, networks with plain models, and the arm's pairs, on everything and by dataset."""
     learned = [own.name for own in arm.learners]
-    for model, against in (*product(learned, arm.plain), *arm.pairs):
-        if model not in errors or against not in errors:
+    for model, against in (*product(errors, (NOTHING,)), *product(learned, arm.plain), *arm.pairs):
+        if model not in errors or against not in (*errors, NOTHING):
             continue
-        datasets = errors[model]["dataset"].unique().sort().to_list()
-        for dataset in (EVERYTHING, *(datasets if len(datasets) > 1 else ())):
-            two = [errors[name] for name in (model, against)]
-            if dataset != EVERYTHING:
-                two = [own.filter(dataset=dataset) for own in two]
+        others = errors[model].with_columns(SUMS * 0.0) if against == NOTHING else errors[against]
+        for dataset, own, other in pair_datasets(errors[model], others):
             named = {"arm": arm.name, "model": model, "against": against, "dataset": dataset}
             for figure, sums in COMPARED_FIGURES.items():
-                if not any(own[column].has_nulls() for own in two for column in sums):
-                    yield from (named | {"figure": figure} | row for row in compare_errors(*two, figure).to_dicts())
+                if not any(each[column].has_nulls() for each in (own, other) for column in sums):
+                    rows = compare_errors(own, other, figure).to_dicts()
+                    yield from (named | {"figure": figure} | row for row in rows)
+
+
+def pair_datasets(own: pl.DataFrame, other: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame, pl.DataFrame]]:
+    """Pair errors of two models on everything, where both have it, and on each dataset that both have."""
+    first, second = (set(each["dataset"]) for each in (own, other))
+    if first == second:
+        yield EVERYTHING, own, other
+    for dataset in sorted(first & second) if len(first | second) > 1 else ():
+        yield dataset, own.filter(dataset=dataset), other.filter(dataset=dataset)
 
 
 def describe_run(job: Job) -> dict[str, Any]:
     """Describe a training by its metrics.json."""
     metrics = json.loads((job.run_folder / "metrics.json").read_text(encoding="utf-8"))
     best = metrics.get("best") or {}
-    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
+    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.trained_in.name}
     kept = {name: metrics.get(name) for name in TABLES["runs"] if name not in named}
     return named | kept | {"best_epoch": best.get("epoch"), "validation_loss": best.get("validation_loss")}
 
@@ -150,7 +162,7 @@ def describe_run(job: Job) -> dict[str, Any]:
 def read_curve(job: Job) -> pl.DataFrame:
     """Read losses by epoch of a training that stops by its validation loss."""
     log = pl.read_csv(job.run_folder / "epochs.csv")
-    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
+    named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.trained_in.name}
     rows = log.with_columns(pl.lit(value).alias(name) for name, value in named.items())
     return rows.select(pl.col(name).cast(dtype) for name, dtype in TABLES["curves"].items()).drop_nulls()
 
