@@ -17,7 +17,8 @@ from pathlib import Path
 
 from study.jobs import ROOT, Workshop
 from study.page import write_pages
-from study.plan import PIECES, Arm, Piece, estimate_piece, make_quick
+from study.pieces import PIECES
+from study.plan import Arm, Piece, estimate_pieces, make_quick
 from study.tables import update_tables
 
 
@@ -58,12 +59,12 @@ def run_arms(arms: Sequence[Arm], workshop: Workshop, docs: Path, *, only_gather
 
 def print_plan(pieces: Sequence[Piece]) -> None:
     """Print every piece with the number of its trainings and the minutes it takes."""
+    estimates = estimate_pieces(pieces)
     for piece in pieces:
-        runs = sum(max(1, len(arm.folds)) * own.seeds for arm in piece.arms for own in arm.learners)
-        print(f"{piece.name:<20}{runs:>5} trainings{estimate_piece(piece):>7.0f} min  {piece.title}")
-    print(
-        f"{'together':<20}{'':>15}{sum(map(estimate_piece, pieces)):>7.0f} min, two trainings at a time, a thread each"
-    )
+        runs, minutes = estimates[piece.name]
+        print(f"{piece.name:<20}{runs:>5} trainings{minutes:>7.0f} min  {piece.title}")
+    minutes = sum(own for _, own in estimates.values())
+    print(f"{'together':<20}{'':>15}{minutes:>7.0f} min, two trainings at a time, a thread each")
 
 
 def read_options(words: Sequence[str] | None) -> argparse.Namespace:

@@ -273,7 +273,7 @@ def read_lake(lake: Lake) -> Lake:
         return lake
     folder = TensorFolder.open(lake.root / commit.info["path"])
     index = json.loads((folder.path / INDEX_FILE).read_text(encoding="utf-8"))
-    plain = [{key: value for key, value in own.items() if LATER.get(key) != value} for own in index["subsets"]]
+    plain = [{key: own[key] for key in own if (key, own[key]) not in LATER.items()} for own in index["subsets"]]
     return replace(lake, digest=digest_tensors(replace(folder, index={**index, "subsets": plain})), index=index)
 
 

@@ -7,7 +7,8 @@ import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.figure import draw_errors
-from study.plan import PIECES, Arm, estimate_piece
+from study.pieces import PIECES
+from study.plan import Arm
 from study.results import Results, grid, judge
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
@@ -45,7 +46,6 @@ def render_pages(results: Results) -> dict[str, str]:
         "missing": [piece for piece in PIECES if not any(arm.name in has for arm in piece.arms)],
         "has": has,
         "figures": FIGURES,
-        "estimate": estimate_piece,
         **{own.__name__: partial(own, results) for own in TABLES_OF_ARM},
     }
     return {name: templates.get_template(f"{name}.j2").render(given) for name in PAGES}

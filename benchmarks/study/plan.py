@@ -1,6 +1,6 @@
-"""What the study runs, as data: recordings, arms, models, and how long each piece takes."""
+"""Recordings, models, arms and pieces of a study, and an estimate of the time that each takes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 
@@ -87,7 +87,6 @@ class Piece:
     arms: tuple[Arm, ...]
 
 
-PLAIN = ("constant-velocity", "damped-velocity", "kalman-cv")
 SPEEDS = {
     "lstm": 10_500,
     "v-lstm": 4_000,
@@ -101,84 +100,34 @@ SPEEDS = {
 OVERHEAD_S, LAKE_S = 12.0, 40.0
 """Seconds of a run besides its training (starts, scores), and of making a lake."""
 
-US_101 = Source(
-    "US-101, 2005-06-15 07:50, an excerpt of NGSIM (U.S. Department of Transportation 2016): 290 of 2,169 vehicles, so "
-    "that no vehicle's neighbors are known. It has no lanes; samples were given lanes of 12 ft from `Local_X`.",
-    file="ngsim/us101_0750_290_vehicles.csv.gz",
-    lane_ft=12.0,
-)
-I_80 = Source(
-    "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "
-    "Next Generation Simulation (NGSIM) vehicle trajectory dataset, Transportation Research Part B 105: 2,283 vehicles "
-    "with lanes and neighbors, but without lateral positions and sizes. Errors along the road alone mean anything.",
-    file="i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz",
-)
-
-BLOCKS = {
-    "TRACKLAKE_SPLIT": "time-blocks",
-    "TRACKLAKE_SPLITS": '["time-blocks"]',
-    "TRACKLAKE_RECONSTRUCT": "false",
-}
-US_101_ARM = Arm(
-    "US-101",
-    US_101,
-    PLAIN,
-    (
-        Learner("lstm", 8, 50_000),
-        Learner("v-lstm", 8, 30_000),
-        Learner("stacked-lstm", 5, 30_000),
-        Learner("lstm-encoder-decoder", 5, 5_000),
-    ),
-    settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "225"},
-    folds=(0, 1, 2, 3),
-)
-
-I_80_ARM = Arm(
-    "I-80",
-    I_80,
-    PLAIN,
-    (
-        Learner("v-lstm", 8, 20_000),
-        Learner("attention-h4", 5, 5_000),
-        Learner("cs-lstm", 5, 20_000),
-        Learner("cs-lstm-m", 5, 20_000),
-        Learner("lstm-encoder-decoder", 5, 5_000),
-    ),
-    settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "240"},
-    folds=(0, 2),
-    pairs=(("cs-lstm", "v-lstm"), ("cs-lstm-m", "cs-lstm"), ("attention-h4", "cs-lstm")),
-)
-
-PIECES = (
-    Piece(
-        "us-101",
-        0,
-        "Real traffic: US-101",
-        "Four blocks of 225 s with 8 s between them; each is predicted by models that were trained on the other three.",
-        (US_101_ARM,),
-    ),
-    Piece(
-        "i-80",
-        1,
-        "Real traffic with neighbors: I-80",
-        "Four blocks of 240 s with 8 s between them; the first and the third are each predicted by models that were "
-        "trained on the other three.",
-        (I_80_ARM,),
-    ),
-)
-
 
 def estimate_run(learner: Learner) -> float:
     """Estimate the seconds of one training and its scores, on one of two idle cores."""
     return OVERHEAD_S + learner.samples * learner.epochs / SPEEDS[learner.model]
 
 
-def estimate_piece(piece: Piece) -> float:
-    """Estimate the minutes of a piece, with two runs at a time."""
-    folds = [(arm, max(1, len(arm.folds))) for arm in piece.arms]
-    runs = sum(count * own.seeds * estimate_run(own) for arm, count in folds for own in arm.learners)
-    fixed = sum(count * (LAKE_S + OVERHEAD_S * len(arm.plain)) for arm, count in folds)
-    return (runs + fixed) / 2 / 60
+def estimate_pieces(pieces: Iterable[Piece]) -> dict[str, tuple[int, float]]:
+    """Estimate trainings and minutes of each piece, two at a time; what an earlier piece has done counts there."""
+    done: set[tuple[object, ...]] = set()
+    found = {}
+    for piece in pieces:
+        spent = {key: seconds for arm in piece.arms for key, seconds in list_work(arm) if key not in done}
+        done |= set(spent)
+        found[piece.name] = (sum(len(key) == 3 for key in spent), sum(spent.values()) / 2 / 60)
+    return found
+
+
+def list_work(arm: Arm) -> Iterator[tuple[tuple[object, ...], float]]:
+    """List lakes, plain models and trainings of an arm by what decides them, with the seconds that each takes."""
+    for fold in arm.folds or (None,):
+        lake = repr((arm.source, arm.protocol, arm.settings, fold))
+        yield (lake,), LAKE_S
+        yield from (((lake, model), OVERHEAD_S / 4) for model in arm.plain)
+        for own in arm.learners:
+            home = repr((own.source or arm.source, arm.protocol, {**arm.settings, **own.settings}, fold))
+            yield (home,), LAKE_S
+            how = (own.model, own.samples, own.epochs, own.options)
+            yield from (((home, how, seed), estimate_run(own)) for seed in range(own.seeds))
 
 
 def make_quick(piece: Piece) -> Piece:

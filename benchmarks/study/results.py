@@ -6,7 +6,8 @@ from pathlib import Path
 
 import polars as pl
 
-from study.plan import PIECES, Arm
+from study.pieces import PIECES
+from study.plan import Arm
 from study.tables import TABLES, read_table
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVERYTHING

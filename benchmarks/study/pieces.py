@@ -1,0 +1,246 @@
+"""What the study runs, as data: real traffic first."""
+
+from dataclasses import replace
+
+from study.plan import Arm, Learner, Piece, Source
+
+PLAIN = ("constant-velocity", "damped-velocity", "kalman-cv")
+BLOCKS = {
+    "TRACKLAKE_SPLIT": "time-blocks",
+    "TRACKLAKE_SPLITS": '["time-blocks"]',
+    "TRACKLAKE_RECONSTRUCT": "false",
+}
+
+US_101 = Source(
+    "US-101, 2005-06-15 07:50, an excerpt of NGSIM (U.S. Department of Transportation 2016): 290 of 2,169 vehicles, so "
+    "that no vehicle's neighbors are known. It has no lanes; samples were given lanes of 12 ft from `Local_X`.",
+    file="ngsim/us101_0750_290_vehicles.csv.gz",
+    lane_ft=12.0,
+)
+I_80 = Source(
+    "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "
+    "Next Generation Simulation (NGSIM) vehicle trajectory dataset, Transportation Research Part B 105: 2,283 vehicles "
+    "with lanes and neighbors, but without lateral positions and sizes. Errors along the road alone mean anything.",
+    file="i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz",
+)
+
+
+def generate(traffic: str, seed: int, title: str, *more: str) -> Source:
+    """Declare generated traffic: three minutes of eight free and congested carriageways and one of NGSIM's kind."""
+    options = (
+        "--traffic",
+        traffic,
+        "--format",
+        "highd",
+        "--format",
+        "ngsim-text",
+        "--minutes",
+        "3",
+        "--seed",
+        f"{seed}",
+    )
+    return Source(title, sample=(*options, *more))
+
+
+IDM = generate(
+    "varied-idm", 0, "Generated traffic: 200 drivers a carriageway, who follow IDM ([sample.md](sample.md))."
+)
+KRAUSS = generate("varied-krauss", 1, "Generated traffic: 200 drivers a carriageway follow Krauss's model.")
+PARTS = {**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "50", "TRACKLAKE_VALIDATION_PART": "true"}
+"""Settings of generated traffic: blocks of 50 s with 8 s between them, some of them for validation."""
+
+V_LSTM, LSTM = Learner("v-lstm", 8, 25_000), Learner("lstm", 8, 25_000)
+STACKED, DECODER = Learner("stacked-lstm", 5, 20_000), Learner("lstm-encoder-decoder", 5, 5_000)
+CS_LSTM, CS_LSTM_M = Learner("cs-lstm", 5, 20_000), Learner("cs-lstm-m", 5, 20_000)
+ATTENTION = Learner("attention-h4", 5, 10_000)
+GENERATED = Arm(
+    "generated",
+    IDM,
+    PLAIN,
+    (LSTM, V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER),
+    settings=PARTS,
+    pairs=(("cs-lstm", "v-lstm"), ("cs-lstm-m", "cs-lstm"), ("attention-h4", "cs-lstm"), ("attention-h4", "v-lstm")),
+)
+
+
+def publish(own: Learner) -> Learner:
+    """Train as published, until the validation loss stops improving."""
+    options = ("--set", "as_published=true", "--patience", "3")
+    return replace(own, seeds=5, samples=own.samples // 2, epochs=24, options=options, label=f"{own.model}-published")
+
+
+def ablate(own: Learner, label: str, *settings: str) -> Learner:
+    """Change settings of a model."""
+    options = tuple(part for setting in settings for part in ("--set", setting))
+    return replace(own, seeds=5, options=options, label=f"{own.model}, {label}")
+
+
+def pair_with(own: Learner, others: tuple[Learner, ...]) -> tuple[tuple[str, str], ...]:
+    """Pair each of the others with a model."""
+    return tuple((other.name, own.name) for other in others)
+
+
+PUBLISHED = tuple(map(publish, (V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER)))
+ABLATED = (
+    ablate(ATTENTION, "ego-only loss", "ego_only=true"),
+    ablate(ATTENTION, "no sizes", "sizes=false"),
+    ablate(ATTENTION, "no lanes", "lanes=none"),
+    ablate(ATTENTION, "two vehicles", "nearest=2"),
+    ablate(ATTENTION, "27 m", "range_m=27.432"),
+)
+LONG_GRID = replace(CS_LSTM, label="cs-lstm, cells of 9 m", settings={"TRACKLAKE_GRID_CELL_M": "9.144"}, at_home=True)
+AXES = tuple(ablate(V_LSTM, f"anchored {axis}", f"anchoring={axis}") for axis in ("none", "longitudinal", "lateral"))
+AUGMENTED = (ablate(V_LSTM, "mirrored", "augmentation=lateral-inversion"),)
+ALONE = {
+    dataset: tuple(
+        replace(
+            own,
+            seeds=5,
+            options=("--dataset", dataset),
+            tested=("--dataset", dataset),
+            label=f"{own.model}, {title} alone",
+        )
+        for own in (V_LSTM, CS_LSTM)
+    )
+    for dataset, title in (("ngsim", "NGSIM-like"), ("highd", "highD-like"))
+}
+MOVED = tuple(replace(own, seeds=5, source=KRAUSS, label=f"{own.model}, of Krauss") for own in (LSTM, V_LSTM, CS_LSTM))
+LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
+
+PIECES = (
+    Piece(
+        "us-101",
+        0,
+        "Real traffic: US-101",
+        "Four blocks of 225 s with 8 s between them; each is predicted by models that were trained on the other three. "
+        "Vehicles that are on the road in two blocks are not scored where one of them trains.",
+        (
+            Arm(
+                "US-101",
+                US_101,
+                PLAIN,
+                (
+                    Learner("lstm", 8, 50_000),
+                    Learner("v-lstm", 8, 30_000),
+                    Learner("stacked-lstm", 5, 30_000),
+                    Learner("lstm-encoder-decoder", 5, 5_000),
+                ),
+                settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "225"},
+                folds=(0, 1, 2, 3),
+            ),
+        ),
+    ),
+    Piece(
+        "i-80",
+        1,
+        "Real traffic with neighbors: I-80",
+        "Four blocks of 240 s with 8 s between them; the first and the third are each predicted by models that were "
+        "trained on the other three.",
+        (
+            Arm(
+                "I-80",
+                I_80,
+                PLAIN,
+                (
+                    Learner("v-lstm", 8, 20_000),
+                    Learner("attention-h4", 5, 5_000),
+                    Learner("cs-lstm", 5, 20_000),
+                    Learner("cs-lstm-m", 5, 20_000),
+                    Learner("lstm-encoder-decoder", 5, 5_000),
+                ),
+                settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "240"},
+                folds=(0, 2),
+                pairs=(("cs-lstm", "v-lstm"), ("cs-lstm-m", "cs-lstm"), ("attention-h4", "cs-lstm")),
+            ),
+        ),
+    ),
+    Piece(
+        "generated",
+        2,
+        "Generated traffic",
+        "Blocks of 50 s with 8 s between them; highD-like recordings are free or congested carriageways at 25 Hz, "
+        "NGSIM-like ones at 10 Hz.",
+        (GENERATED,),
+    ),
+    Piece(
+        "ablations",
+        3,
+        "What attention and social pooling owe to what",
+        "The same recordings. One setting of a model is changed: attention learns from the predicted vehicle alone as "
+        "the others do, is not given sizes or lanes, is trained with two vehicles around, or sees no farther than the "
+        "grid does; the grid's cells are twice as long; V-LSTM counts one axis or both from where they stand, not from "
+        "constant velocity; V-LSTM also learns from mirrored samples.",
+        (
+            replace(
+                GENERATED,
+                name="ablations",
+                learners=(ATTENTION, *ABLATED, CS_LSTM, LONG_GRID, replace(V_LSTM, seeds=5), *AXES, *AUGMENTED),
+                pairs=(
+                    *pair_with(ATTENTION, ABLATED),
+                    *pair_with(CS_LSTM, (LONG_GRID,)),
+                    *pair_with(V_LSTM, (*AXES, *AUGMENTED)),
+                ),
+            ),
+        ),
+    ),
+    Piece(
+        "published",
+        3,
+        "Networks as published",
+        "The same recordings. Each network has the inputs, the outputs and the loss of its publication "
+        "([models.md](models.md)) and is trained until three epochs bring no smaller loss on the validation part. Its "
+        "loss by epoch is in [results-curves.csv](results-curves.csv).",
+        (
+            replace(
+                GENERATED,
+                name="as published",
+                learners=PUBLISHED,
+                pairs=tuple((f"{own.model}-published", own.model) for own in PUBLISHED),
+            ),
+        ),
+    ),
+    Piece(
+        "one-dataset",
+        4,
+        "One data set at a time",
+        "Models that are trained and scored on one kind of recordings alone, against models that are trained on both.",
+        tuple(
+            replace(GENERATED, name=f"{dataset} alone", learners=(V_LSTM, CS_LSTM, *own), pairs=pair_datasets)
+            for dataset, own, pair_datasets in (
+                (dataset, own, tuple((one.name, one.model) for one in own)) for dataset, own in ALONE.items()
+            )
+        ),
+    ),
+    Piece(
+        "transfer",
+        4,
+        "Trained on one simulator, scored on another",
+        "Models that are trained on drivers who follow Krauss's model and scored on drivers who follow IDM, against "
+        "models that are trained on the latter.",
+        (
+            replace(
+                GENERATED,
+                name="transfer",
+                learners=(LSTM, V_LSTM, CS_LSTM, *MOVED),
+                pairs=tuple((own.name, own.model) for own in MOVED),
+            ),
+        ),
+    ),
+    Piece(
+        "leakage",
+        5,
+        "The price of leakage",
+        "The split of convolutional social pooling's code (`csp-2018`) cuts every recording by the vehicles' numbers: "
+        "vehicles that drive side by side are in different parts. Errors under it are compared with those on the same "
+        "recordings parted by blocks of time. Other vehicles are scored: differences are not paired.",
+        (
+            replace(
+                GENERATED,
+                name="csp-2018",
+                learners=LEAKING,
+                settings={**BLOCKS, "TRACKLAKE_SPLIT": "csp-2018", "TRACKLAKE_SPLITS": '["csp-2018"]'},
+                pairs=(),
+            ),
+        ),
+    ),
+)
