@@ -15,15 +15,22 @@ from study.page import render_pages
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
-from study.tables import TABLES, pool_scores, read_table, select_complete
+from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEMPLATES = Path(__file__).parents[1] / "benchmarks" / "study"
+OTHERS = Source("Three others.", file="others.csv.gz", lane_ft=12.0)
 TINY = Arm(
     "tiny",
     Source("Six vehicles.", file="tiny.csv.gz", lane_ft=12.0),
     ("constant-velocity",),
-    (Learner("lstm", 2, 200, epochs=1),),
+    (
+        Learner("lstm", 2, 200, epochs=1),
+        Learner(
+            "lstm", 1, 200, epochs=1, label="elsewhere", source=Source("Others.", file="others.csv.gz", lane_ft=12.0)
+        ),
+    ),
+    pairs=(("elsewhere", "lstm"),),
     settings={
         "TRACKLAKE_SPLIT": "time-blocks",
         "TRACKLAKE_SPLITS": '["time-blocks"]',
@@ -34,14 +41,14 @@ TINY = Arm(
 )
 
 
-def write_traffic(file):
+def write_traffic(file, speed_up_ft=3):
     """Write vehicles that speed up and slow down, three for 20 s and three 8 s later, in the excerpt's columns."""
     vehicle = np.repeat(np.arange(6), 200)
     frame = np.tile(np.arange(200), 6) + 280 * (vehicle // 3)
-    y_ft = 60 * (vehicle % 3) + 4 * (frame % 280) - 6 * np.cos(frame / 20 + vehicle)
+    y_ft = 60 * (vehicle % 3) + 4 * (frame % 280) - 2 * speed_up_ft * np.cos(frame / 20 + vehicle)
     columns = {"Vehicle_ID": 1 + vehicle, "Frame_ID": 100 + frame, "Total_Frames": np.full(1200, 200)}
     columns |= {"Global_Time": 1118846980200 + 100 * (100 + frame), "Local_X": 6.0 + 12 * (vehicle % 3)}
-    columns |= {"Local_Y": y_ft.round(3), "v_Vel": (40 + 3 * np.sin(frame / 20 + vehicle)).round(2)}
+    columns |= {"Local_Y": y_ft.round(3), "v_Vel": (40 + speed_up_ft * np.sin(frame / 20 + vehicle)).round(2)}
     columns |= dict.fromkeys(("v_Acc", "Space_Headway", "Time_Headway"), np.zeros(1200))
     file.write_bytes(gzip.compress(pl.DataFrame(columns).write_csv().encode()))
 
@@ -51,6 +58,7 @@ def tiny(command, tmp_path_factory, plain_flows):  # noqa: ARG001  (a fixture ca
     """A tiny study: its workshop, and the folder of its tables."""
     data, work, docs = (tmp_path_factory.mktemp(name) for name in ("data", "work", "docs"))
     write_traffic(data / TINY.source.file)
+    write_traffic(data / TINY.learners[1].source.file, speed_up_ft=2)
 
     def call(words, environment):
         done = command.here(*words, **environment)
@@ -70,10 +78,11 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     seeds = read_table(docs, "seeds").filter(group="all", dataset="all")
     assert seeds.group_by("model").agg(pl.col("seed").n_unique()).sort("model").rows() == [
         ("constant-velocity", 1),
+        ("elsewhere", 1),
         ("lstm", 2),
     ]
     lakes = workshop.find_lakes(TINY)
-    stated = read_table(docs, "lakes").to_dicts()
+    stated = [row for row in read_table(docs, "lakes").to_dicts() if "elsewhere" not in row["lake"]]
     for lake, row in zip(lakes, stated, strict=True):
         (file,) = lake.root.glob("tensors/*/*/index.json")
         index = json.loads(file.read_text())
@@ -89,13 +98,13 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     assert {row["seconds"] for row in rows} == {1.0}
     assert seeds.filter(model="lstm", seed=1, seconds=1.0)["rmse_m"].to_list() == pytest.approx([rmse], abs=1e-5)
     compared = read_table(docs, "comparisons").filter(figure="rmse_m", seconds=1.0, dataset="all")
-    assert compared.select("model", "against").rows() == [
-        ("constant-velocity", "-"),
-        ("lstm", "-"),
-        ("lstm", "constant-velocity"),
-    ]
-    found = compared.row(2, named=True)
-    assert found["difference"] == pytest.approx(compared["difference"][1] - compared["difference"][0], abs=2e-5)
+    found = {(row["model"], row["against"]): row for row in compared.to_dicts()}
+    alone = {model: row["difference"] for (model, against), row in found.items() if against == NOTHING}
+    assert alone == {model: row["a_value"] for (model, against), row in found.items() if against == NOTHING}
+    assert set(alone) == {"constant-velocity", "lstm", "elsewhere"}
+    assert found["elsewhere", "lstm"]["difference"] == pytest.approx(alone["elsewhere"] - alone["lstm"], abs=2e-5)
+    found = found["lstm", "constant-velocity"]
+    assert found["difference"] == pytest.approx(alone["lstm"] - alone["constant-velocity"], abs=2e-5)
     assert found["a_value"] == pytest.approx(seeds.filter(model="lstm", seconds=1.0)["rmse_m"].mean(), abs=1e-4)
     assert found["low"] <= found["difference"] <= found["high"]
 
@@ -104,7 +113,7 @@ def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tin
     workshop, docs, calls = tiny
     calls.clear()
     run_arms([TINY], workshop, docs, only_gather=False)
-    assert calls == ["run", "run"]
+    assert calls == ["run"] * 4
     more = replace(TINY, learners=(replace(TINY.learners[0], seeds=3),))
     jobs = list(workshop.list_jobs(more))
     assert [(job.model, job.seed, job.lake.fold) for job in jobs if not job.scores.exists()] == [
