@@ -1,0 +1,26 @@
+"""Attention networks of drawn weights, and comparisons with what they predict."""
+
+import numpy as np
+import torch
+
+from tracklake.schemas.protocols import CSP
+from tracklake.training.models import find_model
+
+
+def build(heads=4, protocol=CSP, *, seed=0, wild=True, **parameters):
+    """A network; `wild`: its last layer, which begins at zero, drawn as well, so that every part of it shows."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = find_model(f"attention-h{heads}").build(protocol, **parameters)
+        if wild:
+            torch.nn.init.normal_(network.out[-1].weight, std=0.1)
+            torch.nn.init.normal_(network.out[-1].bias, std=0.3)
+    return network
+
+
+def to_tensors(arrays):
+    return arrays.each(torch.from_numpy)
+
+
+def close(left, right, atol=2e-4):
+    np.testing.assert_allclose(left, right, rtol=2e-4, atol=atol)
