@@ -3,19 +3,29 @@
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.pipeline.lake import Manifest, scan
-from tracklake.schemas import DRIVES
+from tracklake.schemas import DRIVES, STATIONS
 from tracklake.schemas.origin import describe_synthetic
 
 SHOWN = ("subset", "recording", "origin", "seconds", "stations", "messages", "scans", "images")
-"""Columns of `drives` that are shown of each."""
+"""Columns of `drives` that are shown of each; stations and messages are those of other vehicles, as in the report."""
 
 
 def list_drives(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
     """Return what a lake's drives hold, sorted by name."""
-    return scan(root, manifest, DRIVES).select(SHOWN).sort("subset").collect().to_dicts()
+    others = (
+        scan(root, manifest, STATIONS)
+        .filter(~pl.col("own"))
+        .group_by("subset")
+        .agg(stations=pl.len(), messages=pl.col("messages").sum())
+    )
+    drives = scan(root, manifest, DRIVES).drop("stations", "messages").join(others, on="subset", how="left")
+    counted = drives.with_columns(pl.col("stations", "messages").fill_null(0))
+    return counted.select(SHOWN).sort("subset").collect().to_dicts()
 
 
 def print_drives(terminal: Terminal, drives: list[dict[str, Any]]) -> None:

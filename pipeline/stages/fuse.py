@@ -30,6 +30,8 @@ SCANS_PER_READ = 50
 """LiDAR scans that are in memory at once."""
 CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "x_m", "y_m", "z_m")
 """Columns of `drives` about the camera, without their prefix."""
+EGO_SOURCES = "add a log with its own messages or NavSatFix to the drive's folder, and ingest it again"
+"""Next step where positions of the ego are missing."""
 LONGEST_S = 86_400.0
 """Longest drive that is tracked, in s: a day; a longer one has a wrong clock."""
 
@@ -57,7 +59,7 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     ego_states = reader.table(EGO_STATES)
     reason = None
     if ego_states.is_empty():
-        reason = "no position of the ego was logged"
+        reason = f"no position of the ego was logged; {EGO_SOURCES}"
     elif facts["seconds"] > LONGEST_S:
         reason = f"it lasts {facts['seconds']:,.0f} s, more than a day, so a clock is wrong"
     if reason is not None:
@@ -67,7 +69,10 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     fused = fuse_drive(reader.table(BSM), ego_states, ticks, open_sensors(reader, facts, settings))
     unknown = fused.counts["ticks_without_ego"]
     notes = [*list_missing(reader.subset, facts, settings)]
-    note = f"{reader.subset}: the ego's position is unknown at {unknown:,} of {ticks:,} ticks, which have no rows"
+    note = (
+        f"{reader.subset}: the ego's position is unknown at {unknown:,} of {ticks:,} ticks, which have no rows; "
+        f"{EGO_SOURCES}"
+    )
     return StageResult(
         {table: _add_place(table, frame, reader) for table, frame in fused.tables.items()},
         info=dict(fused.counts),
@@ -122,6 +127,6 @@ STAGE = Stage(
     scope="drive",
     after=(INGEST,),
     settings=("onboard_lidar", "onboard_camera"),
-    version=5,
+    version=6,
     build=build,
 )

@@ -48,6 +48,6 @@ STAGE = Stage(
     scope="recording",
     after=(INGEST,),
     settings=("reconstruct_noise_m", "reconstruct_lateral_noise_m", "reconstruct_max_gap_s"),
-    version=4,
+    version=5,
     build=build,
 )

@@ -29,6 +29,7 @@ from tracklake.pipeline.transforms.onboard.clusters import (
     describe_clusters,
     describe_scan,
     find_sector,
+    part_at_gaps,
     select_returns,
 )
 from tracklake.pipeline.transforms.onboard.measurements import LidarMeasurement, Measured, Predicted, Scanner
@@ -348,7 +349,7 @@ def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tup
     inside &= ~inside.any(1)
     parent = np.where(inside.any(1), inside.argmax(1), np.arange(len(mean)))
     _, renumbered = np.unique(parent, return_inverse=True)
-    owner = renumbered[owner]
+    owner = part_at_gaps(scan, free, renumbered[owner])
     boxes, mean = _locate_new(scan, free, owner, whole=True)
     vehicle = _is_vehicle(boxes, mean, np.bincount(owner))
     if known.side.size:

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Flags, Floats, Integers
+from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges
 from tracklake.schemas.extras import require_extras
 
 REACH_ACROSS_M = 0.4
@@ -35,13 +35,18 @@ JOINED_M = 0.3
 """Depth of the places along the line of sight at which returns of several beams are joined, in m."""
 LEAST_ROOF_M = 1.1
 """Returns below this height are on the face of a vehicle, not on its roof, in m."""
+PASSING_STEPS, CLEARANCE_M = 2.5, 0.5
+"""Least gap between two vehicles side by side, in horizontal steps of the scanner, of which one may give no return, and
+in m across the line of sight."""
+SAME_BEAM = 0.01
+"""Difference of slopes within which returns are of one beam, or of neighboring ones; 16 beams lie 0.035 apart."""
 HIDING_M = 0.7
 """How much nearer a return must be to hide what is beside it in the picture, in m."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The P returns of one scan, seen from the scanner; those of several beams at one place count as one."""
+    """The P returns of one scan by azimuth, seen from the scanner; those of several beams at one place count as one."""
 
     place_m: Floats
     """(P, 2) ahead and to the right of the scanner."""
@@ -51,6 +56,8 @@ class Scan:
     """(P,) horizontal distance from the scanner."""
     azimuth_rad: Floats
     """(P,) clockwise from straight ahead."""
+    slope: Floats
+    """(P,) height above the scanner by distance, of the highest return."""
     step_rad: float
     """Horizontal step of the scanner."""
     on_top: Flags
@@ -88,7 +95,9 @@ def describe_scan(points_m: Floats, origin_m: Floats, scanner_z_m: float) -> tup
     np.minimum.at(nearest, names // depths, distance)
     behind = nearest[names // depths] < distance - HIDING_M
     on_top = behind & (height > LEAST_ROOF_M) & (height < scanner_z_m)
-    return Scan(place, height, distance, np.arctan2(place[:, 1], place[:, 0]), step, on_top, nearest), joined
+    azimuth = np.arctan2(place[:, 1], place[:, 0])
+    slope = (height - scanner_z_m) / distance
+    return Scan(place, height, distance, azimuth, slope, step, on_top, nearest), joined
 
 
 def find_sector(azimuth_rad: Floats, sectors: int) -> Integers:
@@ -106,7 +115,8 @@ def estimate_step(azimuth_rad: Floats) -> float:
 def cluster_returns(scan: Scan, chosen: Integers) -> Integers:
     """Number the clusters of the chosen returns, the nearest first.
 
-    A cluster is a connected set: each return lies within reach of another one (DBSCAN with one sample as the least).
+    A cluster is a connected set: each return lies within reach of another one (DBSCAN with one sample as the least). It
+    ends where beams pass through it.
 
     Returns:
         (len(chosen),) numbers from 0.
@@ -122,12 +132,52 @@ def cluster_returns(scan: Scan, chosen: Integers) -> Integers:
     _, first, of_cell = np.unique((cell + 2**19) @ 2 ** np.array([40, 20, 0]), return_index=True, return_inverse=True)
     with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
         _, label = dbscan(cell[first] * CELL, eps=1.0, min_samples=1, algorithm="ball_tree")  # no threads that wait
-    label = label[of_cell]
+    label = part_at_gaps(scan, chosen, label[of_cell])
     nearest = np.full(label.max() + 1, np.inf)
     np.minimum.at(nearest, label, scan.range_m[chosen])
     number = np.empty(nearest.size, np.int64)
     number[np.argsort(nearest, kind="stable")] = np.arange(nearest.size)
     return cast(Integers, number[label])
+
+
+def part_at_gaps(scan: Scan, chosen: Integers, label: Integers) -> Integers:
+    """Part clusters where all beams between two neighboring returns went past them.
+
+    A vehicle is convex: beams between two of its returns meet it, or something nearer that is as high in the picture
+    as the higher one.
+
+    Args:
+        scan: returns.
+        chosen: (N,) those in clusters.
+        label: (N,) their clusters, numbered from 0.
+
+    Returns:
+        (N,) numbers from 0.
+    """
+    count = np.bincount(label)
+    mean = np.column_stack([np.bincount(label, scan.place_m[chosen, axis]) for axis in (0, 1)]) / count[:, None]
+    turned = (scan.azimuth_rad[chosen] - np.arctan2(mean[:, 1], mean[:, 0])[label] + np.pi) % (2 * np.pi)
+    order = np.lexsort((turned, label))
+    nearer = np.minimum(scan.range_m[chosen[order[1:]]], scan.range_m[chosen[order[:-1]]])
+    gap = np.diff(turned[order])
+    same = label[order[1:]] == label[order[:-1]]
+    gaps = np.flatnonzero(same & (gap > PASSING_STEPS * scan.step_rad) & (gap * nearer > CLEARANCE_M))
+    if not gaps.size:
+        return label
+    sectors = scan.nearest_m.size
+    sector = find_sector(scan.azimuth_rad, sectors)  # not falling
+    low = np.searchsorted(sector, sector[chosen[order[gaps]]], "right")
+    high = np.searchsorted(sector, sector[chosen[order[gaps + 1]]], "left")
+    between, which = expand_ranges(low, (high - low) % sector.size)
+    between %= sector.size
+    higher = np.maximum(scan.slope[chosen[order[gaps]]], scan.slope[chosen[order[gaps + 1]]])
+    hides = (scan.range_m[between] < nearer[gaps][which] + HIDING_M) & (scan.slope[between] > higher[which] - SAME_BEAM)
+    hidden = np.bincount(which[hides], minlength=gaps.size) > 0
+    parted = np.zeros(label.size, np.int64)
+    parted[gaps[~hidden] + 1] = 1
+    parts = np.empty(label.size, np.int64)
+    parts[order] = label[order] + np.cumsum(parted)
+    return parts
 
 
 def _scale(scan: Scan, chosen: Integers) -> Floats:

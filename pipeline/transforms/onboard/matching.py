@@ -18,13 +18,19 @@ from tracklake.schemas.perception import FIRST_LIDAR_ID
 
 LOOSE_M2 = 1.0
 """Sum of the variances of x and y from which on a station's place is uncertain, in m2."""
+LOST_M = 0.9
+"""Standard deviation of a place across the road from which on a vehicle may be in the next lane, in m: half of half a
+lane."""
 NEAR, UNSEEN = 13.8, 9.0
 """Squared Mahalanobis distances: of two places (1 in 1,000), and of a place and velocity that is as likely as that the
 station is hidden and the track is of a vehicle that sends nothing, at 1 vehicle per 175 m2 of which half are hidden."""
 TALL_WIDTH_M = 1.95
 """Width that all vehicles have that are taller than TRUCK_HEIGHT_M, in m: vans are 2.0 m wide, trucks 2.5 m."""
-CLEAR = 3.0
-"""Squared Mahalanobis distance by which the next best assignment must be worse."""
+CLEAR, SURE = 3.0, 9.21
+"""Squared Mahalanobis distances by which the next best assignment must be worse: the best one is 4 times and 100 times
+as likely."""
+SURE_VOTES = 2
+"""Votes for a pair that is sure; one that is only clear has one, because it may change as more stations are settled."""
 MOST_SHIFTS = 60
 """Common shifts that are tried at most."""
 STRIKES = 10
@@ -41,6 +47,14 @@ def is_station(tracks: Tracks) -> Flags:
 def is_loose(tracks: Tracks) -> Flags:
     """Tell which tracks are of stations whose place is uncertain."""
     return is_station(tracks) & (tracks.covariance[:, 0, 0] + tracks.covariance[:, 1, 1] > LOOSE_M2)
+
+
+def is_lost(tracks: Tracks, tick: int) -> Flags:
+    """Tell which tracks that LiDAR does not see may be in the next lane: what it sees there may be another vehicle."""
+    across = np.stack((-np.sin(tracks.heading_rad), np.cos(tracks.heading_rad)), 1)
+    variance = np.einsum("ni,nij,nj->n", across, tracks.covariance[:, POSITION, POSITION], across)
+    lost: Flags = (tracks.seen < tick) & (variance > LOST_M**2)
+    return lost
 
 
 def guess_velocities(tracks: Tracks, place_m: Floats, usual_mps: Floats) -> Floats:
@@ -60,7 +74,7 @@ def guess_velocities(tracks: Tracks, place_m: Floats, usual_mps: Floats) -> Floa
 
 
 def match_stations(tracks: Tracks, heard: Flags, ego_m: Floats, heading_sd_rad: float) -> Integers:
-    """Return (N, 2) rows of LiDAR tracks and stations that are clearly one vehicle by the present states.
+    """Return rows of LiDAR tracks and stations that are clearly one vehicle by the present states, and votes: (N, 3).
 
     Args:
         tracks: tracks of a tick.
@@ -71,7 +85,7 @@ def match_stations(tracks: Tracks, heard: Flags, ego_m: Floats, heading_sd_rad: 
     lidar = np.flatnonzero(tracks.vehicle_id >= FIRST_LIDAR_ID)
     lidar = lidar[~_find_doubles(tracks, lidar)]
     stations = np.flatnonzero(is_loose(tracks) & heard)
-    none = np.empty((0, 2), dtype=np.int64)
+    none = np.empty((0, 3), dtype=np.int64)
     if not lidar.size or not stations.size:
         return none
     state, covariance, effect, spread = _expect_offsets(tracks, stations, ego_m, heading_sd_rad)
@@ -90,9 +104,9 @@ def match_stations(tracks: Tracks, heard: Flags, ego_m: Floats, heading_sd_rad: 
     best = pairs[int(np.argmin(cost))]
     taken = (pairs[:, :, None] == best).any(1)  # (K, S): whether some station has the track that is the best for each
     rival = (pairs != best) & ((pairs >= 0) | taken)
-    rivals = np.where(rival, cost[:, None], np.inf).min(0)
-    good = np.flatnonzero((best >= 0) & (rivals - cost.min() >= CLEAR))
-    return np.stack((lidar[best[good]], stations[good]), 1)
+    lead = np.where(rival, cost[:, None], np.inf).min(0) - cost.min()
+    good = np.flatnonzero((best >= 0) & (lead >= CLEAR))
+    return np.stack((lidar[best[good]], stations[good], np.where(lead[good] >= SURE, SURE_VOTES, 1)), 1)
 
 
 def _find_doubles(tracks: Tracks, lidar: Integers) -> Flags:

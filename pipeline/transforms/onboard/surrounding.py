@@ -26,6 +26,7 @@ from tracklake.pipeline.transforms.onboard.matching import (
     find_contradicted,
     guess_velocities,
     is_loose,
+    is_lost,
     match_stations,
     merge_stations,
 )
@@ -66,8 +67,8 @@ MAX_UNSEEN_S = 1.0
 """Time without a LiDAR hit after which a vehicle that sends no messages is gone, in s."""
 CONFIRMING_HITS, FORGIVEN_MISSES = 4, 2
 """LiDAR hits that confirm a track, and misses before then that end it."""
-TICKS_PER_MERGE_CHECK, MERGE_CHECKS = 3, 3
-"""Ticks from one comparison of stations and LiDAR tracks to the next, and how often in a row they must match."""
+TICKS_PER_MERGE_CHECK, MERGE_VOTES = 3, 6
+"""Ticks from one comparison of stations and LiDAR tracks to the next, and votes that a pair needs without a break."""
 FIRST_TENTATIVE_ID = 1_000_000_000
 """Least id by which tracks that are not confirmed are shown to LiDAR."""
 LIDAR_REACH_M = 130.0
@@ -278,7 +279,7 @@ class Tracker:
         self._tracks.heading_rad[moving] = np.arctan2(velocity[moving, 1], velocity[moving, 0])
 
     def _merge(self, tick: int) -> None:
-        """Take a station and a LiDAR track for one vehicle that match MERGE_CHECKS times in a row; part others."""
+        """Take a station and a LiDAR track for one vehicle that match for MERGE_VOTES votes in a row; part others."""
         tracks = self._tracks
         wrong = find_contradicted(tracks)
         if wrong.any():  # LiDAR goes on with a vehicle of its own; the station begins with its next message
@@ -288,14 +289,14 @@ class Tracker:
         if tick % TICKS_PER_MERGE_CHECK:
             return
         recent = (tracks.heard >= 0) & (tick - tracks.heard <= TICK_RATE_HZ)
-        rows, stations = match_stations(
+        rows, stations, votes = match_stations(
             tracks, recent, self._ego.odometry_m[tick], float(self._ego.heading_sigma_rad[tick])
         ).T
         rivalry = np.zeros_like(tracks.rivalry)
-        rivalry[rows] = np.where(tracks.rival[rows] == tracks.vehicle_id[stations], tracks.rivalry[rows] + 1, 1)
+        rivalry[rows] = np.where(tracks.rival[rows] == tracks.vehicle_id[stations], tracks.rivalry[rows], 0) + votes
         tracks.rivalry = rivalry
         tracks.rival[rows] = tracks.vehicle_id[stations]
-        ready = rivalry[rows] >= MERGE_CHECKS
+        ready = rivalry[rows] >= MERGE_VOTES
         if ready.any():
             self._tracks = merge_stations(tracks, np.stack((rows[ready], stations[ready]), 1))
             self.counts["merged"] += int(ready.sum())
@@ -307,12 +308,12 @@ class Tracker:
         self._next_id += count
 
     def _end(self, tick: int) -> None:
-        """End the tracks of vehicles that were neither heard nor seen for long enough."""
+        """End the tracks of vehicles that were neither heard nor seen for long enough, or whose lane is unknown."""
         tracks = self._tracks
         heard = (tracks.heard >= 0) & (tick - tracks.heard <= MAX_PREDICTION_S * TICK_RATE_HZ)
         seen = (tracks.seen >= 0) & (tick - tracks.seen <= MAX_UNSEEN_S * TICK_RATE_HZ)
         missed = (tracks.vehicle_id == TENTATIVE) & (tracks.scans - tracks.hits > FORGIVEN_MISSES)
-        keep = (heard | seen) & ~missed
+        keep = (heard | seen & ~is_lost(tracks, tick)) & ~missed
         if not keep.all():
             self.counts["tracks_ended"] += int((~keep & (tracks.vehicle_id != TENTATIVE)).sum())
             self._tracks = tracks.take(keep)

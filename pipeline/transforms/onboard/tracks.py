@@ -59,7 +59,7 @@ class Tracks:
         seen: (V,) last tick at which LiDAR measured it; -1 never.
         scans: (V,) LiDAR scans since its birth, and the hits among them.
         lean: (V,) by how much the centre moves ahead per half metre that the vehicle is longer, by its last LiDAR hit.
-        rival: (V,) station that a LiDAR track is taken for, and how often in a row.
+        rival: (V,) station that a LiDAR track is taken for, and the votes for it in a row.
         strikes: (V,) messages in a row that contradict the state.
     """
 

@@ -48,10 +48,31 @@ def find_leaders(pieces: Pieces, vehicles: pl.DataFrame) -> Leaders:
     keys, wanted = join_key(ids[pieces.row], pieces.frame), join_key(leader, pieces.frame)
     point = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     point = np.where((leader >= 0) & (keys[point] == wanted), point, -1)
-    known = vehicles.sort("vehicle_id")
-    lengths = known["length_m"].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    place = np.minimum(np.searchsorted(known["vehicle_id"].to_numpy(), leader), max(len(lengths) - 1, 0))
-    return Leaders(point, np.where(point >= 0, lengths[place], np.nan))
+    return Leaders(point, np.where(point >= 0, read_trait(pieces, vehicles, "length_m")[point], np.nan))
+
+
+def find_vehicles_ahead(pieces: Pieces, vehicles: pl.DataFrame, x: Floats, y: Floats) -> Leaders:
+    """Find the next vehicle ahead in the lane of each recorded point, by positions, unless it is beside the vehicle.
+
+    Points whose x is NaN have none, and are none.
+    """
+    lane = pieces.tracks["lane"].fill_null(-1).to_numpy()[pieces.row]
+    known = np.flatnonzero(pieces.recorded & (lane >= 0) & np.isfinite(x))
+    order = known[np.lexsort((x[known], lane[known], pieces.frame[known]))]
+    behind, ahead = order[:-1], order[1:]
+    width_m = read_trait(pieces, vehicles, "width_m")
+    beside = np.abs(y[behind] - y[ahead]) >= (width_m[behind] + width_m[ahead]) / 2
+    follows = (pieces.frame[behind] == pieces.frame[ahead]) & (lane[behind] == lane[ahead]) & ~beside
+    point = np.full(pieces.points, -1)
+    point[behind[follows]] = ahead[follows]
+    return Leaders(point, np.where(point >= 0, read_trait(pieces, vehicles, "length_m")[point], np.nan))
+
+
+def read_trait(pieces: Pieces, vehicles: pl.DataFrame, column: str) -> Floats:
+    """Return a column of `vehicles` at every point, (N,); NaN where it is null."""
+    ids = pieces.tracks.select("vehicle_id")
+    values = ids.join(vehicles.select("vehicle_id", column), on="vehicle_id", how="left", maintain_order="left")[column]
+    return values.cast(pl.Float64).fill_null(np.nan).to_numpy()[pieces.row]
 
 
 def keep_behind_leaders(

@@ -21,7 +21,7 @@ from tracklake.pipeline.transforms.reconstruction.lateral import bound_lateral, 
 from tracklake.pipeline.transforms.reconstruction.motion import Problem, bound_motion
 from tracklake.pipeline.transforms.reconstruction.noise import LEAST_HZ, Noise, estimate_noise
 from tracklake.pipeline.transforms.reconstruction.pieces import Pieces, Skip, cut_pieces
-from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, keep_behind_leaders
+from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, find_vehicles_ahead, keep_behind_leaders
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, make_penalty, smooth_robustly
 from tracklake.schemas.arrays import Flags, Floats
 from tracklake.schemas.columns import Table
@@ -91,7 +91,7 @@ def reconstruct(
 
     Args:
         tracks: vehicle_id, frame, time_s, x_m, y_m, lane, leader_id, in any order.
-        vehicles: vehicle_id, class, length_m; all but the first may be null.
+        vehicles: vehicle_id, class, length_m, width_m; all but the first may be null.
         facts: the subset's row of `subsets`.
         config: settings.
     """
@@ -107,6 +107,8 @@ def reconstruct(
         runs.append(lateral_runs)
     entries = _list_entries(pieces, series, along, across, facts)
     outside = _find_outside(pieces, series, entries, skips)
+    if pieces.points:
+        runs.append(_list_overlaps(pieces, vehicles, replace(along, x=np.where(outside, np.nan, along.x)), across))
     entries = entries.filter(~outside)
     unkept = _list_unkept(pieces, [run.leave_out(outside) for run in runs], facts)
     return Reconstruction(
@@ -158,8 +160,6 @@ def _reconstruct_along(
         skips.append(Skip("no_length", followers, int(unknown.sum()), "overlaps with leaders of unknown length"))
     values = measure_motion(series, x)
     broken = find_breaks(values, limit(x))
-    values["overlap"] = leaders.measure_gaps(x)
-    broken["overlap"] = values["overlap"] < 0
     runs = [list_runs(series, bound, broken[bound], values[bound]) for bound in broken]
     return replace(smoothed, x=x), runs
 
@@ -180,6 +180,13 @@ def _reconstruct_across(
     accel = differentiate(series, y)[1]
     runs = list_runs(series, "lateral_acceleration", np.abs(accel) > config.lateral_accel_mps2, accel)
     return replace(smoothed, x=y), runs
+
+
+def _list_overlaps(pieces: Pieces, vehicles: pl.DataFrame, along: Axis, across: Axis) -> Runs:
+    """Return the runs that overlap the recorded leader, or the next vehicle ahead by positions; none at NaN."""
+    ahead = (find_leaders(pieces, vehicles), find_vehicles_ahead(pieces, vehicles, along.x, across.x))
+    gaps = np.fmin(*(each.measure_gaps(along.x) for each in ahead))
+    return list_runs(along.problem.series, "overlap", gaps < 0, gaps)
 
 
 def _list_entries(pieces: Pieces, series: Series, along: Axis, across: Axis, facts: Mapping[str, Any]) -> pl.DataFrame:

@@ -30,6 +30,10 @@ def test_a_whole_lake_is_up_to_date(command, lake):
         )
         expected = connection.sql(query).fetchall()
         drives = connection.sql("SELECT count(*) FROM drives").fetchall()[0][0]
+        others = connection.sql(
+            "SELECT subset, count(*), sum(messages) FROM stations WHERE NOT own GROUP BY subset ORDER BY subset"
+        ).fetchall()
+    assert [(row["subset"], row["stations"], row["messages"]) for row in said["drives"]] == others
     names = ("dataset", "recording", "subsets", "vehicles", "entries")
     assert [tuple(row[name] for name in names) for row in said["recordings"]] == expected
     assert {state["stage"]: (state["done"], state["possible"]) for state in said["stages"]}["ingest"] == (

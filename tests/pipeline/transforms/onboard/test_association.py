@@ -177,6 +177,19 @@ def test_two_cars_in_one_cluster_are_parted() -> None:
         assert np.hypot(*(found.centre_m - [(box.x_m, box.y_m) for box in boxes]).T).max() < 0.3
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+def test_beams_that_pass_between_two_vehicles_part_their_cluster(hidden: bool) -> None:
+    """One return of a car 0.7 m beside a truck's front; a car before the gap that is as high would hide it."""
+    boxes = [CarBox(-60.4, 0.5), truck(-65.0, 3.4)]
+    points, hit = cast_rays(boxes, noise_m=NOISE_M)
+    corner = np.flatnonzero(hit == 0)[points[hit == 0][:, 1].argmax()]
+    kept = points[(hit == 1) | (np.arange(hit.size) == corner)]
+    nearer = [[x, -0.031 * x, 3.5] for x in np.arange(-30.0, -29.0, 0.1)] if hidden else np.empty((0, 3))
+    found = measure_by_lidar(np.vstack([kept, nearer]), predict([]))
+    together = np.isin(found.clusters["returns"], len(kept))
+    assert together.any() == hidden
+
+
 def test_truck_hidden_in_the_middle_is_one_vehicle() -> None:
     """A van between hides the middle of a truck beside: cab and trailer are two clusters and one measurement."""
     boxes = [truck(10.0, 7.2), CarBox(5.0, 3.6, 0.0, 2.0, 1.0, 4.5)]

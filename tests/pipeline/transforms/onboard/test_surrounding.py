@@ -7,7 +7,7 @@ from drive_scenes import compare, drive, measure_centres
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tracklake.pipeline.transforms.onboard.matching import match_stations
+from tracklake.pipeline.transforms.onboard.matching import SURE_VOTES, is_lost, match_stations
 from tracklake.pipeline.transforms.onboard.measurements import Camera, CameraMeasurement
 from tracklake.pipeline.transforms.onboard.surrounding import MAX_PREDICTION_S, Sensors, fuse_drive
 from tracklake.pipeline.transforms.onboard.tracks import make_tracks
@@ -116,13 +116,17 @@ def test_track_of_lidar_alone_ends_when_it_is_not_seen():
 
 
 def test_no_swaps_among_neighbors_that_drive_alike():
-    """Three lanes side by side at one speed; the ego's GPS and theirs are off by 1 m per axis each."""
-    wrong = 0
+    """Three lanes side by side at one speed; the ego's GPS and theirs are off by 1 m per axis each.
+
+    In one drive of six the likeliest assignment is never clearly likelier than the next: none is made there.
+    """
+    placed = []
     for seed in range(6):
         scene = drive([0, 50, 50, 50], [0, -3.7, 0, 3.7], [30, 30, 30, 30], seconds=12, seed=seed, gps_m=1.0)
-        rows = compare(scene, fuse(scene).tables[SURROUNDING]).filter(pl.col("tick") > 60)
-        wrong += int((rows.group_by("vehicle_id").agg(pl.col("error_m").median())["error_m"] > 1.0).sum())
-    assert wrong == 0
+        rows = compare(scene, fuse(scene).tables[SURROUNDING]).filter(pl.col("tick") > 60, pl.col("from_lidar"))
+        placed += rows.group_by("vehicle_id").agg(pl.col("error_m").median())["error_m"].to_list()
+    assert max(placed) < 1.0
+    assert len(placed) >= 15
 
 
 @pytest.mark.parametrize(
@@ -143,7 +147,7 @@ def test_second_lidar_track_upon_a_station_is_no_hidden_neighbor(place_m, matche
     tracks = make_tracks(np.arange(3), np.array([1, 2, FIRST_LIDAR_ID]), state, covariance, np.full(3, 2.0))
     tracks.size_m[:2, :2] = 4.5, 1.8
     found = match_stations(tracks, np.array([True, True, False]), np.zeros(2), 0.02)
-    assert found.tolist() == ([[2, 1]] if matches else [])
+    assert found.tolist() == ([[2, 1, SURE_VOTES]] if matches else [])
 
 
 @pytest.mark.parametrize(
@@ -158,7 +162,18 @@ def test_truck_that_lidar_sees_is_no_station_that_sends_the_width_of_a_car(heigh
     tracks = make_tracks(np.arange(2), np.array([1, FIRST_LIDAR_ID]), state, covariance, np.full(2, 2.0))
     tracks.size_m[0, :2], tracks.size_m[1] = (4.8, width_m), (4.8, 1.85, height_m)
     found = match_stations(tracks, np.array([True, False]), np.zeros(2), 0.02)
-    assert found.tolist() == ([[1, 0]] if matches else [])
+    assert found.tolist() == ([[1, 0, SURE_VOTES]] if matches else [])
+
+
+@pytest.mark.parametrize(("across_m", "seen", "lost"), [(1.0, 4, True), (1.0, 5, False), (0.8, 4, False)])
+def test_track_that_may_be_in_the_next_lane_is_lost(across_m, seen, lost):
+    """It drives to the side of the ego, so what is unknown along x is across its own way."""
+    state = np.zeros((1, 9))
+    state[0, 3] = 25
+    covariance = np.diag([across_m**2, 9.0] + [0.25] * 7)[None]
+    track = make_tracks(np.zeros(1, int), np.array([FIRST_LIDAR_ID]), state, covariance, np.ones(1))
+    track.seen[:] = seen
+    assert is_lost(track, 5).tolist() == [lost]
 
 
 def test_rear_of_a_truck_stands_still_while_its_length_is_found():
