@@ -10,6 +10,7 @@ from reconstruction_scores import Scene, count_jerk_changes
 
 from tracklake.pipeline.transforms.reconstruction.config import ReconstructionConfig
 from tracklake.quality_reports.published import TOTALS, list_published
+from tracklake.schemas.arrays import Floats
 
 EXCERPTS = {
     "ngsim/us101_0750_290_vehicles.csv.gz": "US-101, 07:50, 290 vehicles",
@@ -19,6 +20,14 @@ EXCERPTS = {
 HIGH_MPS2 = 3.0
 """Acceleration, of either sign, whose share is stated, in m/s2."""
 RATE_HZ = 10.0
+LARGE_MPS3 = 15.0
+"""Jerk, of either sign, whose share is stated, in m/s3."""
+ARTICLE = "I-80, NGSIM's own: published (J. Adv. Transp. 2023, 2661136, table 2)"
+PUBLISHED_LINES = (
+    f"| {ARTICLE} | recorded | - | - | - | - | - | 22.8% | 75.2% | - | - |",
+    f"| {ARTICLE} | filtered | - | - | - | - | - | 0.2% | 13.5% | - | - |",
+)
+"""Means over vehicles in the Journal of Advanced Transportation 2023, article 2661136."""
 PUBLISHED = "us-101-0750"
 """Recording with published figures."""
 
@@ -26,8 +35,9 @@ PUBLISHED = "us-101-0750"
 def render_excerpts(folder: Path) -> str:
     """Render a table of the excerpts that are there."""
     lines = [
-        "| recording | | entries | beyond 3 m/s² | above 3.05 m/s² | exactly 0 | jerk sign changes, 1/s | backward |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| recording | | entries | beyond 3 m/s² | above 3.05 m/s² | exactly 0 | jerk sign changes, 1/s | "
+        "jerk beyond 15 m/s³ | seconds with two changes | backward | overlaps |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, title in EXCERPTS.items():
         if (folder / name).exists():
@@ -36,8 +46,9 @@ def render_excerpts(folder: Path) -> str:
     entries, total = counts[PUBLISHED] or 0, TOTALS[PUBLISHED][1]
     lines.append(
         f"| US-101, 07:50, all 2,169 vehicles: published (Hamalainen 2020) | recorded | {total:,} | - | "
-        f"{entries / total:.1%} | - | - | - |"
+        f"{entries / total:.1%} | - | - | - | - | - | - |"
     )
+    lines += PUBLISHED_LINES
     return "\n".join(lines)
 
 
@@ -65,4 +76,35 @@ def _measure(motion: Motion, scene: Scene) -> list[str]:
     )
     changes, seconds = count_jerk_changes(motion.accel, scene)
     backward = f"{np.mean(motion.speed < 0):.2%}"
-    return [*(f"{np.mean(each):.1%}" for each in shares), f"{changes.sum() / seconds.sum():.2f}", backward]
+    return [
+        *(f"{np.mean(each):.1%}" for each in shares),
+        f"{changes.sum() / seconds.sum():.2f}",
+        *(f"{each:.1%}" for each in _measure_jerk(motion.accel, scene)),
+        backward,
+        _count_overlaps(motion.x, scene),
+    ]
+
+
+def _measure_jerk(accel: Floats, scene: Scene) -> tuple[float, float]:
+    """Return means over vehicles of shares: of large jerks, and of seconds in which the jerk changes its sign twice."""
+    run = np.repeat(np.arange(len(scene.runs.begins)), scene.runs.lengths)
+    steps = np.flatnonzero(np.diff(run) == 0)
+    jerk = (accel[steps + 1] - accel[steps]) * scene.runs.rate_hz
+    vehicle = scene.vehicle[steps]
+    large = np.bincount(vehicle, np.abs(jerk) > LARGE_MPS3) / np.bincount(vehicle)
+    windows = (steps - scene.runs.begins[run[steps]]) // int(scene.runs.rate_hz)
+    moves = np.flatnonzero(jerk)
+    turns = moves[1:][(np.diff(np.sign(jerk[moves])) != 0) & (np.diff(run[steps[moves]]) == 0)]
+    _, first, window = np.unique(run[steps] * len(run) + windows, return_index=True, return_inverse=True)
+    several = np.bincount(window[turns], minlength=len(first)) > 1
+    number = vehicle[first]
+    return float(large.mean()), float((np.bincount(number, several) / np.bincount(number)).mean())
+
+
+def _count_overlaps(x: Floats, scene: Scene) -> str:
+    """Count entries whose front is nearer to their recorded leader's than its length, and vehicles that have some."""
+    led = np.flatnonzero((scene.leader >= 0) & (scene.leader_length > 0))
+    if not led.size:
+        return "-"
+    near = led[x[scene.leader[led]] - scene.leader_length[led] < x[led]]
+    return f"{near.size:,} of {led.size:,} ({len(np.unique(scene.vehicle[near]))} vehicles)"

@@ -36,7 +36,8 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
         notes = _explain_empty(derived, reader.subset, reader.facts["entries"])
         return StageResult(_complete(derived, reader.partition), notes=notes)
     left_out: Derived = {table: (table.empty(), {"arterial": reader.facts["entries"]}) for table in DERIVED_TABLES}
-    return StageResult(_complete(left_out, reader.partition))
+    note = f"{reader.subset}: traffic tables are skipped: an arterial, and they are of freeways"
+    return StageResult(_complete(left_out, reader.partition), notes=[note])
 
 
 def open_scene(reader: SubsetReader, settings: Settings) -> Scene:

@@ -137,7 +137,7 @@ def cluster_returns(scan: Scan, chosen: Integers) -> Integers:
     np.minimum.at(nearest, label, scan.range_m[chosen])
     number = np.empty(nearest.size, np.int64)
     number[np.argsort(nearest, kind="stable")] = np.arange(nearest.size)
-    return cast(Integers, number[label])
+    return number[label]
 
 
 def part_at_gaps(scan: Scan, chosen: Integers, label: Integers) -> Integers:

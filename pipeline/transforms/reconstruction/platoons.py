@@ -51,21 +51,29 @@ def find_leaders(pieces: Pieces, vehicles: pl.DataFrame) -> Leaders:
     return Leaders(point, np.where(point >= 0, read_trait(pieces, vehicles, "length_m")[point], np.nan))
 
 
-def find_vehicles_ahead(pieces: Pieces, vehicles: pl.DataFrame, x: Floats, y: Floats) -> Leaders:
-    """Find the next vehicle ahead in the lane of each recorded point, by positions, unless it is beside the vehicle.
+def measure_overlaps(pieces: Pieces, vehicles: pl.DataFrame, x: Floats, y: Floats) -> Floats:
+    """Return how deep each recorded point (N,) is in a vehicle ahead of it, whether its leader or not, as -m; else NaN.
 
-    Points whose x is NaN have none, and are none.
+    The depth is the lesser of the two along and across the road. Vehicles of unknown widths overlap in one lane only.
+    Points whose x is NaN overlap nothing.
     """
     lane = pieces.tracks["lane"].fill_null(-1).to_numpy()[pieces.row]
-    known = np.flatnonzero(pieces.recorded & (lane >= 0) & np.isfinite(x))
-    order = known[np.lexsort((x[known], lane[known], pieces.frame[known]))]
-    behind, ahead = order[:-1], order[1:]
-    width_m = read_trait(pieces, vehicles, "width_m")
-    beside = np.abs(y[behind] - y[ahead]) >= (width_m[behind] + width_m[ahead]) / 2
-    follows = (pieces.frame[behind] == pieces.frame[ahead]) & (lane[behind] == lane[ahead]) & ~beside
-    point = np.full(pieces.points, -1)
-    point[behind[follows]] = ahead[follows]
-    return Leaders(point, np.where(point >= 0, read_trait(pieces, vehicles, "length_m")[point], np.nan))
+    length_m, width_m = (read_trait(pieces, vehicles, name) for name in ("length_m", "width_m"))
+    known = np.flatnonzero(pieces.recorded & np.isfinite(x))
+    order = known[np.lexsort((x[known], pieces.frame[known]))]
+    found = np.full(pieces.points, np.nan)
+    ahead, step = np.arange(1, len(order)), 1
+    while ahead.size:
+        first, second = order[ahead], order[ahead - step]
+        gap_m = x[first] - length_m[first] - x[second]
+        near = (pieces.frame[first] == pieces.frame[second]) & (gap_m < 0)
+        ahead, first, second, gap_m = ahead[near], first[near], second[near], gap_m[near]
+        apart_m = np.abs(y[first] - y[second]) - (width_m[first] + width_m[second]) / 2
+        apart_m = np.where(np.isnan(apart_m), np.where(lane[first] == lane[second], -np.inf, np.inf), apart_m)
+        found[second] = np.fmin(found[second], np.where(apart_m < 0, np.maximum(gap_m, apart_m), np.nan))
+        step += 1
+        ahead = ahead[ahead >= step]
+    return found
 
 
 def read_trait(pieces: Pieces, vehicles: pl.DataFrame, column: str) -> Floats:

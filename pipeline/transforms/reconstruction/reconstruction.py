@@ -21,7 +21,7 @@ from tracklake.pipeline.transforms.reconstruction.lateral import bound_lateral, 
 from tracklake.pipeline.transforms.reconstruction.motion import Problem, bound_motion
 from tracklake.pipeline.transforms.reconstruction.noise import LEAST_HZ, Noise, estimate_noise
 from tracklake.pipeline.transforms.reconstruction.pieces import Pieces, Skip, cut_pieces
-from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, find_vehicles_ahead, keep_behind_leaders
+from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, keep_behind_leaders, measure_overlaps
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, make_penalty, smooth_robustly
 from tracklake.schemas.arrays import Flags, Floats
 from tracklake.schemas.columns import Table
@@ -183,9 +183,9 @@ def _reconstruct_across(
 
 
 def _list_overlaps(pieces: Pieces, vehicles: pl.DataFrame, along: Axis, across: Axis) -> Runs:
-    """Return the runs that overlap the recorded leader, or the next vehicle ahead by positions; none at NaN."""
-    ahead = (find_leaders(pieces, vehicles), find_vehicles_ahead(pieces, vehicles, along.x, across.x))
-    gaps = np.fmin(*(each.measure_gaps(along.x) for each in ahead))
+    """Return the runs that overlap the recorded leader, or another vehicle ahead; none at NaN."""
+    others = measure_overlaps(pieces, vehicles, along.x, across.x)
+    gaps = np.fmin(find_leaders(pieces, vehicles).measure_gaps(along.x), others)
     return list_runs(along.problem.series, "overlap", gaps < 0, gaps)
 
 

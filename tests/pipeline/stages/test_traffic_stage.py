@@ -98,6 +98,9 @@ def test_an_arterial_is_left_out_and_counted(lake):
     entries = open_subset(lake).facts["entries"]
     assert all(made.tables[table].is_empty() for table in DERIVED_TABLES)
     assert made.tables[TRAFFIC_SKIPS].select("reason", "number").unique().rows() == [("arterial", entries)]
+    assert [note.partition(": ")[2] for note in made.notes] == [
+        "traffic tables are skipped: an arterial, and they are of freeways"
+    ]
 
 
 def test_a_source_without_lanes_is_a_note(lake):

@@ -179,13 +179,26 @@ def test_overlaps_of_vehicles_that_are_not_recorded_as_leader_and_follower_are_l
     tracks = make_tracks((1, frames, 100 + way), (2, frames, 97 + way))
     found = run_reconstruction(tracks).unkept
     assert found.select("vehicle_id", "bound", "first_frame", "entries").rows() == [(2, "overlap", 0, 30)]
-    assert found["worst"].item() == pytest.approx(100 - 97 - make_vehicles(tracks)["length_m"][0])
+    assert found["worst"].item() == pytest.approx(100 - 97 - 4)
+
+    def move(sideways_m):
+        return tracks.with_columns(y_m=pl.col("y_m") + sideways_m * (pl.col("vehicle_id") == 2))
+
+    assert run_reconstruction(move(2.0)).unkept.is_empty()
+    assert run_reconstruction(move(1.5)).unkept["worst"].item() == pytest.approx(-0.3, abs=1e-3)
+    unknown = make_vehicles(tracks).with_columns(width_m=pl.lit(None, pl.Float64))
+    assert run_reconstruction(move(2.0), unknown).unkept.height == 1
     other_lane = pl.when(pl.col("vehicle_id") == 2).then(2).otherwise(1).cast(pl.Int16)
-    assert run_reconstruction(tracks.with_columns(lane=other_lane)).unkept.is_empty()
-    sideways = tracks.with_columns(y_m=pl.col("y_m") + 2.0 * (pl.col("vehicle_id") == 2))
-    assert run_reconstruction(sideways).unkept.is_empty()
-    narrow = make_vehicles(tracks).with_columns(width_m=pl.lit(None, pl.Float64))
-    assert run_reconstruction(sideways, narrow).unkept.height == 1
+    assert run_reconstruction(move(2.0).with_columns(lane=other_lane), unknown).unkept.is_empty()
+
+
+def test_overlaps_beyond_a_vehicle_in_another_lane_are_found():
+    """By position, the vehicle beside them comes between the two."""
+    frames, way = range(30), np.arange(30.0)
+    tracks = make_tracks((1, frames, 100 + way), (2, frames, 97 + way), (3, frames, 98 + way))
+    beside = tracks.with_columns(y_m=pl.col("y_m") + 3.6 * (pl.col("vehicle_id") == 3))
+    found = run_reconstruction(beside).unkept
+    assert found.select("vehicle_id", "entries", "worst").rows() == [(2, 30, pytest.approx(-1.0))]
 
 
 def test_a_recording_without_lanes_is_smoothed_and_says_what_is_left_out():
