@@ -3,7 +3,7 @@
 A vehicle ahead of the ego accelerates or brakes, and keeps its lane or changes it (Choi et al., 2021), among others in
 three lanes. Messages, LiDAR and camera are those of virtual instruments; the truth is known.
 
-python benchmarks/onboard_association.py [--seeds 20] [--gnss plain] [--penetration 1.0]
+python benchmarks/onboard_association.py [--seeds 20] [--first 0] [--gnss plain] [--penetration 1.0]
 """
 
 import argparse
@@ -200,7 +200,7 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
     yield "| --- | --- | --- | --- | --- | --- |"
     for number, ((rate, change), name) in enumerate(SCENARIOS.items()):
         counts = {variant: np.zeros(3, np.int64) for variant in variants}
-        for seed in range(arguments.seeds):
+        for seed in range(arguments.first, arguments.first + arguments.seeds):
             tracks, vehicles = drive_vehicles(np.random.default_rng([number, seed]), rate, change)
             facts = {"dataset": "highd", "subset": "scenario"}
             sensed = sense_drive(tracks, vehicles, facts, EGO, replace(base, seed=1000 * number + seed))
@@ -230,6 +230,7 @@ def run(arguments: argparse.Namespace) -> Iterator[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="drives for each scenario")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--gnss", default="plain", choices=("plain", "dgps"))
     parser.add_argument("--penetration", type=float, default=1.0)
     for line in run(parser.parse_args()):
