@@ -51,7 +51,8 @@ class LaneForestSettings:
     """How examples are labelled, drawn and learned from; stored with the forest.
 
     Args:
-        start_s: T_d, time from a maneuver's start to its end, s.
+        start_s: T_d, time from a maneuver's start to its end, s; with `measured_start`, the longest.
+        measured_start: whether a maneuver starts where the vehicle leaves its lane's centre, not T_d before the end.
         tolerance_m: distance from a lane's centre at which the vehicle has reached it, m.
         examples: largest number drawn from the training part, before augmentation.
         augmentation: names from AUGMENTATIONS.
@@ -63,6 +64,7 @@ class LaneForestSettings:
     """
 
     start_s: float = START_S
+    measured_start: bool = False
     tolerance_m: float = TOLERANCE_M
     examples: int = 10_000
     augmentation: tuple[str, ...] = AUGMENTATIONS
@@ -194,7 +196,13 @@ class Maneuvers(NamedTuple):
     lateral: Bytes
 
 
-def find_maneuvers(folder: TensorFolder, *, start_s: float = START_S, tolerance_m: float = TOLERANCE_M) -> Maneuvers:
+def find_maneuvers(
+    folder: TensorFolder,
+    *,
+    start_s: float = START_S,
+    tolerance_m: float = TOLERANCE_M,
+    measured_start: bool = False,
+) -> Maneuvers:
     """Find every lane change of every run, from T_e - T_d to T_e.
 
     A lane changes where it differs from the row before in the same run; changes from or to an unknown lane (0) do not
@@ -202,6 +210,9 @@ def find_maneuvers(folder: TensorFolder, *, start_s: float = START_S, tolerance_
     beyond it. It is sought until the vehicle leaves the lane, the run ends or T_d has passed; if the centre is not
     reached by then, T_e is the first of the rows nearest to it. No maneuver starts before its run. Lanes without known
     markings are NOMINAL_LANE_M wide from the carriageway's left edge on.
+
+    A measured start is the mirror of T_e: the last row in the old lane at which the vehicle is at its centre or on the
+    other side of it, or else the last of the rows nearest to it; not before T_e - T_d.
 
     Source: Choi et al. 2021, https://doi.org/10.3390/electronics10040420 (keeping, left and right by T_e and T_d).
     """
@@ -219,16 +230,33 @@ def find_maneuvers(folder: TensorFolder, *, start_s: float = START_S, tolerance_
 
     first, last = first[changes], np.minimum(stays[changes + 1] - 1, first[changes] + ticks)
     to_right = lane[first] > lane[first - 1]
+    end = _find_centres(folder, first, last, to_right, tolerance_m)
+    start = np.maximum(end - ticks, folder.run_first_row[folder.runs_of(end)])
+    if measured_start:
+        before = np.maximum(stays[changes - 1], first - ticks)
+        start = np.maximum(start, _find_centres(folder, before, first - 1, ~to_right, tolerance_m, is_last=True))
+    return Maneuvers(start, end, np.where(to_right, RIGHT, LEFT).astype(np.uint8))
+
+
+def _find_centres(
+    folder: TensorFolder,
+    first: Integers,
+    last: Integers,
+    to_right: Flags,
+    tolerance_m: float,
+    *,
+    is_last: bool = False,
+) -> Integers:
+    """Find the first or last of rows `first` to `last` (E,) at the lane's centre or beyond it, else nearest to it."""
     row, change = expand_ranges(first, last - first + 1)
     begins = np.searchsorted(change, np.arange(len(first)))
     offset = _find_offsets(folder, row)
     distance = np.abs(offset)
     is_reached = np.where(to_right[change], offset, -offset) >= -tolerance_m
     is_nearest = distance == np.minimum.reduceat(distance, begins)[change]
-    reached, nearest = (np.minimum.reduceat(np.where(flags, row, rows), begins) for flags in (is_reached, is_nearest))
-    end = np.where(reached < rows, reached, nearest)
-    start = np.maximum(end - ticks, folder.run_first_row[folder.runs_of(end)])
-    return Maneuvers(start, end, np.where(to_right, RIGHT, LEFT).astype(np.uint8))
+    choose, none = (np.maximum, -1) if is_last else (np.minimum, len(folder.lane))
+    reached, nearest = (choose.reduceat(np.where(flags, row, none), begins) for flags in (is_reached, is_nearest))
+    return np.where(reached != none, reached, nearest)
 
 
 def label_rows(folder: TensorFolder, maneuvers: Maneuvers) -> Bytes:
@@ -267,7 +295,12 @@ def label_samples(folder: TensorFolder, part: str | None, settings: LaneForestSe
 
     The same samples serve all scores: cells need the horizon alone, but are scored by maneuver, too.
     """
-    maneuvers = find_maneuvers(folder, start_s=settings.start_s, tolerance_m=settings.tolerance_m)
+    maneuvers = find_maneuvers(
+        folder,
+        start_s=settings.start_s,
+        tolerance_m=settings.tolerance_m,
+        measured_start=settings.measured_start,
+    )
     everything = np.arange(len(folder.sample_row)) if part is None else folder.samples_of(part)
     row = folder.sample_row[everything].astype(np.intp)
     back = min(round(SPEED_CHANGE_S * folder.protocol.rate_hz), folder.protocol.history_ticks - 1)

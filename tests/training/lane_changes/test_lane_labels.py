@@ -55,6 +55,26 @@ def test_by_hand(tmp_path, y_m, expected, storage):
     assert letters(folder, start_s=2.0) == expected
 
 
+# As above, with a T_d of 4 s: from the last row at the old lane's centre, or beyond it, on.
+MEASURED = {
+    "from the centre on": ([2, 2, 2, 2, 3, 4.5, 5.5, 6.2, 6.2], "kkkrrrrrk"),
+    "from the other side of it": ([2, 2, 1.5, 2.5, 3, 4.5, 6, 6, 6], "kkrrrrrkk"),
+    "within the tolerance": ([6, 6, 6, 5.95, 5, 3.5, 2, 2], "kkkllllk"),
+    "never there: the last of the rows nearest to it": ([2.5, 2.5, 2.5, 3, 4.5, 6, 6], "kkrrrrk"),
+    "at once": ([2, 2, 2, 2, 6, 6], "kkkrrk"),
+    "no longer than T_d": ([2] + [2.5 + 0.1 * at for at in range(14)] + [4.1, 6, 6], "k" * 8 + "r" * 9 + "k"),
+    "not before the lane was entered": ([2, 2, 2, 6.5, 7, 10, 10], "kkrrrrk"),
+    "nor before the run": ([2.5, 3, 4.5, 6, 6], "rrrrk"),
+    "nothing across a gap": ([2, 2, None, 2.5, 4.5, 6], "kkrrr"),
+}
+
+
+@pytest.mark.parametrize(("y_m", "expected"), MEASURED.values(), ids=MEASURED)
+def test_a_measured_start_by_hand(tmp_path, y_m, expected):
+    folder = open_tracks(tmp_path / "t", {"a": track(3, y_m)})
+    assert letters(folder, start_s=4.0, measured_start=True) == expected
+
+
 def test_vehicles_and_subsets_do_not_touch(tmp_path):
     right, left = [2, 2, 2, 2, 2, 6, 6], [6, 6, 6, 6, 6, 2, 2]
     rows = {"a": track(1, right) + track(2, [6] * 7) + track(2**31 - 1, left), "b": track(1, left)}
@@ -92,8 +112,13 @@ def test_rows_near_the_end_of_their_run_are_not_judged(tmp_path):
     assert find_labelled(folder, np.arange(9), start_s=1.0).tolist() == [True] * 4 + [False] * 2 + [True] + [False] * 2
 
 
-def loop_over_rows(folder, start_s, tolerance_m, markings):
+def loop_over_rows(folder, start_s, tolerance_m, markings, measured_start):
     """The same row by row."""
+
+    def measure_offset(row, lane):
+        centre = (markings[lane - 1] + markings[lane]) / 2 if markings else (lane - 0.5) * NOMINAL_LANE_M
+        return np.float32(middle + step * float(folder.position_m[row, 1])) - centre
+
     ticks, labels = round(start_s * folder.protocol.rate_hz), ["k"] * len(folder.lane)
     for run in range(len(folder.run_first_row) - 1):
         first, last = int(folder.run_first_row[run]), int(folder.run_first_row[run + 1]) - 1
@@ -104,19 +129,31 @@ def loop_over_rows(folder, start_s, tolerance_m, markings):
                 continue
             step = 1 if folder.step_m is None else folder.step_m[1]
             middle = 0.0 if folder.step_m is None else folder.centre_m[folder.run_subset[run]][1]
-            centre = (markings[lane - 1] + markings[lane]) / 2 if markings else (lane - 0.5) * NOMINAL_LANE_M
             end, nearest = None, None
             for later in range(row, min(last, row + ticks) + 1):
                 if folder.lane[later] != lane:
                     break
-                offset = np.float32(middle + step * float(folder.position_m[later, 1])) - centre
+                offset = measure_offset(later, lane)
                 if nearest is None or abs(offset) < nearest[0]:
                     nearest = abs(offset), later
                 if (offset if lane > before else -offset) >= -tolerance_m:
                     end = later
                     break
             end = nearest[1] if end is None else end
-            for covered in range(max(first, end - ticks, taken + 1), end + 1):
+            start = max(first, end - ticks)
+            if measured_start:
+                left = nearest = None
+                for earlier in range(row - 1, max(first, row - ticks) - 1, -1):
+                    if folder.lane[earlier] != before:
+                        break
+                    offset = measure_offset(earlier, before)
+                    if nearest is None or abs(offset) < nearest[0]:
+                        nearest = abs(offset), earlier
+                    if (-offset if lane > before else offset) >= -tolerance_m:
+                        left = earlier
+                        break
+                start = max(start, nearest[1] if left is None else left)
+            for covered in range(max(start, taken + 1), end + 1):
                 labels[covered] = "r" if lane > before else "l"
             taken = end
     return "".join(labels)
@@ -130,12 +167,14 @@ def loop_over_rows(folder, start_s, tolerance_m, markings):
     markings=st.sampled_from([None, MARKINGS]),
     start_s=st.sampled_from([0.5, 1.0, 3.0]),
     tolerance_m=st.sampled_from([0.0, 0.1, 1.5]),
+    measured_start=st.booleans(),
 )
-def test_as_an_obvious_loop_finds_them(seed, splits, storage, markings, start_s, tolerance_m):
+def test_as_an_obvious_loop_finds_them(seed, splits, storage, markings, start_s, tolerance_m, measured_start):
     """Random lanes and places, with gaps, cut runs, borders of blocks, no or one vehicle."""
     with tempfile.TemporaryDirectory() as home:
         written = write(Path(home) / "t", random_tables(seed), splits, storage=storage, markings=markings)
         folder = TensorFolder.open(written)
-        expected = loop_over_rows(folder, start_s, tolerance_m, markings)
-        assert letters(folder, start_s=start_s, tolerance_m=tolerance_m) == expected
+        expected = loop_over_rows(folder, start_s, tolerance_m, markings, measured_start)
+        found = letters(folder, start_s=start_s, tolerance_m=tolerance_m, measured_start=measured_start)
+        assert found == expected
         del folder
