@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError
+from tracklake.training.data.augmentation import augment
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
@@ -242,13 +243,19 @@ def _take_step(
 
 def _load_batches(plan: Plan, read: Read, step: int) -> Batches:
     """Yield the batches from a step on, without end."""
+    import torch
+
     size = plan.recipe.batch_size
     epoch, done = divmod(step, plan.epoch_steps)
     while True:
         order = plan.draw_epoch(epoch)
         for first in range(done * size, len(order), size):
             samples = order[first : first + size]
-            yield len(samples), *read(samples)
+            observed, truth = read(samples)
+            if plan.recipe.augmentation != "none":
+                changes = (torch.from_numpy(drawn) for drawn in plan.draw_changes(epoch, first, len(samples)))
+                observed, truth = augment(observed, truth, *(drawn.to(plan.device) for drawn in changes))
+            yield len(samples), observed, truth
         epoch, done = epoch + 1, 0
 
 

@@ -7,6 +7,8 @@ from typing import Any, ClassVar, Generic, NoReturn, Self, TypeVar
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Batch
 
+ROWS, COLUMNS, ROW_M = 13, 3, 4.572
+"""Rows of the grid along the road, 0 hindmost; its columns: left, own and right lane; and the length of a row, in m."""
 Array = TypeVar("Array")
 """NumPy arrays or torch tensors, of the same shapes, units and order."""
 

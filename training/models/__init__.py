@@ -54,6 +54,8 @@ class Recipe:
         optimizer: `adam`, or `adamw` (decoupled weight decay).
         schedule: course of the learning rate: `constant`, or `cosine` after a short warm-up.
         max_gradient_norm: largest norm of the gradients; larger ones are scaled down.
+        augmentation: how samples are changed at random while they train a network: `mirror` (half of them sideways),
+            `shift` (along the road, among their neighbors, by -1, 0 or 1 rows of the grid), `both`, or `none`.
     """
 
     phases: tuple[Phase, ...]
@@ -62,6 +64,7 @@ class Recipe:
     optimizer: Literal["adam", "adamw"] = "adam"
     schedule: Literal["constant", "cosine"] = "constant"
     max_gradient_norm: float = 10.0
+    augmentation: Literal["none", "mirror", "shift", "both"] = "none"
 
     @property
     def epochs(self) -> int:

@@ -12,11 +12,11 @@ _HEAD = """\
 Derived from `training/models/__init__.py`; do not edit (`make docs` writes it).
 
 `tracklake train MODEL` trains one by its own recipe; `--set name=value` changes a parameter or what is learned by
-(batch_size, learning_rate, optimizer, schedule, max_gradient_norm). Fitted models need no torch: `tracklake train` fits
-their parameters on the training part in one pass and writes a run, and `tracklake evaluate MODEL` fits them on the fly.
-Those without a recipe that are not fitted predict as they are. None is given the future or a true maneuver: `predict`
-gets `training.data.observed.Observed` (the sample and the neighbors in its grid) or `ObservedScene` (the sample and the
-vehicles nearest to it), and nothing else.
+(batch_size, learning_rate, optimizer, schedule, max_gradient_norm, augmentation). Fitted models need no torch:
+`tracklake train` fits their parameters on the training part in one pass and writes a run, `tracklake evaluate MODEL`
+fits them on the fly. Those without a recipe that are not fitted predict as they are. None is given the future or a true
+maneuver: `predict` gets `training.data.observed.Observed` (the sample and the neighbors in its grid) or `ObservedScene`
+(the sample and the vehicles nearest to it), and nothing else.
 
 `anchoring` names the axes on which a network's outputs are counted from constant velocity: `both`, `longitudinal`,
 `lateral` or `none`. On other axes they are counted from the last position, as published. `residual` is its former name:

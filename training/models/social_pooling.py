@@ -6,7 +6,7 @@ from torch.nn.functional import binary_cross_entropy, cross_entropy, leaky_relu,
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.data.observed import COLUMNS, ROWS, Observed, Truth
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
 from tracklake.training.models.network import (
     Network,
@@ -20,8 +20,6 @@ from tracklake.training.models.prediction import Prediction
 
 SLOPE = 0.1
 """Slope of the leaky ReLUs where the input is negative."""
-ROWS, COLUMNS = 13, 3
-"""Rows of the grid along the road (0 hindmost), and its columns: left, own and right lane."""
 KERNEL = 3
 """Rows of the grid that each convolution's kernel covers."""
 LATERAL, LONGITUDINAL = len(LATERAL_MANEUVERS), len(LONGITUDINAL_MANEUVERS)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from tracklake.schemas.arrays import Integers
+from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Model, Recipe
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 OptimizerName = Literal["adam", "adamw"]
 ScheduleName = Literal["constant", "cosine"]
-RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm")
+AugmentationName = Literal["none", "mirror", "shift", "both"]
+RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm", "augmentation")
 """Settings of a model's recipe that a training may change."""
 BUDGETS = ("seconds", "steps", "epochs")
 """Settings that end a training; one of them at most is given."""
@@ -48,6 +49,7 @@ class TrainConfig:
     optimizer: OptimizerName | None = None
     schedule: ScheduleName | None = None  # cosine: warms up over the first 2 % and decays to 0
     max_gradient_norm: float | None = None  # larger gradients are scaled down
+    augmentation: AugmentationName | None = None  # mirrors samples, or moves them among their neighbors
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of the model
     dataset: str | None = None  # trains, validates and evaluates on this dataset alone
     recording: str | None = None  # on this recording or subset alone
@@ -79,7 +81,8 @@ class TrainConfig:
         given = [f"{name} {getattr(self, name)}" for name in BUDGETS if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(f"training: expected one of {', '.join(BUDGETS)} at most, got {' and '.join(given)}")
-        for name, known in (("optimizer", get_args(OptimizerName)), ("schedule", get_args(ScheduleName))):
+        choices = {"optimizer": OptimizerName, "schedule": ScheduleName, "augmentation": AugmentationName}
+        for name, known in ((name, get_args(choice)) for name, choice in choices.items()):
             if getattr(self, name) not in (None, *known):
                 raise UsageError(f"training: expected `{name}` {' or '.join(known)}, got {getattr(self, name)!r}")
 
@@ -120,6 +123,16 @@ class Plan:
     def draw_epoch(self, epoch: int) -> Integers:
         """Draw (epoch_samples,) numbers of an epoch's samples in their order, each at most once."""
         return np.random.default_rng((self.config.seed, epoch)).choice(self.train, self.epoch_samples, replace=False)
+
+    def draw_changes(self, epoch: int, first: int, samples: int) -> tuple[Flags, Integers]:
+        """Draw which samples (B,) of a batch are mirrored and by how many rows (B,) each is moved (`augment`).
+
+        They depend on the seed and on the batch alone (the number of its epoch and of its first sample there), so that
+        a training which was interrupted goes on as it would have gone.
+        """
+        random, chosen = np.random.default_rng((self.config.seed, epoch, 1 + first)), self.recipe.augmentation
+        mirrored, rows = random.random(samples) < 0.5, random.integers(-1, 2, samples)
+        return mirrored & (chosen in ("mirror", "both")), rows * (chosen in ("shift", "both"))
 
     def learning_rate(self, spent: float) -> float:
         """Return the learning rate of a step before which a part of the budget is spent."""
