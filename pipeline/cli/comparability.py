@@ -51,13 +51,18 @@ def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *,
 
 def print_lane_centres(terminal: Terminal, folder: TensorFolder) -> None:
     """Print which subsets have lane centres in place of lateral positions, with the publication of those of NGSIM."""
-    subsets = (f"{own['dataset']}/{own['subset']}" for own in folder.index["subsets"])
-    names = [name for name, centred in zip(subsets, folder.lane_centred, strict=True) if centred]
-    kept = sorted(folder.origins.keys() & names)
-    if kept:
-        cite = f" Cite with NGSIM's I-80: {COIFMAN.full}" if any(name.startswith("ngsim/i-80") for name in kept) else ""
+    names = list_lane_centred(folder)
+    if names:
+        cite = f" Cite with NGSIM's I-80: {COIFMAN.full}" if any(own.startswith("ngsim/i-80") for own in names) else ""
         terminal.print_line(
-            f"note: lateral positions of {', '.join(kept)} are lane centres: only errors along the road mean anything; "
-            f"radial and lateral ones are left out.{cite}",
+            f"note: lateral positions of {', '.join(names)} are lane centres: only errors along the road mean "
+            f"anything; radial and lateral ones are left out.{cite}",
             style="dim",
         )
+
+
+def list_lane_centred(folder: TensorFolder) -> list[str]:
+    """List the subsets (`dataset/subset`) in use that have lane centres in place of lateral positions."""
+    subsets = (f"{own['dataset']}/{own['subset']}" for own in folder.index["subsets"])
+    named = zip(subsets, folder.lane_centred, strict=True)
+    return sorted(name for name, centred in named if centred and name in folder.origins)

@@ -10,7 +10,7 @@ import polars as pl
 import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
-from tracklake.pipeline.cli.comparability import print_comparability
+from tracklake.pipeline.cli.comparability import list_lane_centred, print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.evidence import show_evidence
 from tracklake.pipeline.cli.options import (
@@ -170,7 +170,10 @@ def evaluate(
                 terminal.print_line(fit.describe(), style="dim")
             tracks_from = found[0].protocol.tracks_from
             terminal.print_line(describe_causality(tracks_from), style="dim")
-            if gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS:
+            wanted = gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS
+            if wanted and list_lane_centred(tensors):
+                terminal.print_line("note: no gain from smoothing: it is one of radial errors, which lane centres lack")
+            elif wanted:
                 gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
         tables = show_evidence(terminal, tensors, found, records, compare=compare, out=evidence)
         if vehicle_errors is not None:

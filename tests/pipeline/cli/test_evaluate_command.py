@@ -58,11 +58,12 @@ def test_scores_of_synthetic_data_say_so_and_have_no_published_rows(command, lak
 def test_lane_centres_are_announced_and_errors_along_the_road_shown(command, lake):
     centred = property(lambda folder: np.ones(len(folder.index["subsets"]), dtype=bool))
     with mock.patch("tracklake.training.data.tensor_folder.TensorFolder.lane_centred", centred):
-        models = ("constant-velocity", "ctrv", "--compare")
+        models = ("constant-velocity", "ctrv", "--compare", "--gain")
         done = command.here("evaluate", *models, "--lake", lake.root, "--dataset", "ngsim")
     assert done.code == 0, done.err
     said = " ".join(done.out.split())
     assert "difference of longitudinal RMSE, m" in said
+    assert "no gain from smoothing" in said
     assert "are lane centres: only errors along the road mean anything" in said
     assert "longitudinal RMSE, m" in said
     assert not any(line.startswith("RMSE, m") for line in done.out.splitlines())
