@@ -148,7 +148,7 @@ def test_columns_that_are_missing_are_null_and_named(tmp_path):
     [
         ([(1, 1, 6), (1, 2, 18), (2, 2, 18)], 100, True),
         ([(1, 1, 6), (1, 2, 18), (2, 2, 18)], 99, False),
-        ([(1, 1, 6), (2, 2, 18), (2, 2, 18)], 100, False),  # nobody changes lanes: all may have driven straight on
+        ([(1, 1, 6), (2, 2, 18), (2, 2, 18)], 100, False),  # no vehicle changes lanes: all may have driven straight on
         ([(1, 1, 6), (1, 2, 18), (2, 2, 18), (2, 2, 18.1)], 100, False),
         ([(1, 2, 18), (1, 2, 18), (2, 2, 18)], 100, False),
         ([(1, 1, 6), (1, 2, 18), (2, "", 18)], 100, True),
