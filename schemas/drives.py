@@ -65,7 +65,7 @@ STATIONS = Table(
             "messages missing by the counter, which runs from 0 to 127; a silence of more than 12.8 s counts none",
             ge=0,
         ),
-        "clock_steps": column(pl.Int64, "times the sender's clock jumped against the receiver's", ge=0),
+        "clock_steps": column(pl.Int64, "times the sender's clock jumped by over 0.5 s against the receiver's", ge=0),
         "latency_median_s": column(
             pl.Float32, "received - generated; null where either is unlogged", unit="s", nullable=True
         ),

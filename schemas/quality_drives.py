@@ -26,7 +26,7 @@ class DriveFacts(TypedDict):
     duplicates: Annotated[int, "messages of other vehicles dropped: the same counter and moment as one kept"]
     invalid: Annotated[int, "messages of other vehicles dropped for an impossible position or time"]
     id_changes: Annotated[int, "times that other vehicles were given another temporary id"]
-    clock_steps: Annotated[int, "times that the clock of another vehicle jumped"]
+    clock_steps: Annotated[int, "times that the clock of another vehicle jumped by over 0.5 s"]
     latency_median_s: Annotated[float | None, "received - generated; null where either is unlogged"]
     latency_p95_s: Annotated[float | None, "the same, exceeded by 5 % of the messages"]
     scans: Annotated[int, "LiDAR scans"]
@@ -62,7 +62,7 @@ class DriveStation(TypedDict):
     duplicates: Annotated[int, "messages dropped: the same counter and moment as one kept"]
     invalid: Annotated[int, "messages dropped for an impossible position or time"]
     id_changes: Annotated[int, "times it was given another temporary id"]
-    clock_steps: Annotated[int, "times its clock jumped"]
+    clock_steps: Annotated[int, "times its clock jumped by over 0.5 s"]
     latency_median_s: Annotated[float | None, "received - generated; null where either is unlogged"]
 
 

@@ -50,13 +50,14 @@ def _find_parts(root: Path, manifest: Manifest) -> dict[tuple[str, str], list[An
     }
 
 
-def build(readers: Sequence[LakeReader], _settings: Settings) -> list[StageResult]:
+def build(readers: Sequence[LakeReader], settings: Settings) -> list[StageResult]:
     """Query what the lake holds of some recordings and write their subsets' pages into reports/subsets/."""
     from tracklake.quality_reports.pages.subsets import render_pages
 
     root, names = readers[0].root, [_name_pages(reader) for reader in readers]
     with open_recordings(root, readers[0].manifest, [reader.job.tail for reader in readers]) as connection:
-        rendered = render_pages(connection, describe_origin(root), names=dict(ChainMap(*names)))
+        provenance = {**describe_origin(root), "settings": {"tracks_from": settings.tracks_from}}
+        rendered = render_pages(connection, provenance, names=dict(ChainMap(*names)))
         files = {name: write_report_file(root, f"{FOLDER}/{name}", content) for name, content in rendered}
     return [
         StageResult(
@@ -78,7 +79,7 @@ STAGE = Stage(
     meaning="Draw the report's page of each subset.",
     scope="recording",
     after=(),  # a page shows what there is
-    version=8,
+    version=9,
     build=build,
     batch_entries=500_000,
     extra_inputs=_find_inputs,
