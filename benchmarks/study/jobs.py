@@ -29,6 +29,8 @@ from tracklake.training.runs.run_folder import digest_tensors
 ROOT = Path(__file__).resolve().parents[2]
 NOTES, SCORES, VEHICLES = "jobs.csv", "scores.csv", "vehicles.parquet"
 """Files of the study's folder: what was run, and of each run its scores and its errors by vehicle."""
+EVIDENCE = ("--calibration",)
+"""Options of `tracklake evaluate` for what is looked at besides the errors."""
 LATER = {"lateral_positions": RECORDED_POSITIONS}
 """What the index did not state of a recording at first, and what it was then: no run is made again because of it."""
 DONE = (0, 3)
@@ -111,6 +113,17 @@ class Job:
     def scores(self) -> Path:
         """Folder of its scores, which exists once they are complete."""
         return self.lake.root.parents[1] / "scores" / self.identity
+
+    @property
+    def evidence(self) -> Path | None:
+        """Folder of its calibration and feasibility; None: of networks, the first seed's alone are looked at."""
+        asked = make_digest(EVIDENCE)[:4]
+        return None if self.seed else self.lake.root.parents[1] / "evidence" / f"{self.identity}-{asked}"
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has all its scores."""
+        return self.scores.exists() and (self.evidence is None or self.evidence.exists())
 
     @property
     def seconds(self) -> float:
@@ -218,7 +231,7 @@ class Workshop:
 
     def work_on(self, jobs: Iterable[Job]) -> None:
         """Train and score what is not done yet: the shortest first, and of these one seed in all folds."""
-        todo = (job for job in jobs if not job.scores.exists())
+        todo = (job for job in jobs if not job.is_done)
         left = sorted(todo, key=lambda job: (job.seconds, job.seed or 0, job.lake.name))
         with ThreadPoolExecutor(self.at_once) as pool:
             list(pool.map(self.finish, left))
@@ -229,14 +242,21 @@ class Workshop:
             return
         if job.home is not None:
             lend_run(job)
-        aside = job.scores.with_name(f"{job.scores.name}.unfinished")
+        if not job.scores.exists():
+            self.evaluate(job, job.scores, "--out", SCORES, "--vehicle-errors", VEHICLES)
+        if job.evidence is not None and not job.evidence.exists():
+            self.evaluate(job, job.evidence, *EVIDENCE, "--evidence", "")
+
+    def evaluate(self, job: Job, out: Path, *options: str) -> None:
+        """Evaluate a run into a folder that exists once it is complete; options that are files are put into it."""
+        aside = out.with_name(f"{out.name}.unfinished")
         shutil.rmtree(aside, ignore_errors=True)
         aside.mkdir(parents=True)
+        files = [str(aside / word) if not word.startswith("--") else word for word in options]
         tested = job.learner.tested if job.learner else ()
-        files = ("--out", aside / SCORES, "--vehicle-errors", aside / VEHICLES)
         words = ("evaluate", job.run, *job.lake.options, "--no-published", *tested, *files)
         if self.run(*words, environment=job.lake.environment):
-            aside.rename(job.scores)
+            aside.rename(out)
 
     def train(self, job: Job, own: Learner) -> bool:
         """Train a run if there is none yet; returns whether there is one."""

@@ -9,7 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from study.figure import draw_errors
 from study.pieces import PIECES
 from study.plan import Arm
-from study.results import Results, grid, judge
+from study.results import FEW, Results, grid, judge
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
 
@@ -19,6 +19,7 @@ FIGURES = {
     "rmse_lateral_m": "RMSE across the road, m",
     "nll_nats": "negative log-likelihood, nats",
 }
+SHOWN_BY_DENSITY = ("rmse_longitudinal_m", "sigma_longitudinal_m", "radius_m", "coverage")
 PAGES = ("results.md", "results-discussion.md")
 
 
@@ -116,7 +117,70 @@ def lay_out_maneuvers(results: Results, arm: Arm) -> str:
     return grid([heads[0], *(heads[n] for n in shown)], ([row[0], *(row[n] for n in shown)] for row in body))
 
 
-TABLES_OF_ARM = (lay_out_lakes, lay_out_training, lay_out_errors, lay_out_differences, lay_out_maneuvers)
+def lay_out_coverage(results: Results, arm: Arm) -> str:
+    """Lay out how many true positions lie in the regions that are said to hold them, over all folds."""
+    rows = results.of_arm("calibration", arm.name)
+    pooled = rows.group_by("model", "level", "seconds", maintain_order=True).agg(_pool("coverage"))
+    seconds = results.list_seconds(arm.name)
+    body = [
+        [f"`{model}`", f"{level:.0%}", *(f"{100 * own.filter(seconds=at)['coverage'].sum():.1f} %" for at in seconds)]
+        for (model, level), own in pooled.group_by("model", "level", maintain_order=True)
+    ]
+    return grid(["model", "region", *(f"{at:g} s" for at in seconds)], body) if body else ""
+
+
+def lay_out_by_density(results: Results, arm: Arm) -> str:
+    """Lay out RMSE and predicted sigma along the road, and radii, by traffic density at the last horizon."""
+    errors, radii = (results.of_arm(name, arm.name) for name in ("density_errors", "conformal_radii"))
+    last = pl.col("seconds") == pl.col("seconds").max()
+    squares = [_pool(name, root=True) for name in ("rmse_longitudinal_m", "sigma_longitudinal_m")]
+    key = ("model", "density")
+    table = (
+        errors.filter(last, pl.col("n") >= FEW)
+        .group_by(key, maintain_order=True)
+        .agg(pl.col("n").sum(), *squares)
+        .join(radii.filter(last, level=0.9).group_by(key).agg(_pool("radius_m"), _pool("coverage")), on=key, how="left")
+    )
+    body = [
+        [
+            f"`{row['model']}`",
+            row["density"],
+            _format(row["n"]),
+            *(_format_figure(row[name]) for name in SHOWN_BY_DENSITY),
+        ]
+        for row in table.to_dicts()
+    ]
+    heads = ("RMSE along, m", "sigma along, m", "radius of 90 %, m", "held")
+    return grid(["model", "vehicles per km of lane", "samples", *heads], body) if body else ""
+
+
+def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
+    """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart."""
+    seconds = results.list_seconds(arm.name)
+    body = [
+        [f"`{own}`", *(_format_difference(results.subtract(arm.name, fair, own, at)) for at in seconds)]
+        for own in results.list_models(arm.name)
+    ]
+    return grid(["model", *(f"{at:g} s" for at in seconds)], body)
+
+
+def _pool(name: str, *, root: bool = False) -> pl.Expr:
+    """Average a column by the number of samples, its squares where `root`; null where a fold lacks it."""
+    figure = pl.col(name) ** 2 if root else pl.col(name)
+    mean = (figure * pl.col("n")).sum() / pl.col("n").sum()
+    return pl.when(pl.col(name).is_not_null().all()).then(mean.sqrt() if root else mean).alias(name)
+
+
+TABLES_OF_ARM = (
+    lay_out_lakes,
+    lay_out_training,
+    lay_out_errors,
+    lay_out_differences,
+    lay_out_maneuvers,
+    lay_out_coverage,
+    lay_out_by_density,
+    lay_out_leakage,
+)
 """Functions that the templates call with an arm."""
 
 
@@ -125,6 +189,11 @@ def _format(value: object) -> str:
     if value is None:
         return "-"
     return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def _format_figure(value: float | None) -> str:
+    """Format a figure with two decimals; a dash for null."""
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _format_difference(found: dict[str, float] | None) -> str:

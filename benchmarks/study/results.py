@@ -8,7 +8,7 @@ import polars as pl
 
 from study.pieces import PIECES
 from study.plan import Arm
-from study.tables import TABLES, read_table
+from study.tables import NOTHING, TABLES, read_table
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVERYTHING
 
@@ -93,6 +93,15 @@ class Results:
         rows = self.of_arm("comparisons", arm)
         found = rows.filter(model=model, against=against, seconds=seconds, figure=figure, dataset=dataset)
         return found.row(0, named=True) if found.height else None
+
+    def subtract(self, arm: str, other: str, model: str, seconds: float) -> dict[str, float] | None:
+        """Subtract a model's RMSE in another arm, of other vehicles: squares of both intervals' halves add up."""
+        found = [self.compare(name, model, NOTHING, seconds, "rmse_m") for name in (arm, other)]
+        if found[0] is None or found[1] is None or None in (found[0]["low"], found[1]["low"]):
+            return None
+        difference = found[0]["difference"] - found[1]["difference"]
+        half = sum((own["high"] - own["difference"]) ** 2 for own in found if own) ** 0.5
+        return {"difference": difference, "low": difference - half, "high": difference + half}
 
     def prove(self, what: str, arm: str, model: str, against: str, seconds: float, figure: str = "rmse_m") -> str:
         """State that a model is `better` or `worse` than another, or that `no difference` is shown, with the interval.

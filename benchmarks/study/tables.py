@@ -10,7 +10,7 @@ import polars as pl
 
 from study.jobs import SCORES, VEHICLES, Job, Lake
 from study.plan import Arm
-from tracklake.schemas.comparisons import COMPARED_FIGURES
+from tracklake.schemas.comparisons import CALIBRATION, COMPARED_FIGURES, CONFORMAL_RADII, DENSITY_ERRORS
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.training.comparison.bootstrap import compare_errors
 
@@ -41,6 +41,11 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
         **dict.fromkeys(("train", "val", "eval"), WHOLE),
     },
 }
+EVIDENCE_TABLES = {table.name: table for table in (CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII)}
+TABLES |= {
+    name: {**KEY, "lake": TEXT, **{column: dtype for column, dtype in table.dtypes.items() if column != "run"}}
+    for name, table in EVIDENCE_TABLES.items()
+}
 """Columns of docs/results-NAME.csv. `seeds` has one row per arm, model, seed, part of the data and horizon; the seed is
 null where nothing was drawn."""
 
@@ -48,6 +53,8 @@ NOTHING = "-"
 """What a model is compared with where the interval is that of its own error."""
 SUMS = pl.col("squared_longitudinal_m2", "squared_lateral_m2", "distance_m", "nll_nats")
 
+LEVELS = (0.5, 0.9, 0.95)
+"""Probabilities of regions that are kept."""
 DIGITS = 5
 """Decimals of the committed tables."""
 
@@ -72,6 +79,7 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
         "curves": pl.concat([pl.DataFrame(schema=TABLES["curves"]), *(read_curve(job) for job in done if job.learner)]),
         "lakes": pl.DataFrame([describe_lake(lake) for lake in lakes], schema=TABLES["lakes"]),
     }
+    found |= {name: read_evidence(done, name) for name in EVIDENCE_TABLES}
     for name, table in found.items():
         kept = read_table(docs, name).filter(pl.col("arm") != arm.name)
         whole = pl.concat([kept, table.select(*TABLES[name])]).with_columns(pl.selectors.float().round(DIGITS))
@@ -148,6 +156,21 @@ def pair_datasets(own: pl.DataFrame, other: pl.DataFrame) -> Iterator[tuple[str,
         yield EVERYTHING, own, other
     for dataset in sorted(first & second) if len(first | second) > 1 else ():
         yield dataset, own.filter(dataset=dataset), other.filter(dataset=dataset)
+
+
+def read_evidence(jobs: Iterable[Job], name: str) -> pl.DataFrame:
+    """Read a table beside the scores of the jobs that have it, at LEVELS, and for each fold apart."""
+    tables = [pl.DataFrame(schema=TABLES[name])]
+    for job in jobs:
+        file = job.evidence / f"{name}.csv" if job.evidence else None
+        if file is not None and file.exists():
+            schema = EVIDENCE_TABLES[name].dtypes
+            table = pl.read_csv(file, schema_overrides=schema, infer_schema_length=None)
+            if "level" in table.columns:
+                table = table.filter(pl.col("level").is_in(LEVELS))
+            named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
+            tables.append(table.with_columns(pl.lit(own, TABLES[name][key]).alias(key) for key, own in named.items()))
+    return pl.concat([table.select(*TABLES[name]) for table in tables])
 
 
 def describe_run(job: Job) -> dict[str, Any]:
