@@ -132,6 +132,8 @@ def test_pages_of_a_study_print_its_digests_and_call_nothing_better_without_an_i
     for digest in read_table(docs, "lakes")["tensors"]:
         assert f"| {digest} |" in page
     assert "### tiny" in page
+    # Half of six vehicles give the radius: too few of any density but the sum of all.
+    assert re.search(r"\| `lstm` \| all \| [\d,]+ \| \d+\.\d\d \| - \| \d+\.\d\d \|", page)
     check_verdicts(page)
 
 
@@ -180,6 +182,17 @@ def test_better_is_said_only_where_the_interval_excludes_zero(low, high, says):
             results.prove(other, *names)
     with pytest.raises(UnprovenError, match="not measured"):
         results.prove("better", "tiny", "lstm", "kalman-cv", 1.0)
+
+
+def test_errors_of_two_splits_are_subtracted_with_both_their_intervals():
+    """5 m, give or take 0.3 m, minus 3 m, give or take 0.4 m: 2 m, give or take 0.5 m."""
+    rows = [
+        {"arm": arm, "model": "lstm", "against": NOTHING, "dataset": "all", "figure": "rmse_m", "seconds": 1.0}
+        | {"difference": value, "low": value - half, "high": value + half}
+        for arm, value, half in (("leaks", 5.0, 0.3), ("fair", 3.0, 0.4))
+    ]
+    found = Results({"comparisons": pl.DataFrame(rows)}).subtract("leaks", "fair", "lstm", 1.0)
+    assert found == pytest.approx({"difference": 2.0, "low": 1.5, "high": 2.5})
 
 
 INTERVAL = re.compile(r"(better|worse) (?:\()?([+-][\d.]+)[^()]*?\(?(?:95 % interval )?([+-][\d.]+) to ([+-][\d.]+)")

@@ -69,7 +69,7 @@ def lay_out_training(results: Results, arm: Arm) -> str:
             means = runs.select(pl.col(columns).mean()).row(0)
             body.append([f"`{model}`", str(runs["seed"].n_unique()), *map(_format, means)])
     heads = ("weights", "steps", "samples seen", "positions supervised", "s", "samples a second")
-    return grid(["model", "seeds", *heads], body)
+    return grid(["model", "seeds", *heads], body) if body else ""
 
 
 def lay_out_errors(results: Results, arm: Arm, figure: str) -> str:
@@ -91,8 +91,7 @@ def lay_out_differences(results: Results, arm: Arm, figure: str) -> str:
     """Lay out each network's difference to the best plain model of every horizon, and those of the arm's pairs."""
     seconds = results.list_seconds(arm.name)
     best = {at: results.find_baseline(arm.name, at, figure) for at in seconds}
-    learned = [own.name for own in arm.learners if own.name in results.list_models(arm.name)]
-    rows = [(model, "best without training", best) for model in learned]
+    rows = [(model, "best without a network", best) for model in results.list_networks(arm.name)]
     rows += [(model, f"`{against}`", dict.fromkeys(seconds, against)) for model, against in arm.pairs]
     body = []
     for model, title, against in rows:

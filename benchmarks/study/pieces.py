@@ -5,6 +5,7 @@ from dataclasses import replace
 from study.plan import Arm, Learner, Piece, Source
 
 PLAIN = ("constant-velocity", "damped-velocity", "kalman-cv")
+PLAIN_PAIRS = (("damped-velocity", "constant-velocity"), ("kalman-cv", "constant-velocity"))
 BLOCKS = {
     "TRACKLAKE_SPLIT": "time-blocks",
     "TRACKLAKE_SPLITS": '["time-blocks"]',
@@ -59,7 +60,13 @@ GENERATED = Arm(
     PLAIN,
     (LSTM, V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER),
     settings=PARTS,
-    pairs=(("cs-lstm", "v-lstm"), ("cs-lstm-m", "cs-lstm"), ("attention-h4", "cs-lstm"), ("attention-h4", "v-lstm")),
+    pairs=(
+        *PLAIN_PAIRS,
+        ("cs-lstm", "v-lstm"),
+        ("cs-lstm-m", "cs-lstm"),
+        ("attention-h4", "cs-lstm"),
+        ("attention-h4", "lstm-encoder-decoder"),
+    ),
 )
 
 
@@ -127,6 +134,7 @@ PIECES = (
                 ),
                 settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "225"},
                 folds=(0, 1, 2, 3),
+                pairs=PLAIN_PAIRS,
             ),
         ),
     ),
@@ -150,7 +158,13 @@ PIECES = (
                 ),
                 settings={**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "240"},
                 folds=(0, 2),
-                pairs=(("cs-lstm", "v-lstm"), ("cs-lstm-m", "cs-lstm"), ("attention-h4", "cs-lstm")),
+                pairs=(
+                    *PLAIN_PAIRS,
+                    ("cs-lstm", "v-lstm"),
+                    ("cs-lstm-m", "cs-lstm"),
+                    ("attention-h4", "cs-lstm"),
+                    ("attention-h4", "lstm-encoder-decoder"),
+                ),
             ),
         ),
     ),

@@ -55,6 +55,10 @@ class Results:
         known = (*own.plain, *(learner.name for learner in own.learners))
         return [name for name in known if name in set(self.of_arm("seeds", arm)["model"])]
 
+    def list_networks(self, arm: str) -> list[str]:
+        """List the networks among them."""
+        return [name for name in self.list_models(arm) if name not in find_arm(arm).plain]
+
     def list_seconds(self, arm: str) -> list[float]:
         """List an arm's horizons."""
         seconds: list[float] = self.of_arm("seeds", arm)["seconds"].unique().sort().to_list()
@@ -109,13 +113,19 @@ class Results:
         Raises:
             UnprovenError: the interval says something else.
         """
+        said = self.state(arm, model, against, seconds, figure)
+        if not said.startswith(what):
+            raise UnprovenError(f"{arm}: `{model}` against `{against}` at {seconds:g} s is {said}, and not `{what}`")
+        return said
+
+    def state(self, arm: str, model: str, against: str, seconds: float, figure: str = "rmse_m") -> str:
+        """State whether a model is better or worse than another, with the interval."""
         found = self.compare(arm, model, against, seconds, figure)
-        says = judge(found["low"], found["high"]) if found else "not measured"
-        if found is None or not says.startswith(what):
-            raise UnprovenError(f"{arm}: `{model}` against `{against}` at {seconds:g} s is {says}, and not `{what}`")
+        if found is None or found["low"] is None:
+            return "not measured"
         unit = UNITS.get(figure, " m")
         bounds = " to ".join(f"{found[name]:+.2f}" for name in ("low", "high"))
-        return f"{says} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
+        return f"{judge(found['low'], found['high'])} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
 
 
 def find_arm(name: str) -> Arm:
