@@ -112,7 +112,7 @@ def _metres(description: str, *, nullable: bool = True) -> Column:
 
 
 _BOUNDS = {
-    "low": _share("lower end of the coverage's 95 % interval over vehicles; null: of one vehicle", nullable=True),
+    "low": _share("lower end of the share's 95 % interval over vehicles; null: of one vehicle", nullable=True),
     "high": _share("upper end of it", nullable=True),
 }
 
@@ -168,3 +168,37 @@ CONFORMAL_RADII = Table(
         **_BOUNDS,
     },
 )
+
+FEASIBILITY_RULES = ("overlap", "negative_headway", "high_jerk", "off_road")
+"""Rules that jointly predicted scenes are judged by: docs/rules.md has the first three, by their own thresholds."""
+ANY_RULE = "any"
+"""Name that stands for all of FEASIBILITY_RULES together."""
+
+FEASIBILITY = Table(
+    "feasibility",
+    "One row per run, rule and horizon: how many predictions of whole scenes break it at a tick up to then.",
+    key=("run", "rule", "seconds"),
+    partition=(),
+    columns={
+        **_RUN,
+        "rule": column(
+            pl.String,
+            "overlap of two vehicles; negative_headway to the next vehicle in the lane; high_jerk along the road, from "
+            "positions at the protocol's rate, the last three observed ones included; off_road: front centre beside "
+            "the carriageway; any of them",
+            isin=(*FEASIBILITY_RULES, ANY_RULE),
+        ),
+        **_SECONDS,
+        "n": column(pl.Int64, "predictions", ge=0),
+        "scenes": column(pl.Int64, "scenes that they are of", ge=0),
+        "share": _share("predictions that break the rule at `seconds` or before"),
+        **_BOUNDS,
+        "true_share": _share("true futures of the same vehicles that do, at the same ticks: the floor"),
+        "scene_share": _share("scenes with such a prediction"),
+        "true_scene_share": _share("scenes with such a true future"),
+        "rmse_m": _metres("of the same predictions, as in `evaluations`"),
+    },
+)
+
+COMPARISON_TABLES = (VEHICLE_ERRORS, COMPARISONS, CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII, FEASIBILITY)
+"""Tables that `tracklake evaluate` writes beside `evaluations`."""

@@ -4,14 +4,14 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 
 from tracklake.schemas import SCHEMA_VERSION, TABLES, Table
-from tracklake.schemas.comparisons import CALIBRATION, COMPARISONS, CONFORMAL_RADII, DENSITY_ERRORS, VEHICLE_ERRORS
+from tracklake.schemas.comparisons import COMPARISON_TABLES
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 
 RAW_TABLES = (RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS)
 
-SCORE_TABLES = (EVALUATIONS, VEHICLE_ERRORS, COMPARISONS, CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII)
+SCORE_TABLES = (EVALUATIONS, *COMPARISON_TABLES)
 
 HEADINGS = ("column", "dtype", "unit", "null", "bounds", "meaning")
 """Titles above the declaration of a table."""

@@ -99,9 +99,13 @@ CalibrationOption = Annotated[
         help="Show how far predicted regions hold the truth, and sigma, errors and conformal radii by traffic density.",
     ),
 ]
+FeasibilityOption = Annotated[
+    bool,
+    typer.Option("--feasibility", help="Show how many jointly predicted scenes overlap, jerk or leave the road."),
+]
 EvidenceOption = Annotated[
     Path | None,
-    typer.Option("--evidence", metavar="DIR", help="Write the tables and plots of --compare and --calibration to DIR."),
+    typer.Option("--evidence", metavar="DIR", help="Write tables and plots of these three options to DIR."),
 ]
 EveryTickOption = Annotated[
     bool, typer.Option("--every-tick", help="Score at every tick, not only at the protocol's seconds.")
@@ -124,6 +128,7 @@ def evaluate(
     vehicle_errors: VehicleErrorsOption = None,
     compare: CompareOption = False,
     calibration: CalibrationOption = False,
+    feasibility: FeasibilityOption = False,
     evidence: EvidenceOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -135,15 +140,9 @@ def evaluate(
     """
     with command(quiet=quiet, json=json) as terminal:
         require_choice("--part", part, PARTS)
-        if out is not None and out.suffix not in FORMATS:
-            raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
-        if vehicle_errors is not None and vehicle_errors.suffix != ".parquet":
-            raise typer.BadParameter(f"--vehicle-errors ends with .parquet; got {vehicle_errors}")
-        if evidence is not None and not (compare or calibration):
-            raise typer.BadParameter("--evidence writes what --compare and --calibration find: give one of them")
-        refuse_lake(out)
-        refuse_lake(evidence, "--evidence")
-        refuse_lake(vehicle_errors, "--vehicle-errors")
+        if evidence is not None and not (compare or calibration or feasibility):
+            raise typer.BadParameter("--evidence DIR needs --compare, --calibration or --feasibility")
+        _check_files(out, vehicle_errors, evidence)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         tensors = TensorFolder.open(tensor_folder(root, load(root), settings)).narrow(dataset, recording)
@@ -175,11 +174,11 @@ def evaluate(
                 terminal.print_line("note: no gain from smoothing: it is one of radial errors, which lane centres lack")
             elif wanted:
                 gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
-        tables = show_evidence(terminal, tensors, found, records, compare=compare, out=evidence)
+        scored = [own.model for own in found] if feasibility else []
+        joint = [open_forecaster(name, tensors, root / MODELS, frozenset({part})) for name in scored]
+        tables = show_evidence(terminal, tensors, found, records, joint, compare=compare, out=evidence)
         if vehicle_errors is not None:
-            errors = pl.concat([VEHICLE_ERRORS.empty(), *(own.to_vehicle_errors() for own in found)])
-            _write_table(vehicle_errors, VEHICLE_ERRORS.validate(errors.sort(VEHICLE_ERRORS.key), where="evaluate"))
-            terminal.print_line(f"vehicle errors {vehicle_errors}: {errors.height:,} rows", style="dim")
+            _write_vehicle_errors(terminal, vehicle_errors, found)
         if target is not None:
             _write_table(target, table)
             terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")
@@ -191,6 +190,17 @@ def evaluate(
         shown = {"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target}
         further = {"smoothing_gain": gains, **tables}
         terminal.print_json(shown | {name: own.to_dicts() for name, own in further.items() if own is not None})
+
+
+def _check_files(out: Path | None, vehicle_errors: Path | None, evidence: Path | None) -> None:
+    """Refuse files of other formats, and places within a lake."""
+    if out is not None and out.suffix not in FORMATS:
+        raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
+    if vehicle_errors is not None and vehicle_errors.suffix != ".parquet":
+        raise typer.BadParameter(f"--vehicle-errors ends with .parquet; got {vehicle_errors}")
+    refuse_lake(out)
+    refuse_lake(evidence, "--evidence")
+    refuse_lake(vehicle_errors, "--vehicle-errors")
 
 
 def _evaluate_all(
@@ -239,6 +249,13 @@ def _compare_histories(
     gains = measure_gain(models, inputs)
     show_gain(terminal, gains, inputs)
     return gains
+
+
+def _write_vehicle_errors(terminal: Terminal, target: Path, found: Iterable[Evaluation]) -> None:
+    """Write the summed errors of every run, vehicle and horizon."""
+    errors = pl.concat([VEHICLE_ERRORS.empty(), *(own.to_vehicle_errors() for own in found)])
+    _write_table(target, VEHICLE_ERRORS.validate(errors.sort(VEHICLE_ERRORS.key), where="evaluate"))
+    terminal.print_line(f"vehicle errors {target}: {errors.height:,} rows", style="dim")
 
 
 def _write_table(target: Path, table: pl.DataFrame) -> None:

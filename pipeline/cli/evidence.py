@@ -1,4 +1,4 @@
-"""Evidence that `tracklake evaluate` shows beside the scores: differences with intervals, and calibration."""
+"""Evidence that `tracklake evaluate` shows beside the scores: differences, calibration and feasibility."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,15 +8,18 @@ import polars as pl
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.score_tables import HEADINGS, find_headline
 from tracklake.pipeline.cli.tables import format_number, print_table
-from tracklake.schemas.comparisons import ALL_DENSITIES, DENSITY_CLASSES
+from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE, DENSITY_CLASSES, FEASIBILITY_RULES
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_output
 from tracklake.training.comparison.arms import compare_arms
+from tracklake.training.comparison.feasibility import measure_feasibility
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.comparison.traffic_states import measure_densities
 from tracklake.training.comparison.uncertainty import calibrate, find_radii, score_by_density
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
+from tracklake.training.models.inputs import NEAREST
+from tracklake.training.runs.forecasters import Forecaster
 
 Tables = dict[str, pl.DataFrame]
 """Tables of `schemas.comparisons` by their names."""
@@ -33,6 +36,7 @@ def show_evidence(
     folder: TensorFolder,
     found: Sequence[Evaluation],
     records: Mapping[str, SampleRecord],
+    joint: Sequence[Forecaster],
     *,
     compare: bool,
     out: Path | None,
@@ -44,6 +48,7 @@ def show_evidence(
         folder: the tensors.
         found: evaluations of the models.
         records: of each model by name, where calibration is asked for; else empty.
+        joint: the models, where the feasibility of jointly predicted scenes is asked for; else empty.
         compare: whether models are compared.
         out: folder of the tables and plots; None: they are not written.
     """
@@ -52,6 +57,8 @@ def show_evidence(
         tables["comparisons"] = show_comparisons(terminal, found)
     if records and found:
         tables |= show_uncertainty(terminal, folder, {own.model: records[own.model] for own in found})
+    if joint:
+        tables["feasibility"] = show_feasibility(terminal, folder, found, joint)
     if out is not None:
         write_evidence(terminal, out, tables)
     return tables
@@ -133,6 +140,35 @@ def _show_densities(terminal: Terminal, tables: Tables, seconds: float) -> None:
         f"radius: of half of the vehicles, to hold {SHOWN_RADIUS:.0%} of true positions; held: by the other half's",
         style="dim",
     )
+
+
+def show_feasibility(
+    terminal: Terminal, folder: TensorFolder, found: Sequence[Evaluation], models: Sequence[Forecaster]
+) -> pl.DataFrame:
+    """Print how many predictions and scenes break rules within the horizon, beside the error and the true futures."""
+    nearest = {own.model: NEAREST if own.nearest is None else own.nearest for own in found}
+    ordered = sorted(models, key=lambda own: own.name)
+    table = pl.concat(measure_feasibility(own, folder, found[0].part, nearest[own.name]) for own in ordered)
+    last = table.filter(pl.col("seconds") == pl.col("seconds").max())
+    rules = [ANY_RULE, *FEASIBILITY_RULES]
+    for title, share, floor in (
+        ("predictions that break a rule", "share", "true_share"),
+        ("scenes with a prediction that breaks a rule", "scene_share", "true_scene_share"),
+    ):
+        lines = []
+        for (run,), own in last.group_by("run", maintain_order=True):
+            values = dict(zip(own["rule"], own[share], strict=True))
+            lines.append([str(run), format_number(own["rmse_m"][0]), *(f"{values[rule]:.1%}" for rule in rules)])
+        values = dict(zip(last["rule"], last[floor], strict=True))  # of all models the same
+        lines.append(["true futures", "", *(f"{values[rule]:.1%}" for rule in rules)])
+        headings = ["", "RMSE, m", *(rule.replace("_", " ") for rule in rules)]
+        print_table(terminal, headings, lines, title=title, fold=True)
+    terminal.print_line(
+        f"rules: docs/tables.md (feasibility); within {last['seconds'][0]:g} s, {last['n'][0]:,} predictions in "
+        f"{last['scenes'][0]:,} scenes",
+        style="dim",
+    )
+    return table
 
 
 def write_evidence(terminal: Terminal, folder: Path, tables: Tables) -> None:

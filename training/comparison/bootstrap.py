@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from tracklake.schemas.arrays import Floats, Integers
+from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.comparisons import COMPARED_FIGURES, VEHICLE
 from tracklake.schemas.errors import TracklakeError, UsageError
 
@@ -196,6 +196,7 @@ def bound_shares(hits: Floats, n: Floats) -> tuple[Floats, Floats]:
     """Find the 95 % intervals of shares from counts (V, K) of vehicles: low and high (K,), NaN with fewer than two.
 
     The variance is that of a ratio of sums over independent vehicles (Cochran 1977, Sampling Techniques, section 6.4).
+    Of none or all, the outer bound is exact where every vehicle counts once (Clopper and Pearson 1934, Biometrika 26).
     """
     total = n.sum(axis=0)
     share = hits.sum(axis=0) / np.maximum(total, 1)
@@ -203,4 +204,16 @@ def bound_shares(hits: Floats, n: Floats) -> tuple[Floats, Floats]:
     squares = ((hits - share * n) ** 2).sum(axis=0) * vehicles / np.maximum(vehicles - 1, 1)
     quantile = [find_quantile(max(int(count) - 1, 1)) for count in vehicles]
     half = np.where(vehicles > 1, quantile * np.sqrt(squares) / np.maximum(total, 1), np.nan)
-    return np.maximum(share - half, 0.0), np.minimum(share + half, 1.0)
+    alike = np.where(vehicles > 1, 0.025 ** (1 / np.maximum(vehicles, 1)), np.nan)
+    low = np.where(share == 1, alike, np.maximum(share - half, 0.0))
+    return low, np.where(share == 0, 1 - alike, np.minimum(share + half, 1.0))
+
+
+def estimate_shares(inside: Flags, vehicle: Integers) -> tuple[Floats, Floats, Floats, int, int]:
+    """Find shares of samples (B, K) of vehicles (B,), their intervals (K,), and the numbers of both."""
+    number = np.unique(vehicle, return_inverse=True)[1]
+    hits = np.zeros((int(number.max()) + 1, inside.shape[1]))
+    np.add.at(hits, number, inside)
+    n = np.broadcast_to(np.bincount(number).astype(np.float64)[:, None], hits.shape)
+    low, high = bound_shares(hits, n)
+    return inside.mean(axis=0), low, high, len(inside), len(hits)

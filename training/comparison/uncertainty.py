@@ -7,10 +7,10 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from tracklake.schemas.arrays import Flags, Floats, Integers
+from tracklake.schemas.arrays import Floats
 from tracklake.schemas.columns import Table
 from tracklake.schemas.comparisons import CALIBRATION, CONFORMAL_RADII, DENSITY_ERRORS
-from tracklake.training.comparison.bootstrap import bound_shares
+from tracklake.training.comparison.bootstrap import estimate_shares
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.comparison.traffic_states import list_classes
 
@@ -31,23 +31,13 @@ def calibrate(run: str, record: SampleRecord) -> pl.DataFrame:
         if not judged.any():
             continue
         inside = record.level[judged, at, None] <= np.array(LEVELS)
-        share, low, high, n, vehicles = _find_shares(inside, record.vehicle[judged])
+        share, low, high, n, vehicles = estimate_shares(inside, record.vehicle[judged])
         rows.append(
             pl.DataFrame({"level": LEVELS, "coverage": share, "low": low, "high": high}).with_columns(
                 run=pl.lit(run), seconds=pl.lit(seconds), n=pl.lit(n), vehicles=pl.lit(vehicles)
             )
         )
     return _finish(CALIBRATION, rows)
-
-
-def _find_shares(inside: Flags, vehicle: Integers) -> tuple[Floats, Floats, Floats, int, int]:
-    """Find shares of samples (B, K) of vehicles (B,), their intervals (K,), and the numbers of both."""
-    number = np.unique(vehicle, return_inverse=True)[1]
-    hits = np.zeros((int(number.max()) + 1, inside.shape[1]))
-    np.add.at(hits, number, inside)
-    n = np.broadcast_to(np.bincount(number).astype(np.float64)[:, None], hits.shape)
-    low, high = bound_shares(hits, n)
-    return inside.mean(axis=0), low, high, len(inside), len(hits)
 
 
 def score_by_density(run: str, record: SampleRecord, density: Floats) -> pl.DataFrame:
@@ -104,7 +94,7 @@ def find_radii(run: str, record: SampleRecord, density: Floats, seed: int = 0) -
                 row |= {"calibration_n": len(known), "n": int(held_back.sum()), "vehicles": 0}
                 if radius is not None and held_back.any():
                     inside = distance[held_back, at, None] <= radius
-                    share, low, high, _, row["vehicles"] = _find_shares(inside, record.vehicle[held_back])
+                    share, low, high, _, row["vehicles"] = estimate_shares(inside, record.vehicle[held_back])
                     row |= {"coverage": float(share[0]), "low": float(low[0]), "high": float(high[0])}
                 rows.append(pl.DataFrame([row], schema=CONFORMAL_RADII.dtypes))
     return _finish(CONFORMAL_RADII, rows)

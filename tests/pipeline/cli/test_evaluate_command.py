@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import re
 from io import StringIO
 from unittest import mock
@@ -14,12 +15,12 @@ from rich.console import Console
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.comparisons import CALIBRATION, COMPARISONS, CONFORMAL_RADII, DENSITY_ERRORS, VEHICLE_ERRORS
+from tracklake.schemas.comparisons import COMPARISON_TABLES, VEHICLE_ERRORS
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 
-EVIDENCE = (COMPARISONS, CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII)
+EVIDENCE = COMPARISON_TABLES[1:]
 
 
 @pytest.fixture
@@ -118,14 +119,15 @@ def test_errors_of_vehicles_add_up_to_the_scores(said, out):
     assert sums["rmse_m"].to_list() == pytest.approx(scores["rmse_m"].to_list())
 
 
-def test_calibration_is_shown_and_written(command, lake, tmp_path):
-    call = ("evaluate", "kalman-cv", "constant-velocity", "--lake", lake.root, "--calibration")
+def test_calibration_and_feasibility_are_shown_and_written(command, lake, tmp_path):
+    call = ("evaluate", "kalman-cv", "constant-velocity", "--lake", lake.root, "--calibration", "--feasibility")
     done = command.here(*call, "--compare", "--evidence", tmp_path / "evidence")
     assert done.code == 0, done.err
     assert "true positions in predicted regions\n" in done.out
     assert "kalman-cv, 90% region" in done.out
     assert "constant-velocity: no density is predicted" in done.out
     assert "at 5 s, by vehicles per km of lane\n" in done.out
+    assert "scenes with a prediction that breaks a rule\n" in done.out
     files = {path.name: path for path in (tmp_path / "evidence").iterdir()}
     assert sorted(files) == sorted([*(f"{own.name}.csv" for own in EVIDENCE), "reliability.svg"])
     assert "kalman-cv, 5 s" in files["reliability.svg"].read_text()
@@ -134,6 +136,10 @@ def test_calibration_is_shown_and_written(command, lake, tmp_path):
         assert own.validate(table, where="here").height > 0
     radii = pl.read_csv(files["conformal_radii.csv"]).filter(density="all", level=0.9)
     assert radii["run"].unique().sort().to_list() == ["constant-velocity", "kalman-cv"]
+    judged = pl.read_csv(files["feasibility.csv"]).filter(run="constant-velocity", rule="any", seconds=5.0)
+    errors = pl.read_csv(files["density_errors.csv"]).filter(run="constant-velocity", density="all", seconds=5.0)
+    rmse = math.hypot(errors["rmse_longitudinal_m"][0], errors["rmse_lateral_m"][0])
+    assert judged["rmse_m"][0] == pytest.approx(rmse, rel=1e-4)
 
 
 def list_files(lake):

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from scipy.stats import chi2, multivariate_normal
 from tensor_tables import CLOCK, TINY, split_row, write
 
@@ -186,6 +187,14 @@ def test_intervals_of_shares_equal_a_loop():
     half = 4.302653 * math.sqrt(squares * 3 / 2) / 8  # Student's t of two degrees of freedom
     low, high = bound_shares(hits, n)
     assert (low[0], high[0]) == (max(share - half, 0), min(share + half, 1))
+
+
+def test_none_and_all_have_exact_bounds():
+    # With 4 vehicles none is right with a probability of 2.5 % where each is with 1 - 0.025 ** (1 / 4).
+    n = np.full((4, 2), 3.0)
+    low, high = bound_shares(np.column_stack([np.zeros(4), np.full(4, 3.0)]), n)
+    assert (low.tolist(), high.tolist()) == ([0, 0.025**0.25], [1 - 0.025**0.25, 1])
+    assert stats.binom.pmf(0, 4, high[0]) == pytest.approx(0.025)
 
 
 def road(folder):
