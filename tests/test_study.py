@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from study.__main__ import main, run_arms
 from study.jobs import SCORES, Job, Lake, Workshop
-from study.page import render_pages
+from study.page import lay_out_prices, render_pages
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
@@ -193,6 +193,23 @@ def test_errors_of_two_splits_are_subtracted_with_both_their_intervals():
     ]
     found = Results({"comparisons": pl.DataFrame(rows)}).subtract("leaks", "fair", "lstm", 1.0)
     assert found == pytest.approx({"difference": 2.0, "low": 1.5, "high": 2.5})
+
+
+def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
+    """0.4 m more with a defect of 20 % of the vehicles: 0.02 m per per cent."""
+    (arm,) = next(piece.arms for piece in PIECES if piece.name == "defects")
+    clean, damaged, mended = arm.learners[:3]
+    rows = [
+        {"arm": arm.name, "model": own.name, "against": clean.name, "dataset": "all", "figure": figure, "seconds": 5.0}
+        | {"difference": value, "low": value - 0.1, "high": value + 0.1}
+        for own, value in ((damaged, 0.4), (mended, 0.05))
+        for figure in ("rmse_m", "nll_nats")
+    ]
+    seeds = pl.DataFrame({"arm": [arm.name], "seconds": [5.0]})
+    page = lay_out_prices(Results({"comparisons": pl.DataFrame(rows), "seeds": seeds}), arm)
+    *_, first, second = page.splitlines()
+    assert first.endswith("| worse +0.40 (+0.30 to +0.50) | +0.0200 | +0.0200 | costs 0.40 m |")
+    assert second.endswith("| +0.05 (-0.05 to +0.15) | +0.0025 | +0.0025 | no cost shown |")
 
 
 INTERVAL = re.compile(r"(better|worse) (?:\()?([+-][\d.]+)[^()]*?\(?(?:95 % interval )?([+-][\d.]+) to ([+-][\d.]+)")

@@ -31,7 +31,8 @@ def draw_errors(rows: pl.DataFrame, figures: Mapping[str, str]) -> Drawing:
     models, arms = (seeds[name].unique(maintain_order=True).to_list() for name in ("model", "arm"))
     colours = [PALETTE[number % len(PALETTE)] for number in range(len(models))]
     dashes = [DASHES[number // len(PALETTE) % len(DASHES)] for number in range(len(models))]
-    legend = alt.Legend(title=None, columns=4, symbolSize=500, labelColor=INK, labelLimit=190, orient="bottom")
+    symbol = {"symbolType": "stroke", "symbolSize": 500, "symbolStrokeWidth": 2.5, "symbolOpacity": 1}
+    legend = alt.Legend(title=None, columns=4, labelColor=INK, labelLimit=190, orient="bottom", **symbol)
     base = alt.Chart().encode(
         x=alt.X("seconds:Q", title="seconds ahead", axis=alt.Axis(grid=False, tickMinStep=1, format="d")),
         color=alt.Color("model:N", sort=models, scale=alt.Scale(domain=models, range=colours), legend=legend),

@@ -29,7 +29,7 @@ from tracklake.training.runs.run_folder import digest_tensors
 ROOT = Path(__file__).resolve().parents[2]
 NOTES, SCORES, VEHICLES = "jobs.csv", "scores.csv", "vehicles.parquet"
 """Files of the study's folder: what was run, and of each run its scores and its errors by vehicle."""
-EVIDENCE = ("--calibration",)
+EVIDENCE = ("--calibration", "--feasibility")
 """Options of `tracklake evaluate` for what is looked at besides the errors."""
 LATER = {"lateral_positions": RECORDED_POSITIONS}
 """What the index did not state of a recording at first, and what it was then: no run is made again because of it."""
@@ -273,7 +273,7 @@ def lend_run(job: Job) -> None:
 
     Recordings of two samples have the same names. So that a run is not refused as one that was trained on what it is
     scored on, its copy states the blocks of that lake: samples of other traffic, or clean copies of blocks of its own
-    evaluation part, are scored.
+    evaluation part, are scored. It states that lake's protocol, too, which may take other tracks, recorded ones.
     """
     copy = job.lake.root / MODELS / job.run
     if not copy.exists():
@@ -281,7 +281,7 @@ def lend_run(job: Job) -> None:
         shutil.rmtree(aside, ignore_errors=True)
         shutil.copytree(job.run_folder, aside)
         config = json.loads((aside / "config.json").read_text(encoding="utf-8"))
-        config["blocks"] = (job.lake.index or {})["blocks"]
+        config |= {name: (job.lake.index or {})[name] for name in ("blocks", "protocol")}
         (aside / "config.json").write_text(json.dumps(config), encoding="utf-8")
         aside.rename(copy)
 

@@ -153,6 +153,42 @@ def lay_out_by_density(results: Results, arm: Arm) -> str:
     return grid(["model", "vehicles per km of lane", "samples", *heads], body) if body else ""
 
 
+def lay_out_feasibility(results: Results, arm: Arm) -> str:
+    """Lay out how many predictions of whole scenes break a rule up to the last horizon, beside true futures."""
+    rows = results.of_arm("feasibility", arm.name).filter(pl.col("seconds") == pl.col("seconds").max())
+    pooled = rows.group_by("model", "rule", maintain_order=True).agg(_pool("share"), _pool("true_share"))
+    rules = pooled["rule"].unique(maintain_order=True).to_list()
+    shares = {
+        (model, rule): f"{100 * value:.2f}"
+        for model, rule, share, floor in pooled.rows()
+        for model, value in ((f"`{model}`", share), ("true futures", floor))
+        if value is not None
+    }
+    models = sorted({model for model, _ in shares}, key=lambda name: (name != "true futures", name))
+    body = [[model, *(shares.get((model, rule), "-") for rule in rules)] for model in models]
+    return grid(["% of predictions", *rules], body) if body else ""
+
+
+def lay_out_prices(results: Results, arm: Arm) -> str:
+    """Lay out what each per cent of damaged vehicles costs, at the last horizon, in words and figures."""
+    at = results.list_seconds(arm.name)[-1]
+    body = []
+    for own in arm.learners:
+        found = {
+            figure: results.compare(arm.name, own.name, arm.learners[0].name, at, figure)
+            for figure in ("rmse_m", "nll_nats")
+        }
+        error, nll = found["rmse_m"], found["nll_nats"]
+        if own.source is not None and error is not None and nll is not None:
+            per_cent = 100 * float(own.source.sample[own.source.sample.index("--dose") + 1])
+            says = judge(error["low"], error["high"])
+            costs = {"worse": f"costs {error['difference']:.2f} m", "better": f"gains {-error['difference']:.2f} m"}
+            parts = (error["difference"] / per_cent, nll["difference"] / per_cent)
+            row = (_format_difference(error), *(f"{part:+.4f}" for part in parts), costs.get(says, "no cost shown"))
+            body.append([f"`{own.name}`", *row])
+    return grid(["trained on", f"RMSE at {at:g} s, m", "m per %", "nats per %", "in words"], body) if body else ""
+
+
 def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
     """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart."""
     seconds = results.list_seconds(arm.name)
@@ -178,6 +214,8 @@ TABLES_OF_ARM = (
     lay_out_maneuvers,
     lay_out_coverage,
     lay_out_by_density,
+    lay_out_feasibility,
+    lay_out_prices,
     lay_out_leakage,
 )
 """Functions that the templates call with an arm."""

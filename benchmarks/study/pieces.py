@@ -112,6 +112,23 @@ ALONE = {
     for dataset, title in (("ngsim", "NGSIM-like"), ("highd", "highD-like"))
 }
 MOVED = tuple(replace(own, seeds=5, source=KRAUSS, label=f"{own.model}, of Krauss") for own in (LSTM, V_LSTM, CS_LSTM))
+CLEAN = generate("varied-idm", 0, "The same traffic without any defect.", "--defect", "late_start", "--dose", "0")
+DOSED = ("late_start", "frame_gap", "position_jump", "second_track", "acceleration_spike")
+"""Defects that are injected, each alone."""
+DOSE = 0.2
+"""Share of the vehicles that get a defect."""
+REPAIRED = {"TRACKLAKE_RECONSTRUCT": "true", "TRACKLAKE_TRACKS_FROM": "reconstructed"}
+LEARNER = Learner("v-lstm", 5, 12_500)
+DAMAGED = tuple(
+    replace(
+        LEARNER,
+        label=f"v-lstm, {defect} {DOSE:.0%}{title}",
+        source=generate("varied-idm", 0, "", "--defect", defect, "--dose", str(DOSE)),
+        settings=settings,
+    )
+    for defect in DOSED
+    for title, settings in (("", {}), (", reconstructed", REPAIRED))
+)
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
 
 PIECES = (
@@ -254,6 +271,22 @@ PIECES = (
                 learners=LEAKING,
                 settings={**BLOCKS, "TRACKLAKE_SPLIT": "csp-2018", "TRACKLAKE_SPLITS": '["csp-2018"]'},
                 pairs=(),
+            ),
+        ),
+    ),
+    Piece(
+        "defects",
+        6,
+        "The price of defects",
+        "One defect of a fifth of the vehicles in otherwise clean traffic; a network is trained on it, or on its "
+        "reconstructed tracks, and scored on the same traffic without defects.",
+        (
+            replace(
+                GENERATED,
+                name="defects",
+                source=CLEAN,
+                learners=(LEARNER, *DAMAGED),
+                pairs=pair_with(LEARNER, DAMAGED),
             ),
         ),
     ),

@@ -10,7 +10,7 @@ import polars as pl
 
 from study.jobs import SCORES, VEHICLES, Job, Lake
 from study.plan import Arm
-from tracklake.schemas.comparisons import CALIBRATION, COMPARED_FIGURES, CONFORMAL_RADII, DENSITY_ERRORS
+from tracklake.schemas.comparisons import CALIBRATION, COMPARED_FIGURES, CONFORMAL_RADII, DENSITY_ERRORS, FEASIBILITY
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.training.comparison.bootstrap import compare_errors
 
@@ -41,7 +41,7 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
         **dict.fromkeys(("train", "val", "eval"), WHOLE),
     },
 }
-EVIDENCE_TABLES = {table.name: table for table in (CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII)}
+EVIDENCE_TABLES = {table.name: table for table in (CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII, FEASIBILITY)}
 TABLES |= {
     name: {**KEY, "lake": TEXT, **{column: dtype for column, dtype in table.dtypes.items() if column != "run"}}
     for name, table in EVIDENCE_TABLES.items()
