@@ -97,7 +97,8 @@ ABLATED = (
 )
 LONG_GRID = replace(CS_LSTM, label="cs-lstm, cells of 9 m", settings={"TRACKLAKE_GRID_CELL_M": "9.144"}, at_home=True)
 AXES = tuple(ablate(V_LSTM, f"anchored {axis}", f"anchoring={axis}") for axis in ("none", "longitudinal", "lateral"))
-AUGMENTED = (ablate(V_LSTM, "mirrored", "augmentation=lateral-inversion"),)
+MIRRORED = ablate(V_LSTM, "mirrored", "augmentation=mirror")
+AUGMENTED = ablate(CS_LSTM, "mirrored and shifted", "augmentation=both")
 ALONE = {
     dataset: tuple(
         replace(
@@ -200,16 +201,25 @@ PIECES = (
         "The same recordings. One setting of a model is changed: attention learns from the predicted vehicle alone as "
         "the others do, is not given sizes or lanes, is trained with two vehicles around, or sees no farther than the "
         "grid does; the grid's cells are twice as long; V-LSTM counts one axis or both from where they stand, not from "
-        "constant velocity; V-LSTM also learns from mirrored samples.",
+        "constant velocity; V-LSTM learns from mirrored samples, CS-LSTM from mirrored and shifted ones.",
         (
             replace(
                 GENERATED,
                 name="ablations",
-                learners=(ATTENTION, *ABLATED, CS_LSTM, LONG_GRID, replace(V_LSTM, seeds=5), *AXES, *AUGMENTED),
+                learners=(
+                    ATTENTION,
+                    *ABLATED,
+                    CS_LSTM,
+                    LONG_GRID,
+                    replace(V_LSTM, seeds=5),
+                    *AXES,
+                    MIRRORED,
+                    AUGMENTED,
+                ),
                 pairs=(
                     *pair_with(ATTENTION, ABLATED),
-                    *pair_with(CS_LSTM, (LONG_GRID,)),
-                    *pair_with(V_LSTM, (*AXES, *AUGMENTED)),
+                    *pair_with(CS_LSTM, (LONG_GRID, AUGMENTED)),
+                    *pair_with(V_LSTM, (*AXES, MIRRORED)),
                 ),
             ),
         ),
