@@ -12,6 +12,7 @@ from tracklake.pipeline.synthetic import (
     DEFAULT_FORMATS,
     DEFAULT_MINUTES,
     DEFAULT_NOISE,
+    DOSED,
     NOISE_MODELS,
     TRAFFICS,
     UNIFORM,
@@ -70,6 +71,8 @@ def write_generated(
     formats: list[str] | None = None,
     noise: list[str] | None = None,
     traffic: str = UNIFORM,
+    defect: str | None = None,
+    dose: float | None = None,
 ) -> SampleSummary:
     """Write the generated sample into a folder."""
     for name in formats or ():
@@ -77,6 +80,8 @@ def write_generated(
     for name in noise or ():
         require_choice("--noise", name, NOISE_MODELS)
     require_choice("--traffic", traffic, TRAFFICS)
+    if defect is not None:
+        require_choice("--defect", defect, tuple(DOSED))
     if not formats and find_missing("onboard"):
         formats = [name for name in DEFAULT_FORMATS if name != DRIVES]
         terminal.print_line("without drives, which need the extra [onboard]", style="dim")
@@ -88,5 +93,7 @@ def write_generated(
             seed=1 if seed is None else seed,
             noise=tuple(noise) if noise else DEFAULT_NOISE,
             traffic=traffic,
+            defect=defect,
+            dose=dose,
             progress=lambda text: terminal.print_line(text, style="dim"),
         )

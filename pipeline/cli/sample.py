@@ -30,6 +30,13 @@ def sample(
             "--traffic", help="uniform, or varied-idm, varied-krauss: drivers, lane changes and waves drawn at random."
         ),
     ] = UNIFORM,
+    defect: Annotated[
+        str | None,
+        typer.Option("--defect", help="The only defect of the sample, such as frame_gap or late_start; with --dose."),
+    ] = None,
+    dose: Annotated[
+        float | None, typer.Option("--dose", help="Share of the vehicles that have the defect; 0: clean traffic.")
+    ] = None,
     minutes: MinutesOption = None,
     seed: SeedOption = None,
     quiet: QuietOption = False,
@@ -38,11 +45,16 @@ def sample(
     """Generate recordings in the raw formats with SUMO, with known defects and their truth."""
     with command(quiet=quiet, json=json) as terminal:
         refuse_lake(out)
-        summary = write_generated(out, minutes, seed, terminal, formats=format, noise=noise, traffic=traffic)
+        summary = write_generated(
+            out, minutes, seed, terminal, formats=format, noise=noise, traffic=traffic, defect=defect, dose=dose
+        )
         terminal.print_line(
             f"{summary.rows:,} rows of {summary.recordings} recordings in {out} ({summary.seconds:.0f} s)"
         )
+        if summary.dose is not None:
+            terminal.print_line(f"{defect}: {summary.dose:.2%} of the vehicles, {dose:.2%} were asked for")
         terminal.print_line(f"Try next:\n  {find_command()} run {out}")
         terminal.print_json(
             {"out": out, "rows": summary.rows, "recordings": summary.recordings, "seconds": summary.seconds}
+            | ({} if summary.dose is None else {"defect": defect, "dose": summary.dose})
         )

@@ -11,7 +11,16 @@ import polars as pl
 from tracklake.pipeline.synthetic.build import README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
 from tracklake.pipeline.synthetic.drivers import TRAFFICS, UNIFORM
 from tracklake.pipeline.synthetic.noise import NOISE_MODELS, SMOOTH
-from tracklake.pipeline.synthetic.scenarios import DEFAULT_FORMATS, FORMATS, LEAST_MINUTES, MOST_MINUTES
+from tracklake.pipeline.synthetic.scenarios import (
+    DEFAULT_FORMATS,
+    DOSED,
+    DRIVES,
+    FORMATS,
+    HIGHD_ONLY,
+    LEAST_MINUTES,
+    MOST_MINUTES,
+    Dose,
+)
 from tracklake.pipeline.synthetic.sumo import SumoError
 from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
 from tracklake.schemas.errors import UsageError
@@ -27,6 +36,7 @@ __all__ = [
     "DEFAULT_FORMATS",
     "DEFAULT_MINUTES",
     "DEFAULT_NOISE",
+    "DOSED",
     "NOISE_MODELS",
     "TRAFFICS",
     "UNIFORM",
@@ -38,12 +48,16 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SampleSummary:
-    """The result of writing a sample: its files, data lines of tracks with damaged ones, recordings, and time."""
+    """The result of writing a sample: its files, data lines of tracks with damaged ones, recordings, and time.
+
+    `dose` is the share of the vehicles that have the defect, where one was asked for by dose.
+    """
 
     files: tuple[Path, ...]
     rows: int
     recordings: int
     seconds: float
+    dose: float | None = None
 
 
 def write_sample(
@@ -54,6 +68,8 @@ def write_sample(
     seed: int = 1,
     noise: tuple[str, ...] = DEFAULT_NOISE,
     traffic: str = UNIFORM,
+    defect: str | None = None,
+    dose: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SampleSummary:
     """Write a sample: raw files, `truth.parquet`, `true_tracks.parquet` and a README.
@@ -62,7 +78,8 @@ def write_sample(
     ALL_FORMATS are written into `out`, which is missing, empty, or holds only an earlier sample, which is replaced.
     Recordings last 0.4 to 1.9 times `minutes`; the same seed, formats and minutes give the same bytes. `noise` are some
     of NOISE_MODELS, whose errors add up; with none, positions are exact but for the defects. `traffic` is one of
-    TRAFFICS. `progress` is called with a description of each step.
+    TRAFFICS. With `defect`, a name from DOSED, the share `dose` of the vehicles has it, and there are no other defects.
+    `progress` is called with a description of each step.
 
     Raises:
         UsageError: an argument is invalid, or `out` holds other files.
@@ -80,6 +97,7 @@ def write_sample(
         raise UsageError(f"noise: expected some of {', '.join(NOISE_MODELS)}, got {', '.join(unknown)}")
     if traffic not in TRAFFICS:
         raise UsageError(f"traffic: expected one of {', '.join(TRAFFICS)}, got {traffic}")
+    dosed = _read_dose(defect, dose, formats)
     out = Path(out).absolute()
     _require_replaceable(out)
     began = time.perf_counter()
@@ -87,7 +105,8 @@ def write_sample(
     aside, old = name_unfinished(out), name_unfinished(out)
     aside.mkdir()
     try:
-        rows, recordings = build_sample(aside, formats, minutes, seed, models, traffic, progress or (lambda _: None))
+        report = progress or (lambda _: None)
+        rows, recordings, reached = build_sample(aside, formats, minutes, seed, models, traffic, dosed, report)
         _require_replaceable(out)
         if out.exists():
             out.rename(old)
@@ -95,7 +114,23 @@ def write_sample(
     finally:
         for leftover in (aside, old):
             shutil.rmtree(leftover, ignore_errors=True)
-    return SampleSummary(tuple(sorted(out.iterdir())), rows, recordings, time.perf_counter() - began)
+    return SampleSummary(tuple(sorted(out.iterdir())), rows, recordings, time.perf_counter() - began, reached)
+
+
+def _read_dose(defect: str | None, dose: float | None, formats: tuple[str, ...]) -> Dose | None:
+    """Check a defect and its dose; both or none are given."""
+    if defect is None and dose is None:
+        return None
+    if defect is None or dose is None:
+        raise UsageError("a defect and its dose belong together, such as --defect frame_gap --dose 0.05")
+    if defect not in DOSED:
+        raise UsageError(f"defect: expected one of {', '.join(DOSED)}, got {defect}")
+    if not 0 <= dose <= 1:
+        raise UsageError(f"dose: expected a share of the vehicles from 0 to 1, got {dose}")
+    others = [name for name in formats if name not in ("highd", DRIVES)]
+    if defect in HIGHD_ONLY and others:
+        raise UsageError(f"{defect} cannot be recorded in {', '.join(others)}; choose --format highd")
+    return Dose(defect, dose)
 
 
 def _require_replaceable(out: Path) -> None:

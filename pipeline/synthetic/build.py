@@ -21,10 +21,12 @@ from tracklake.pipeline.synthetic.scenarios import (
     NGSIM_CSV,
     NGSIM_SOCRATA,
     NGSIM_TEXT,
+    Dose,
     HighdScenario,
     NgsimScenario,
     Road,
     Traffic,
+    plan_dose,
 )
 from tracklake.pipeline.synthetic.sumo import find_sumo, simulate, stop_programs
 
@@ -70,14 +72,15 @@ def build_sample(
     seed: int,
     noise: tuple[str, ...],
     traffic: str,
+    dose: Dose | None,
     progress: Callable[[str], None],
-) -> tuple[int, int]:
+) -> tuple[int, int, float | None]:
     """Write a whole sample into an empty folder; the arguments are those of `write_sample`.
 
-    Returns the number of data lines in files of tracks, and of recordings.
+    Returns the number of data lines in files of tracks, and of recordings, and the share of vehicles with the defect.
     """
     home = find_sumo()
-    recordings = HIGHD if "highd" in formats else ()
+    recordings: tuple[HighdScenario, ...] = HIGHD if "highd" in formats else ()
     groups: list[tuple[str, str, tuple[NgsimScenario, ...]]] = [
         (kind, file, scenarios)
         for kind, file, scenarios in (
@@ -94,6 +97,10 @@ def build_sample(
     ]
     progress(f"simulating {len(jobs)} carriageways")
     clean = _simulate_all(home, jobs, seed, progress)
+    if dose is not None:
+        recordings = tuple(replace(scenario, damaged=False) for scenario in recordings)
+        plans = (plan_dose(dose, clean[job.subset]["vehicle"].n_unique()) for job in jobs)
+        jobs = [replace(job, traffic=replace(job.traffic, plan=plan)) for job, plan in zip(jobs, plans, strict=True)]
     found = truth.Found()
     rows: list[dict[str, object]] = []
     true: list[pl.DataFrame] = []
@@ -108,7 +115,7 @@ def build_sample(
         progress(f"writing {file}")
         of_file = [job for job in jobs if job.file == file]
         numbered = _shift_vehicles(scenarios, of_file, clean)
-        rows += _write_ngsim(folder, kind, file, scenarios, of_file, numbered, seed, noise)
+        rows += _write_ngsim(folder, kind, file, scenarios, of_file, numbered, seed, noise, damaged=dose is None)
         true += [_find_true_tracks(job, numbered[job.subset], found) for job in of_file]
         names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
         truth.read_ngsim(folder / file, names, found)
@@ -119,18 +126,46 @@ def build_sample(
         rows += drives.write_drive(folder, drive, tracks[drive.subset], pair[0].road.rate_hz, seed)
     progress("writing the truth")
     # What each rule has to find is counted where today's tests compare it; the loops take as long as all the rest.
-    counted = found if traffic == UNIFORM else replace(found, entries={})
+    counted = found if traffic == UNIFORM and dose is None else replace(found, entries={})
+    rows += [] if dose is None else _measure_dose(dose, jobs, rows)
     truth.build_truth(rows + truth.list_counts(counted)).write_parquet(folder / TRUTH_FILE)
     pl.concat([pl.DataFrame(schema=true_tracks.TRUE_TRACKS_SCHEMA), *true]).sort(
         "dataset", "subset", "vehicle_id", "frame"
     ).write_parquet(folder / TRUE_TRACKS_FILE)
     named = " and ".join(noise) or "no"
     named += " noise" if traffic == UNIFORM else f" noise, {traffic} traffic"
+    named += "" if dose is None else f", of the defects only {dose.defect}, of {dose.share:g} of the vehicles"
     text = README.format(seed=seed, minutes=minutes, noise=named)
     (folder / README_FILE).write_text(text, encoding="utf-8")
     lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
     count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
-    return lines, count + driven * len(drives.SCENARIOS)
+    return lines, count + driven * len(drives.SCENARIOS), _find_share(rows) if dose is not None else None
+
+
+def _measure_dose(dose: Dose, jobs: list[_Job], rows: list[dict[str, object]]) -> list[dict[str, object]]:
+    """Measure the dose reached in each subset, by the rows of truth about its vehicles and defects."""
+    table = truth.build_truth(rows)
+    measured = []
+    for job in jobs:
+        own = table.filter(subset=job.subset)
+        vehicles, damaged = own.filter(kind="first_frame"), own.filter(kind="defect", name=dose.defect)
+        if vehicles.is_empty():  # simulated for drives alone
+            continue
+        reached = damaged["vehicle_id"].n_unique()
+        measured.append(
+            {
+                "kind": "dose", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
+                "file": job.file, "name": dose.defect, "entries": int(damaged["entries"].sum()), "vehicles": reached,
+                "value": reached / vehicles.height,
+            }
+        )  # fmt: skip
+    return measured
+
+
+def _find_share(rows: list[dict[str, object]]) -> float:
+    """Find the share of all vehicles that have the defect."""
+    table = truth.build_truth(rows)
+    return float(table.filter(kind="dose")["vehicles"].sum() / max(1, table.filter(kind="first_frame").height))
 
 
 def _find_driven() -> tuple[HighdScenario, ...]:
@@ -220,7 +255,7 @@ def _damage_tracks(
         job.traffic.plan,
         rate_hz=job.road.rate_hz,
         on_ramp_lane=job.road.lanes + 2 if job.road.ramp else None,
-        unseen_leaders=is_ngsim,
+        unseen_leaders=is_ngsim and job.traffic.plan.lost_leader,
         random=random,
         next_vehicle=next_vehicle,
     )
@@ -337,11 +372,14 @@ def _write_ngsim(
     tracks: dict[str, pl.DataFrame],
     seed: int,
     noise: tuple[str, ...],
+    *,
+    damaged: bool,
 ) -> list[dict[str, object]]:
+    """Write an NGSIM file, and list its defects; `damaged` also inserts duplicates and malformed lines."""
     written, rows = [], []
     for scenario, job in zip(scenarios, jobs, strict=True):
-        damaged, declared = _damage_tracks(tracks[job.subset], job, seed, noise)
-        written.append(ngsim.build_rows(damaged, scenario.start_time))
+        injected, declared = _damage_tracks(tracks[job.subset], job, seed, noise)
+        written.append(ngsim.build_rows(injected, scenario.start_time))
         rows += declared
     random = np.random.default_rng([seed, jobs[0].index, 2])
     together = pl.concat(written)
@@ -352,7 +390,7 @@ def _write_ngsim(
     else:
         lines = ngsim.format_portal(ngsim.shuffle_rows(together, random))
         dialect = damage.Dialect(header=True, separator=",", number_field=5, quotes=True)
-    lines, extra = damage.damage_lines(lines, dialect, random)
+    lines, extra = damage.damage_lines(lines, dialect, random) if damaged else (lines, [])
     recording = jobs[0].recording if len(jobs) == 1 else None
     rows += _list_line_defects(extra, "ngsim", recording, file)
     end, start = ("\r\n", BOM) if kind == "socrata" else ("\n", b"")

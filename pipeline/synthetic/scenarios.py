@@ -1,6 +1,7 @@
 """Scenarios of the sample as data: roads, traffic and the number of defects of each kind."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 from tracklake.pipeline.synthetic.drivers import UNIFORM
 
@@ -52,6 +53,7 @@ class Plan:
         size_changes: vehicles recorded longer for a while; in NGSIM's formats they would be two vehicles.
         early_ends: vehicles that lose the last part of their track.
         second_tracks: vehicles whose first seconds stand in the file a second time under another id.
+        lost_leader: one overlap is with a leader that misses frames, in formats that record its headway.
     """
 
     late_starts: int = 3
@@ -69,6 +71,38 @@ class Plan:
     size_changes: int = 0
     early_ends: int = 0
     second_tracks: int = 0
+    lost_leader: bool = True
+
+
+class Dose(NamedTuple):
+    """The one defect of a sample, a name from DOSED, and the share of each subset's vehicles that are to have it."""
+
+    defect: str
+    share: float
+
+
+DOSED = {
+    "late_start": "late_starts", "overlap": "overlaps", "backward": "backward_share", "acceleration_spike": "spikes",
+    "frozen_slow_speed": "frozen", "frame_gap": "gaps", "position_jump": "jumps", "wrong_leader": "wrong_leaders",
+    "wrong_headway": "wrong_headways", "lane_flicker": "lane_flickers", "hard_braking": "hard_brakings",
+    "sideways_speed": "sideways_speeds", "size_change": "size_changes", "early_end": "early_ends",
+    "second_track": "second_tracks",
+}  # fmt: skip
+"""Field of a plan by the name of the defect, as the truth has it."""
+HIGHD_ONLY = ("sideways_speed", "size_change")
+"""Defects that NGSIM's formats cannot record: they have no lateral speeds, and another size is another vehicle."""
+CLEAN = Plan(late_starts=0, overlaps=0, spikes=0, frozen=0, gaps=0, lost_leader=False)
+"""No defects at all."""
+
+
+def plan_dose(dose: Dose, vehicles: int) -> Plan:
+    """Plan a dose among so many vehicles; a larger dose is planned for the same vehicles and more."""
+    wanted = round(dose.share * vehicles)
+    if dose.defect == "backward":
+        # `inject_defects` rounds this share of the vehicles down.
+        return replace(CLEAN, backward_share=(wanted + 0.5) / max(1, vehicles))
+    counts: dict[str, Any] = {DOSED[dose.defect]: wanted}
+    return replace(CLEAN, **counts)
 
 
 @dataclass(frozen=True)

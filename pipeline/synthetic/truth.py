@@ -34,10 +34,11 @@ TRUTH_SCHEMA = {
 `first_frame`: a vehicle's TRUE first and last frame and number of frames in the window, before any defect; value is
 its true x_m at the first, from the window's entrance along the direction of travel (noise apart).
 `lane_change`: a lane change (`name`: left, right) of varied traffic, and its true first and last frame, which may lie
-outside the recording; value is its duration in s. `rule`: entries and vehicles of a subset that break a rule (`name`),
-as counted from the files; value is the number of runs of consecutive frames. `rows`: lines of a file that are `read`
-(the header apart), `kept`, `malformed`, `duplicate`. `drive`: a file of the drive in folder `recording`, of vehicle
-`vehicle_id` in `subset`, which takes value seconds. Null where a column does not apply."""
+outside the recording; value is its duration in s. `dose`: entries and vehicles of a subset that have the defect
+(`name`) of a sample with a dose; value is the share of its vehicles. `rule`: entries and vehicles of a subset that
+break a rule (`name`), as counted from the files; value is the number of runs of consecutive frames. `rows`: lines of a
+file that are `read` (the header apart), `kept`, `malformed`, `duplicate`. `drive`: a file of the drive in folder
+`recording`, of vehicle `vehicle_id` in `subset`, which takes value seconds. Null where a column does not apply."""
 
 METRES_PER_FOOT = 0.3048
 NGSIM_CLASSES = {1: "motorcycle", 2: "car", 3: "truck"}
