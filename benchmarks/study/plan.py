@@ -132,7 +132,7 @@ def list_work(arm: Arm) -> Iterator[tuple[tuple[object, ...], float]]:
 
 def shorten(source: Source) -> Source:
     """Shorten what is generated."""
-    return replace(source, sample=(*source.sample, "--minutes", "0.5")) if source.sample else source
+    return replace(source, sample=(*source.sample, "--minutes", "1")) if source.sample else source
 
 
 def make_quick(piece: Piece) -> Piece:
@@ -151,6 +151,7 @@ def make_quick(piece: Piece) -> Piece:
                 if own.name not in left_out
             ),
             source=shorten(arm.source),
+            settings={**arm.settings, **({"TRACKLAKE_SPLIT_BLOCK_S": "10"} if arm.source.sample else {})},
         )
         for arm in piece.arms
     )
