@@ -4,6 +4,7 @@ import gzip
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from study.pieces import PIECES
 from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
+
+from tracklake.pipeline.cli.train import _read_settings_of_model
+from tracklake.training.models import find_model
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEMPLATES = Path(__file__).parents[1] / "benchmarks" / "study"
@@ -260,6 +264,13 @@ def test_the_plan_stays_within_four_hours_and_names_every_arm_once():
     assert len(set(names)) == len(names)
     assert sum(minutes for _, minutes in estimate_pieces(PIECES).values()) < 240
     assert sum(minutes for _, minutes in estimate_pieces(map(make_quick, PIECES)).values()) < 10
+
+
+def test_every_setting_of_the_plan_is_one_of_its_model():
+    learners = {own.name: own for piece in PIECES for arm in piece.arms for own in arm.learners}
+    for own in learners.values():
+        settings = [word for option, word in pairwise(own.options) if option == "--set"]
+        assert _read_settings_of_model(find_model(own.model), settings) or not settings, own.name
 
 
 def test_the_plan_is_printed_and_an_unknown_piece_refused(capsys, tmp_path):
