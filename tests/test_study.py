@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 from study.__main__ import main, run_arms
 from study.jobs import SCORES, Job, Lake, Workshop
-from study.page import lay_out_prices, render_pages
+from study.page import lay_out_differences, lay_out_errors, lay_out_prices, render_pages
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
@@ -282,3 +282,20 @@ def test_the_plan_is_printed_and_an_unknown_piece_refused(capsys, tmp_path):
     # Without recordings and lakes there is nothing to say, and no page claims otherwise.
     assert main(["--gather", "--work", str(tmp_path), "--docs", str(tmp_path / "docs"), "--data", str(tmp_path)]) == 0
     assert "Not run yet" in (tmp_path / "docs" / "results.md").read_text()
+
+
+def test_an_arm_of_one_dataset_shows_it_alone(monkeypatch):
+    """2 m on one dataset, where the other model has 3 m, and 9 m on both together."""
+    arm = Arm("alone", OTHERS, ("constant-velocity",), (Learner("lstm", 1, 1),), dataset="highd")
+    for module in ("study.page", "study.results"):
+        monkeypatch.setattr(f"{module}.PIECES", (replace(PIECES[0], arms=(arm,)),))
+    blank = dict.fromkeys(TABLES["seeds"]) | {"arm": "alone", "group": "all", "seconds": 5.0, "n": 100}
+    errors = {("lstm", "all"): 2.0, ("lstm", "highd"): 2.0}
+    errors |= {("constant-velocity", "all"): 9.0, ("constant-velocity", "highd"): 3.0}
+    seeds = [blank | {"model": model, "dataset": name, "rmse_m": value} for (model, name), value in errors.items()]
+    row = blank | {"model": "lstm", "against": "constant-velocity", "dataset": "highd", "figure": "rmse_m"}
+    row |= {"difference": -1.0, "low": -1.5, "high": -0.5}
+    tables = {"seeds": pl.DataFrame(seeds, schema=TABLES["seeds"]), "comparisons": pl.DataFrame([row])}
+    results = Results(tables)
+    assert "| `constant-velocity` | 3.00 |" in lay_out_errors(results, arm, "rmse_m")
+    assert "better -1.00 (-1.50 to -0.50)" in lay_out_differences(results, arm, "rmse_m")

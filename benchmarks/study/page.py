@@ -9,7 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from study.figure import draw_errors
 from study.pieces import PIECES
 from study.plan import Arm
-from study.results import FEW, Results, grid, judge
+from study.results import FEW, Results, find_dataset, grid, judge
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
 
@@ -31,7 +31,9 @@ def write_pages(docs: Path) -> None:
             table.write_csv(docs / f"results-{name}.csv")
     for name, content in render_pages(results).items():
         write_file(docs / name, content.encode())
-    drawn = results.tables["seeds"].filter(dataset=EVERYTHING, group=EVERYTHING)
+    arms = {name: find_dataset(name) for name in results.tables["seeds"]["arm"].unique()}
+    shown = pl.col("dataset") == pl.col("arm").replace_strict(arms, return_dtype=pl.String)
+    drawn = results.tables["seeds"].filter(shown, group=EVERYTHING)
     if drawn.height:
         write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
 
@@ -101,11 +103,16 @@ def lay_out_differences(results: Results, arm: Arm, figure: str) -> str:
     return grid(["model", "against", *(f"{at:g} s" for at in seconds)], body) if body else ""
 
 
+def choose_headline(results: Results, arm: Arm) -> str:
+    """Choose the figure that stands for others: along the road alone where nothing is known across it."""
+    return "rmse_m" if results.of_arm("seeds", arm.name)["rmse_m"].count() else "rmse_longitudinal_m"
+
+
 def lay_out_maneuvers(results: Results, arm: Arm) -> str:
     """Lay out RMSE at the last horizon by true maneuver; along the road where nothing is known across it."""
     last = results.list_seconds(arm.name)[-1]
-    rows = results.of_arm("seeds", arm.name).filter(seconds=last, dataset=EVERYTHING)
-    figure = "rmse_m" if rows["rmse_m"].count() else "rmse_longitudinal_m"
+    rows = results.of_arm("seeds", arm.name).filter(seconds=last, dataset=arm.dataset)
+    figure = choose_headline(results, arm)
     groups = [name for name in rows["group"].unique(maintain_order=True) if name != EVERYTHING]
     body = [
         [f"`{model}`", *(results.show(arm.name, model, last, figure, group=group) for group in groups)]
@@ -119,10 +126,12 @@ def lay_out_maneuvers(results: Results, arm: Arm) -> str:
 def lay_out_coverage(results: Results, arm: Arm) -> str:
     """Lay out how many true positions lie in the regions that are said to hold them, over all folds."""
     rows = results.of_arm("calibration", arm.name)
+    if arm.dataset != EVERYTHING:  # the table does not tell datasets apart
+        return ""
     pooled = rows.group_by("model", "level", "seconds", maintain_order=True).agg(_pool("coverage"))
     seconds = results.list_seconds(arm.name)
     body = [
-        [f"`{model}`", f"{level:.0%}", *(f"{100 * own.filter(seconds=at)['coverage'].sum():.1f} %" for at in seconds)]
+        [f"`{model}`", f"{level:.0%}", *(_format_share(own.filter(seconds=at)["coverage"]) for at in seconds)]
         for (model, level), own in pooled.group_by("model", "level", maintain_order=True)
     ]
     return grid(["model", "region", *(f"{at:g} s" for at in seconds)], body) if body else ""
@@ -131,6 +140,8 @@ def lay_out_coverage(results: Results, arm: Arm) -> str:
 def lay_out_by_density(results: Results, arm: Arm) -> str:
     """Lay out RMSE and predicted sigma along the road, and radii, by traffic density at the last horizon."""
     errors, radii = (results.of_arm(name, arm.name) for name in ("density_errors", "conformal_radii"))
+    if arm.dataset != EVERYTHING:  # as above
+        return ""
     last = pl.col("seconds") == pl.col("seconds").max()
     squares = [_pool(name, root=True) for name in ("rmse_longitudinal_m", "sigma_longitudinal_m")]
     key = ("model", "density")
@@ -156,6 +167,8 @@ def lay_out_by_density(results: Results, arm: Arm) -> str:
 def lay_out_feasibility(results: Results, arm: Arm) -> str:
     """Lay out how many predictions of whole scenes break a rule up to the last horizon, beside true futures."""
     rows = results.of_arm("feasibility", arm.name).filter(pl.col("seconds") == pl.col("seconds").max())
+    if arm.dataset != EVERYTHING:  # as above
+        return ""
     pooled = rows.group_by("model", "rule", maintain_order=True).agg(_pool("share"), _pool("true_share"))
     rules = pooled["rule"].unique(maintain_order=True).to_list()
     shares = {
@@ -207,6 +220,7 @@ def _pool(name: str, *, root: bool = False) -> pl.Expr:
 
 
 TABLES_OF_ARM = (
+    choose_headline,
     lay_out_lakes,
     lay_out_training,
     lay_out_errors,
@@ -226,6 +240,11 @@ def _format(value: object) -> str:
     if value is None:
         return "-"
     return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def _format_share(shares: pl.Series) -> str:
+    """Format a column of one share in percent; a dash where there is none."""
+    return f"{100 * shares[0]:.1f} %" if shares.count() else "-"
 
 
 def _format_figure(value: float | None) -> str:

@@ -229,8 +229,10 @@ PIECES = (
         3,
         "Networks as published",
         "The same recordings. Each network has the inputs, the outputs and the loss of its publication "
-        "([models.md](models.md)) and is trained until three epochs bring no smaller loss on the validation part. Its "
-        "loss by epoch is in [results-curves.csv](results-curves.csv).",
+        "([models.md](models.md)) and is trained until three epochs of its last phase bring no smaller loss on the "
+        "validation part, or for 24 epochs; the weights with the smallest loss are kept. Ours are trained for 8 epochs "
+        "of twice as many samples, and the last weights are kept. Losses by epoch are in "
+        "[results-curves.csv](results-curves.csv).",
         (
             replace(
                 GENERATED,
@@ -244,10 +246,17 @@ PIECES = (
         "one-dataset",
         4,
         "One data set at a time",
-        "Models that are trained and scored on one kind of recordings alone, against models that are trained on both.",
+        "Models that are trained and scored on one kind of recordings alone, against models that are trained on both "
+        "and are scored on that kind here, too. Both see as many samples, so that the former see each more often.",
         tuple(
-            replace(GENERATED, name=f"{dataset} alone", learners=(V_LSTM, CS_LSTM, *own), pairs=pair_datasets)
-            for dataset, own, pair_datasets in (
+            replace(
+                GENERATED,
+                name=f"{dataset} alone",
+                learners=(V_LSTM, CS_LSTM, *own),
+                pairs=(*PLAIN_PAIRS, *pairs),
+                dataset=dataset,
+            )
+            for dataset, own, pairs in (
                 (dataset, own, tuple((one.name, one.model) for one in own)) for dataset, own in ALONE.items()
             )
         ),
@@ -273,7 +282,8 @@ PIECES = (
         "The price of leakage",
         "The split of convolutional social pooling's code (`csp-2018`) cuts every recording by the vehicles' numbers: "
         "vehicles that drive side by side are in different parts. Errors under it are compared with those on the same "
-        "recordings parted by blocks of time. Other vehicles are scored: differences are not paired.",
+        "recordings parted by blocks of time. Other vehicles are scored: differences are not paired. Constant velocity "
+        "learns nothing, so its difference is what the other vehicles make; the rest is the price.",
         (
             replace(
                 GENERATED,

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from tracklake.schemas.evaluations import EVERYTHING
+
 
 @dataclass(frozen=True)
 class Source:
@@ -64,6 +66,7 @@ class Arm:
         settings: settings of the lake, by their names in the environment.
         plain: models without networks; the best of them at a horizon is the baseline there.
         pairs: models that are compared with each other, besides with the baselines.
+        dataset: the part of the data that tables show, where some of the models are scored on it alone.
     """
 
     name: str
@@ -74,6 +77,7 @@ class Arm:
     settings: Mapping[str, str] = field(default_factory=dict)
     folds: tuple[int, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
+    dataset: str = EVERYTHING
 
 
 @dataclass(frozen=True)

@@ -65,11 +65,11 @@ class Results:
         return seconds
 
     def select(
-        self, arm: str, model: str, seconds: float, dataset: str = EVERYTHING, group: str = EVERYTHING
+        self, arm: str, model: str, seconds: float, dataset: str | None = None, group: str = EVERYTHING
     ) -> pl.DataFrame:
-        """Select a model's rows of all seeds at a horizon."""
+        """Select a model's rows of all seeds at a horizon, of the arm's part of the data where none is named."""
         rows = self.of_arm("seeds", arm)
-        return rows.filter(model=model, seconds=seconds, dataset=dataset, group=group)
+        return rows.filter(model=model, seconds=seconds, dataset=dataset or find_dataset(arm), group=group)
 
     def show(self, arm: str, model: str, seconds: float, figure: str = "rmse_m", **part: str) -> str:
         """Show the mean over seeds, with its standard deviation where there are several; a dash where it is unknown."""
@@ -85,17 +85,15 @@ class Results:
             pl.col("model").is_in(find_arm(arm).plain),
             pl.col(figure).is_not_null(),
             seconds=seconds,
-            dataset=EVERYTHING,
+            dataset=find_dataset(arm),
             group=EVERYTHING,
         )
         return rows.sort(figure, "model")["model"][0] if rows.height else None
 
-    def compare(
-        self, arm: str, model: str, against: str, seconds: float, figure: str, dataset: str = EVERYTHING
-    ) -> dict[str, float] | None:
-        """Return the comparison of two models; None where it was not made."""
+    def compare(self, arm: str, model: str, against: str, seconds: float, figure: str) -> dict[str, float] | None:
+        """Return the comparison of two models on the arm's part of the data; None where it was not made."""
         rows = self.of_arm("comparisons", arm)
-        found = rows.filter(model=model, against=against, seconds=seconds, figure=figure, dataset=dataset)
+        found = rows.filter(model=model, against=against, seconds=seconds, figure=figure, dataset=find_dataset(arm))
         return found.row(0, named=True) if found.height else None
 
     def subtract(self, arm: str, other: str, model: str, seconds: float) -> dict[str, float] | None:
@@ -126,6 +124,11 @@ class Results:
         unit = UNITS.get(figure, " m")
         bounds = " to ".join(f"{found[name]:+.2f}" for name in ("low", "high"))
         return f"{judge(found['low'], found['high'])} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
+
+
+def find_dataset(arm: str) -> str:
+    """Find the part of the data that tables of an arm show."""
+    return next((own.dataset for piece in PIECES for own in piece.arms if own.name == arm), EVERYTHING)
 
 
 def find_arm(name: str) -> Arm:
