@@ -10,6 +10,7 @@ from study.figure import draw_errors
 from study.pieces import PIECES
 from study.plan import Arm
 from study.results import FEW, Results, find_dataset, grid, judge
+from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
 
@@ -143,6 +144,8 @@ def lay_out_by_density(results: Results, arm: Arm) -> str:
     if arm.dataset != EVERYTHING:  # as above
         return ""
     last = pl.col("seconds") == pl.col("seconds").max()
+    if arm.source.lacks_vehicles:
+        errors = errors.filter(density=ALL_DENSITIES)
     squares = [_pool(name, root=True) for name in ("rmse_longitudinal_m", "sigma_longitudinal_m")]
     key = ("model", "density")
     table = (
@@ -170,7 +173,8 @@ def lay_out_feasibility(results: Results, arm: Arm) -> str:
     if arm.dataset != EVERYTHING:  # as above
         return ""
     pooled = rows.group_by("model", "rule", maintain_order=True).agg(_pool("share"), _pool("true_share"))
-    rules = pooled["rule"].unique(maintain_order=True).to_list()
+    unknown = ("overlap", "negative_headway", ANY_RULE) if arm.source.lacks_vehicles else ()
+    rules = [rule for rule in pooled["rule"].unique(maintain_order=True) if rule not in unknown]
     shares = {
         (model, rule): f"{100 * value:.2f}"
         for model, rule, share, floor in pooled.rows()

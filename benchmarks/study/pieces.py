@@ -17,6 +17,7 @@ US_101 = Source(
     "that no vehicle's neighbors are known. It has no lanes; samples were given lanes of 12 ft from `Local_X`.",
     file="ngsim/us101_0750_290_vehicles.csv.gz",
     lane_ft=12.0,
+    lacks_vehicles=True,
 )
 I_80 = Source(
     "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "

@@ -15,12 +15,14 @@ class Source:
         file: raw file below the folder of `--data`; empty = generated.
         sample: options of `tracklake sample`.
         lane_ft: width of the lanes that are filled in from `Local_X` where the file has none.
+        lacks_vehicles: whether so many are missing that nothing which depends on those around means anything.
     """
 
     title: str
     file: str = ""
     sample: tuple[str, ...] = ()
     lane_ft: float = 0.0
+    lacks_vehicles: bool = False
 
 
 @dataclass(frozen=True)
