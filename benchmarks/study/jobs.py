@@ -22,6 +22,7 @@ import polars as pl
 from study.plan import Arm, Learner, Source, estimate_run
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS, TENSORS
+from tracklake.schemas.files import write_file
 from tracklake.schemas.tensors import INDEX_FILE, RECORDED_POSITIONS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.runs.run_folder import digest_tensors
@@ -224,9 +225,10 @@ class Workshop:
         if not source.lane_ft:
             return raw
         out = self.work / "sources" / raw.name.removesuffix(".gz")
-        if not out.exists():
+        content = fill_lanes(raw, source.lane_ft).write_csv().encode()
+        if not out.exists() or out.read_bytes() != content:  # of other lanes, or of a run that was interrupted
             out.parent.mkdir(parents=True, exist_ok=True)
-            fill_lanes(raw, source.lane_ft).write_csv(out)
+            write_file(out, content)
         return out
 
     def work_on(self, jobs: Iterable[Job]) -> None:

@@ -173,7 +173,9 @@ def lay_out_feasibility(results: Results, arm: Arm) -> str:
     if arm.dataset != EVERYTHING:  # as above
         return ""
     pooled = rows.group_by("model", "rule", maintain_order=True).agg(_pool("share"), _pool("true_share"))
-    unknown = ("overlap", "negative_headway", ANY_RULE) if arm.source.lacks_vehicles else ()
+    unknown = ["overlap", "negative_headway", ANY_RULE] if arm.source.lacks_vehicles else []
+    if choose_headline(results, arm) != "rmse_m":  # lane centres in place of lateral positions
+        unknown += ["off_road", ANY_RULE]
     rules = [rule for rule in pooled["rule"].unique(maintain_order=True) if rule not in unknown]
     shares = {
         (model, rule): f"{100 * value:.2f}"

@@ -22,7 +22,8 @@ US_101 = Source(
 I_80 = Source(
     "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "
     "Next Generation Simulation (NGSIM) vehicle trajectory dataset, Transportation Research Part B 105: 2,283 vehicles "
-    "with lanes and neighbors, but without lateral positions and sizes. Errors along the road alone mean anything.",
+    "with lanes and neighbors, but without lateral positions and sizes: every vehicle is 4.27 m long and 1.83 m wide. "
+    "Errors along the road alone mean anything.",
     file="i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz",
 )
 

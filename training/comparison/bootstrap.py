@@ -120,9 +120,14 @@ def arrange_errors(table: pl.DataFrame, figure: str, name: str = "the table") ->
     return Errors(keys, seconds["seconds"].to_list(), seeds["seed"].to_list(), n[0], total)
 
 
+def limit_group(vehicles: int) -> int:
+    """Limit the vehicles that are drawn together, so that LEAST_GROUPS are left if possible."""
+    return min(TOGETHER, max(1, vehicles // LEAST_GROUPS))
+
+
 def join_neighbors(errors: Errors) -> Errors:
-    """Join vehicles of successive numbers in a subset: as many as leave LEAST_GROUPS of the whole, TOGETHER at most."""
-    most = min(TOGETHER, max(1, len(errors.keys) // LEAST_GROUPS))
+    """Join vehicles of successive numbers in a subset."""
+    most = limit_group(len(errors.keys))
     count, rank = pl.len().over(list(PLACE)), pl.int_range(pl.len()).over(list(PLACE))
     group = rank * ((count + most - 1) // most) // count
     numbered = errors.keys.select(pl.struct(*PLACE, group=group).rle_id())
@@ -216,14 +221,17 @@ def find_quantile(freedom: float) -> float:
 def bound_shares(hits: Floats, n: Floats) -> tuple[Floats, Floats]:
     """Find the 95 % intervals of shares from counts (V, K) of vehicles: low and high (K,), NaN with fewer than two.
 
-    The variance is that of a ratio of sums over independent vehicles (Cochran 1977, Sampling Techniques, section 6.4).
-    Of none or all, the outer bound is exact where every vehicle counts once (Clopper and Pearson 1934, Biometrika 26).
+    The variance is that of a ratio of sums over independent groups of successive vehicles, as large as those that are
+    drawn together (Cochran 1977, Sampling Techniques, section 6.4). Of none or all, the outer bound is exact where
+    every vehicle counts once and by itself (Clopper and Pearson 1934, Biometrika 26).
     """
     total = n.sum(axis=0)
     share = hits.sum(axis=0) / np.maximum(total, 1)
     vehicles = (n > 0).sum(axis=0)
-    squares = ((hits - share * n) ** 2).sum(axis=0) * vehicles / np.maximum(vehicles - 1, 1)
-    quantile = [find_quantile(max(int(count) - 1, 1)) for count in vehicles]
+    first = np.arange(0, len(n), limit_group(len(n)))
+    groups = (np.add.reduceat(n, first) > 0).sum(axis=0)
+    squares = (np.add.reduceat(hits - share * n, first) ** 2).sum(axis=0) * groups / np.maximum(groups - 1, 1)
+    quantile = [find_quantile(max(int(count) - 1, 1)) for count in groups]
     half = np.where(vehicles > 1, quantile * np.sqrt(squares) / np.maximum(total, 1), np.nan)
     alike = np.where(vehicles > 1, 0.025 ** (1 / np.maximum(vehicles, 1)), np.nan)
     low = np.where(share == 1, alike, np.maximum(share - half, 0.0))

@@ -238,3 +238,11 @@ def test_intervals_hold_the_difference_of_vehicles_that_share_a_jam():
         (row,) = compare_errors(a, b, "mae_m", resamples=200).iter_rows(named=True)
         held += row["low"] <= 0 <= row["high"]
     assert held >= 85
+
+
+def test_intervals_of_shares_count_vehicles_of_one_jam_together():
+    """200 vehicles, of which 20 in a row are alike, are as good as 10 groups: a t interval of their ten means."""
+    hits = np.repeat([1.0, 0, 0, 1, 0, 1, 1, 0, 0, 0], 20)[:, None]
+    low, high = bootstrap.bound_shares(hits, np.ones((200, 1)))
+    half = stats.t.ppf(0.975, 9) * np.std(hits[::20], ddof=1) / 10**0.5
+    assert (low[0], high[0]) == pytest.approx((0.4 - half, 0.4 + half), rel=1e-3)
