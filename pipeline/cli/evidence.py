@@ -150,7 +150,7 @@ def show_feasibility(
     ordered = sorted(models, key=lambda own: own.name)
     table = pl.concat(measure_feasibility(own, folder, found[0].part, nearest[own.name]) for own in ordered)
     last = table.filter(pl.col("seconds") == pl.col("seconds").max())
-    rules = [ANY_RULE, *FEASIBILITY_RULES]
+    rules = [rule for rule in (ANY_RULE, *FEASIBILITY_RULES) if rule in set(last["rule"])]
     for title, share, floor in (
         ("predictions that break a rule", "share", "true_share"),
         ("scenes with a prediction that breaks a rule", "scene_share", "true_scene_share"),

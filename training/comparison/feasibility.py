@@ -52,12 +52,15 @@ def measure_feasibility(model: Forecaster, folder: TensorFolder, part: str, near
         error = predicted[:, ticks - 1].astype(np.float64) - own.future[:, ticks - 1]
         squares.append(np.where(own.future_mask[:, ticks - 1], (error**2).sum(axis=-1), np.nan))
     subset, vehicle = find_vehicles(folder, samples)
-    rmse = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
-    if folder.lane_centred[subset].any():
+    rmse, rules = np.sqrt(np.nanmean(np.concatenate(squares), axis=0)), list(FEASIBILITY_RULES)
+    if folder.lane_centred[subset].any():  # the carriageway's edges mean nothing there
         rmse[:] = np.nan
+        rules.remove("off_road")
+    judged = [FEASIBILITY_RULES.index(rule) for rule in rules]
     numbers = (np.unique(scene, return_inverse=True)[1], vehicle)
     seconds = [tick / rate_hz for tick in ticks.tolist()]
-    return _summarise(model.name, seconds, np.concatenate(broken), np.concatenate(true), numbers, rmse)
+    both = (np.concatenate(broken)[..., judged], np.concatenate(true)[..., judged])
+    return _summarise(model.name, seconds, rules, both, numbers, rmse)
 
 
 def _cut_scenes(scene: Integers) -> Iterator[slice]:
@@ -137,14 +140,19 @@ def _find_lanes(folder: TensorFolder, subset: Integers, y_m: Floats) -> Integers
 
 
 def _summarise(
-    run: str, seconds: list[float], broken: Flags, true: Flags, numbers: tuple[Integers, Integers], rmse_m: Floats
+    run: str,
+    seconds: list[float],
+    rules: list[str],
+    judged: tuple[Flags, Flags],
+    numbers: tuple[Integers, Integers],
+    rmse_m: Floats,
 ) -> pl.DataFrame:
-    """Summarise which predictions and true futures (B, T, rules) of scenes and vehicles break rules."""
+    """Summarise which predictions and true futures, `judged` (B, T, rules), of scenes and vehicles break rules."""
     scene, vehicle = numbers
     scenes = int(scene.max(initial=-1)) + 1
     rows = []
     for at, ahead in enumerate(seconds):
-        both = [np.column_stack([own[:, at], own[:, at].any(axis=1)]) for own in (broken, true)]
+        both = [np.column_stack([own[:, at], own[:, at].any(axis=1)]) for own in judged]
         share, low, high, n, _ = estimate_shares(both[0], vehicle)
         in_scenes = []
         for own in both:
@@ -155,7 +163,7 @@ def _summarise(
         figures |= dict(zip(("scene_share", "true_scene_share"), in_scenes, strict=True))
         constant = {"run": run, "seconds": ahead, "n": n, "scenes": scenes, "rmse_m": rmse_m[at]}
         rows.append(
-            pl.DataFrame({"rule": (*FEASIBILITY_RULES, ANY_RULE), **figures}).with_columns(
+            pl.DataFrame({"rule": (*rules, ANY_RULE), **figures}).with_columns(
                 pl.lit(value).alias(name) for name, value in constant.items()
             )
         )

@@ -119,6 +119,14 @@ def test_jerk_where_a_prediction_begins(tmp_path, step_m, broken):
     assert (found["high_jerk"]["low"], found["high_jerk"]["true_share"]) == (None, 0)
 
 
+def test_nothing_leaves_the_road_where_lateral_positions_are_lane_centres(tmp_path):
+    folder = make_folder(tmp_path, {1: drive(0, 6)})
+    folder.index["subsets"][1]["lateral_positions"] = "lane centres"
+    found = shares(folder, Says([np.column_stack([10.0 * np.arange(1, 5), np.full(4, 3.0)])]))
+    assert set(found) == {"overlap", "negative_headway", "high_jerk", "any"}
+    assert (found["any"]["share"], found["any"]["rmse_m"]) == (0, None)
+
+
 def test_only_known_ticks_are_judged(tmp_path):
     folder = make_folder(tmp_path, {1: drive(0, 2), 2: drive(15, 2, ticks=5)})
     found = shares(folder, Says([along(10, 10, 10, 10), along(10, 10, -40, 10)]))
