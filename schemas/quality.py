@@ -307,6 +307,7 @@ class ShownSettings(TypedDict, total=False):
         bool, "true: entries of vehicles that break an error rule around them are no samples"
     ]
     nearest: Annotated[int, "nearest vehicles listed with each sample; 0 = none"]
+    grid_cell_m: Annotated[float, "length of a cell of the grid of neighbors"]
     validation_part: Annotated[bool, "true: the split has a validation part"]
     split: Annotated[str, "split that tensors are made of"]
     splits: Annotated[list[str], "splits that are made"]

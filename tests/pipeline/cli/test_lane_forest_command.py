@@ -144,7 +144,7 @@ def test_settings_are_the_forests(command, copied, kept):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--set", "depth=3"], "the forest has start_s, tolerance_m, shift_m, trees, leaf, least_correlation,"),
+        (["--set", "depth=3"], "the forest has start_s, measured_start, tolerance_m, shift_m, trees, leaf,"),
         (["--set", "examples=3"], "got 'examples=3'"),
         (["--set", "trees=many"], "--set trees=many: expected int like 100"),
         (["--set", "trees=0"], "trees: expected more than 0, got 0"),

@@ -301,8 +301,8 @@ def test_commands_show_drives_keep_them_apart_and_remove_them(tmp_path, put, com
     assert "nothing to do" in again.out
     shown = command.here("info", *lake).out
     assert [line.split() for line in shown.splitlines() if line.startswith("trip")] == [
-        ["trip", "recorded", "1", "3", "0", "0", "0.2"]
-    ]
+        ["trip", "recorded", "0", "0", "0", "0", "0.2"]
+    ], "the ego and its messages are not of a vehicle around it"
     other = command.here("ingest", tmp_path / "source" / "two" / "trip", *lake)
     assert other.code == 3
     assert "recording trip: another drive of this name is in the lake" in other.err
