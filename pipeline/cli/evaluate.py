@@ -153,6 +153,8 @@ def evaluate(
             with explain_file_errors(file.parent):
                 file.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
         names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in finished_runs(root))])
+        if compare and len(names) < 2:
+            raise typer.BadParameter(f"--compare needs two runs or models; got {', '.join(names)} alone")
         records = {name: SampleRecord(tensors, part) for name in names} if calibration else {}
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, records, every_tick=every_tick, strict=bool(runs)

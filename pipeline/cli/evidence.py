@@ -107,11 +107,12 @@ def show_uncertainty(terminal: Terminal, folder: TensorFolder, records: Mapping[
         for (run, level), own in rows.group_by("run", "level", maintain_order=True)
     ]
     seconds = [f"{ahead:g} s" for ahead in one.seconds]
-    print_table(terminal, ["", *seconds], sorted(lines), title="true positions in predicted regions", fold=True)
+    if lines:
+        print_table(terminal, ["", *seconds], sorted(lines), title="true positions in predicted regions", fold=True)
     without = [run for run in records if run not in set(rows["run"])]
     if without:
         why = "no density is predicted, or lateral positions are lane centres"
-        terminal.print_line(f"{', '.join(without)}: {why}", style="dim")
+        terminal.print_line(f"no coverage of {', '.join(without)}: {why}", style="dim")
     _show_densities(terminal, tables, one.seconds[-1])
     return tables
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
 from tracklake.schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, VEHICLES
 from tracklake.schemas.columns import PARTS
-from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.protocols import LATER, Protocol
 from tracklake.schemas.split_recipes import TIME_BLOCKS
 from tracklake.schemas.tensors import INDEX_FILE
 
@@ -160,20 +161,31 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
     protocol = settings.get_protocol()
     if commit.built_from["protocol"] != protocol.digest:
         made = json.loads((root / str(commit.info["path"]) / INDEX_FILE).read_text(encoding="utf-8"))["protocol"]
+        differences = _list_differences(LATER | made, asdict(protocol)) if made["name"] == protocol.name else ""
         raise StageError(
             f"{root}: the tensors were made by another protocol than {protocol.title} as it is set "
-            f"now: by {made['name']} ({made['digest']}). Run `tracklake run` with these settings, or set what they "
-            "were made with."
+            f"now: by {made['name']} ({made['digest']}){differences}. "
+            "Run `tracklake run` with these settings, or set what they were made with."
         )
     split = find_training_split(manifest, settings)
     recipe = settings.get_split_recipe(split)
     found = commit.built_from.get("split_recipe", {"digest": "unknown"})
     if found["digest"] != recipe.digest:
+        differences = _list_differences(found.get("parameters", {}), json.loads(recipe.parameters))
         raise StageError(
-            f"{root}: the tensors were made by another recipe of the split {recipe.name} ({found['digest']}: "
-            f"{json.dumps(found.get('parameters', {}))}) than the settings now give ({recipe.digest}: "
-            f"{recipe.parameters}). Run `tracklake run` with these settings, or set what they were made with."
+            f"{root}: the tensors were made by another recipe of the split {recipe.name} ({found['digest']}) than the "
+            f"settings now give ({recipe.digest}){differences}. Run `tracklake run` with these settings, or set what "
+            "they were made with."
         )
     if drops_cut_samples(settings, split) != commit.built_from.get("drop_cut_samples", False):
         raise StageError(f"{root}: the tensors were made with another `drop_cut_samples`. Run `tracklake tensors`.")
     return root / str(commit.info["path"])
+
+
+def _list_differences(made: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """List the parameters that tensors were made with and that are set otherwise now; empty where none is known."""
+    same = json.loads(json.dumps(now))  # tuples as lists, as they are stored
+    changed = sorted(name for name in same.keys() & made.keys() if same[name] != made[name])
+    changed += sorted((same.keys() ^ made.keys()) - {"digest"}) if made else []
+    described = (f"{name} {json.dumps(made.get(name))}, now {json.dumps(same.get(name))}" for name in changed)
+    return f": {'; '.join(described)}" if changed else ""

@@ -127,6 +127,10 @@ def _read_dose(defect: str | None, dose: float | None, formats: tuple[str, ...])
         raise UsageError(f"defect: expected one of {', '.join(DOSED)}, got {defect}")
     if not 0 <= dose <= 1:
         raise UsageError(f"dose: expected a share of the vehicles from 0 to 1, got {dose}")
+    if set(formats) <= {DRIVES}:
+        raise UsageError(
+            f"{defect}: drives do not have it by dose; add --format highd, or another of overhead recordings"
+        )
     others = [name for name in formats if name not in ("highd", DRIVES)]
     if defect in HIGHD_ONLY and others:
         raise UsageError(f"{defect} cannot be recorded in {', '.join(others)}; choose --format highd")

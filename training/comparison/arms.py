@@ -43,7 +43,8 @@ def compare_arms(evaluations: Sequence[Evaluation]) -> pl.DataFrame:
     arms = {name: _join(name, group) for name, group in group_arms(evaluations).items()}
     if len(arms) < 2:
         named = ", ".join(own.model for own in evaluations)
-        raise UsageError(f"a comparison needs two models; {named} are seeds of one: name another run or model")
+        found = f"{named} differ in their seed alone" if len(evaluations) > 1 else f"there is {named or 'none'} alone"
+        raise UsageError(f"a comparison needs two models, but {found}: name another run or model")
     (a, own), *others = arms.items()
     tables = [
         compare_errors(own, other, figure).with_columns(a=pl.lit(a), b=pl.lit(b), figure=pl.lit(figure))

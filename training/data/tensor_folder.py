@@ -197,7 +197,9 @@ class TensorFolder:
             return np.ones(len(subsets), dtype=np.bool_)
         meant = np.array([[own == name or own.startswith(f"{name}-") for name in names] for own in subsets])
         if not meant.any(axis=0).all():
-            raise UsageError(f"{self.path}: expected names among {', '.join(subsets)}, got {', '.join(names)}")
+            raise UsageError(
+                f"{self.path}: expected subsets, or recordings, of {', '.join(subsets)}, got {', '.join(names)}"
+            )
         return np.asarray(meant.any(axis=1))
 
     def read_part(self, part: str, *names: str) -> Batch:

@@ -162,9 +162,11 @@ def measure_errors(
     samples = folder.samples_of(part)
     if len(samples) == 0:
         counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in ("train", "val", "eval"))
+        more = "add recordings" if part != "val" else "set validation_part = true (TRACKLAKE_VALIDATION_PART)"
+        kept = "" if folder.kept is None else f" of {', '.join(folder.origins)}"
         raise EmptyPartError(
-            f"{folder.path}: the split `{folder.split}` has no samples in `{part}` (samples: {counts}); with a single "
-            "subset everything trains, and nothing is left to evaluate on: add recordings and run `tracklake split`"
+            f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "
+            f'{more}, or set split = "time-blocks" to divide each recording, and run `tracklake run` again'
         )
     refuse_future(predictor, folder, part, name=name, reads=reads, nearest=nearest)
     strata, protocol = find_strata(folder, samples), folder.protocol

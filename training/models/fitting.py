@@ -46,18 +46,23 @@ class Moments:
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters that were fitted, and the number of samples that they were fitted on."""
+    """Parameters of a fitted model, those of them that were set, and the number of samples the others are fitted on."""
 
     model: str
     samples: int
     parameters: Mapping[str, float]
+    given: Sequence[str] = ()
 
     def describe(self) -> str:
         """Return a line for people."""
-        shown = ", ".join(f"{name} = {value:g}" for name, value in self.parameters.items())
-        if self.samples == 0:
-            return f"{self.model}: not fitted, as `train` has no samples; {shown}"
-        return f"{self.model}: {shown}, fitted on {self.samples:,} samples of `train`"
+        how = f"fitted on {self.samples:,} samples of `train`" if self.samples else "not fitted: `train` has no samples"
+        groups = {how: set(self.parameters).difference(self.given), "set, not fitted": set(self.given)}
+        shown = [
+            ", ".join(f"{name} = {value:g}" for name, value in self.parameters.items() if name in names) + f", {how}"
+            for how, names in groups.items()
+            if names
+        ]
+        return f"{self.model}: {'; '.join(shown)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to plain values for JSON."""
@@ -74,7 +79,8 @@ def fit_model(model: Model, folder: TensorFolder, samples: Integers, given: Mapp
     builder = type(model.build(folder.protocol, **fitted))  # refuses parameters that are wrong
     if len(chosen):
         fitted |= builder.fit(folder.protocol, sum_moments(folder, chosen), given)
-    return Fit(model.name, len(chosen), {name: float(f"{value:.4g}") for name, value in fitted.items()} | dict(given))
+    rounded = {name: float(f"{value:.4g}") for name, value in fitted.items()}
+    return Fit(model.name, len(chosen), rounded | dict(given), sorted(given))
 
 
 def sum_moments(folder: TensorFolder, samples: Integers) -> Moments:

@@ -122,6 +122,7 @@ def test_a_fitted_model_is_trained_and_evaluated_with_what_was_fitted(command, l
     chosen = command.here("train", "damped-velocity", "--set", "decay_s=2", "--name", "two", "--lake", lake.root)
     assert chosen.code == 0, chosen.err
     assert json.loads((models / "two" / "config.json").read_text())["parameters"] == {"decay_s": 2.0}
+    assert "damped-velocity: decay_s = 2, set, not fitted\n" in chosen.out
     shown = command.here("evaluate", "two", "damped-velocity", "kalman-cv", "--lake", lake.root)
     assert "kalman-cv: measurement_longitudinal_m = " in shown.out
     assert "damped-velocity: " not in shown.out, "it has a run"
@@ -152,7 +153,9 @@ def test_runs_of_several_seeds_are_compared_with_a_model(command, lake, models):
     assert "small-0 - constant-velocity" in out
     assert "note: small-0: one seed; another one may change the difference" in out
     alone = command.here("evaluate", "small-0", "small-1", "--compare", "--lake", lake.root)
-    assert (alone.code, "a comparison needs two models; small-0, small-1 are seeds of one" in alone.err) == (2, True)
+    assert (alone.code, "small-0, small-1 differ in their seed alone" in alone.err) == (2, True)
+    single = command.here("evaluate", "small-0", "small-0", "--compare", "--lake", lake.root)
+    assert (single.code, single.out) == (2, ""), "refused before the scoring"
     shutil.copytree(models / "small-0", models / "twice")
     twice = command.here("evaluate", "constant-velocity", "small-0", "twice", "--compare", "--lake", lake.root)
     assert "small-0 (2 seeds): two of the runs small-0, twice have the same seed" in twice.err

@@ -70,9 +70,10 @@ def test_samples_differ_by_the_dose_alone_and_say_what_was_reached(tmp_path):
         ({"defect": "frame_gap", "dose": 1.5}, "from 0 to 1, got 1.5"),
         ({"defect": "frame_gap", "dose": np.nan}, "got nan"),
         ({"defect": "size_change", "dose": 0.1}, "cannot be recorded in ngsim-csv; choose --format highd"),
+        ({"defect": "frame_gap", "dose": 0.1, "formats": ("drives",)}, "add --format highd"),
     ],
 )
 def test_wrong_doses_are_refused(tmp_path, given, message):
     with pytest.raises(UsageError, match=re.escape(message)):
-        write_sample(tmp_path / "out", formats=("ngsim-csv",), **given)
+        write_sample(tmp_path / "out", **{"formats": ("ngsim-csv",)} | given)
     assert not list(tmp_path.iterdir())

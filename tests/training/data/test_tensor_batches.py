@@ -208,5 +208,5 @@ def test_samples_are_found_by_subset_and_recording(tmp_path):
         assert found.tolist() == [number for number, own in enumerate(subset) if own in subsets]
         assert len(folder.read_part(part, *chosen)) == len(found) > 0
     assert len(folder.samples_of("eval", "011")) == 0
-    with pytest.raises(UsageError, match="expected names among 01-lower, 01-upper, 011, got 01, 02"):
+    with pytest.raises(UsageError, match="expected subsets, or recordings, of 01-lower, 01-upper, 011, got 01, 02"):
         folder.samples_of("train", "01", "02")

@@ -16,7 +16,7 @@ from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
 from tracklake.training.models.constant_velocity import DampedVelocity, KalmanConstantVelocity, velocity_ticks
-from tracklake.training.models.fitting import fit_model, search, sum_moments
+from tracklake.training.models.fitting import Fit, fit_model, search, sum_moments
 from tracklake.training.runs.forecasters import open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import train
@@ -116,6 +116,16 @@ def test_vehicles_that_stand_still_are_predicted_all_the_same(name):
     assert said.density is None or (said.density.sigma_m > 0).all()
 
 
+def test_parameters_that_are_set_are_not_said_to_be_fitted():
+    fit = Fit(
+        "kalman-cv", 1200, {"measurement_lateral_m": 0.25, "acceleration_lateral_m2ps3": 2.0}, ["measurement_lateral_m"]
+    )
+    assert fit.describe() == (
+        "kalman-cv: acceleration_lateral_m2ps3 = 2, fitted on 1,200 samples of `train`; measurement_lateral_m = 0.25, "
+        "set, not fitted"
+    )
+
+
 # Runs
 
 
@@ -152,5 +162,5 @@ def test_only_the_training_part_is_fitted_on(tmp_path):
 def test_without_a_training_part_the_defaults_hold_and_that_is_said(tmp_path):
     folder = TensorFolder.open(write_tiny(tmp_path / "tensors", split_row("b", "eval"), subsets="b"))
     fit = open_forecaster("damped-velocity", folder, tmp_path, frozenset({"eval"})).fit
-    assert fit.describe() == "damped-velocity: not fitted, as `train` has no samples; decay_s = 1"
+    assert fit.describe() == "damped-velocity: decay_s = 1, not fitted: `train` has no samples"
     assert TINY.name == folder.protocol.name
