@@ -16,6 +16,7 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.origin import DataOrigin, summarise_origins
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.split_recipes import TIME_BLOCKS
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
@@ -163,10 +164,12 @@ def measure_errors(
     if len(samples) == 0:
         counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in ("train", "val", "eval"))
         more = "add recordings" if part != "val" else "set validation_part = true (TRACKLAKE_VALIDATION_PART)"
+        if folder.split != TIME_BLOCKS:
+            more += f', or set split = "{TIME_BLOCKS}" to divide each recording'
         kept = "" if folder.kept is None else f" of {', '.join(folder.origins)}"
         raise EmptyPartError(
             f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "
-            f'{more}, or set split = "time-blocks" to divide each recording, and run `tracklake run` again'
+            f"{more}, and run `tracklake run` again"
         )
     refuse_future(predictor, folder, part, name=name, reads=reads, nearest=nearest)
     strata, protocol = find_strata(folder, samples), folder.protocol
