@@ -96,7 +96,12 @@ def remove_unfinished(folder: Path) -> None:
 
 def list_unfinished(folder: Path) -> list[Path]:
     """Return the unfinished files that killed processes left in a folder."""
-    return [file for file in folder.glob(".*.tmp*") if _UNFINISHED.fullmatch(file.name) and file.is_file()]
+    return [file for file in folder.glob(".*.tmp*") if is_unfinished(file.name) and file.is_file()]
+
+
+def is_unfinished(name: str) -> bool:
+    """Return whether a file's name is that of one that is not whole yet."""
+    return _UNFINISHED.fullmatch(name) is not None
 
 
 def sync(path: Path) -> None:

@@ -21,6 +21,8 @@ import duckdb
 import pytest
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
+from object_stores import bucket as bucket
+from object_stores import object_store_server as object_store_server
 from plain_flows import replace_prefect
 from simulated import simulate_once
 

@@ -25,3 +25,19 @@ class LakeVersionError(LakeError):
 
 class QueryError(LakeError):
     """A SQL statement was refused or failed."""
+
+
+class StoreError(LakeError):
+    """A lake's objects cannot be read or written where they are kept."""
+
+
+class AlreadyStoredError(StoreError):
+    """An object that was to be created is there already."""
+
+
+class MissingObjectError(StoreError):
+    """An object that was to be read is not there."""
+
+
+class SwapConflictError(StoreError):
+    """An object was changed by another writer since it was read."""

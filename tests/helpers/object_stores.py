@@ -1,0 +1,98 @@
+"""An S3 server on this machine for tests, and buckets in it."""
+
+import os
+import re
+import threading
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from unittest import mock
+
+import pytest
+
+KEY_ID, SECRET = "AKIAEXAMPLEOFTESTS", "a/secret/that/must/be/written/nowhere"
+HEEDLESS, FORBIDDEN = "heedless", "forbidden"
+"""Beginnings of the names of buckets that ignore the conditions of writes, and that refuse everything."""
+REFUSAL = (
+    "<Error><Code>SignatureDoesNotMatch</Code><Message>no</Message>"
+    f"<AWSAccessKeyId>{KEY_ID}</AWSAccessKeyId><StringToSign>{SECRET}</StringToSign></Error>"
+)
+"""Answer that repeats credentials, as S3's repeats the key's id."""
+
+
+@dataclass(frozen=True)
+class ObjectStoreServer:
+    """A server and the environment of a process that uses it."""
+
+    url: str
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {
+            "AWS_ENDPOINT_URL": self.url,
+            "AWS_ACCESS_KEY_ID": KEY_ID,
+            "AWS_SECRET_ACCESS_KEY": SECRET,
+            "AWS_REGION": "eu-north-1",
+        }
+
+    def make_bucket(self, kind: str = "bucket") -> str:
+        """Make a bucket and return the address of a folder in it."""
+        import boto3
+
+        name = f"{kind}-{uuid.uuid4().hex}"
+        if kind != FORBIDDEN:
+            region = {"LocationConstraint": "eu-north-1"}
+            with mock.patch.dict(os.environ, self.environment):
+                client = boto3.client("s3", endpoint_url=self.url, region_name="eu-north-1")
+                client.create_bucket(Bucket=name, CreateBucketConfiguration=region)
+                client.close()
+        return f"s3://{name}/lake"
+
+
+def _make_application() -> Callable[..., Iterable[bytes]]:
+    from moto.server import DomainDispatcherApplication, create_backend_app
+
+    moto = DomainDispatcherApplication(create_backend_app)
+    one_at_a_time = threading.Lock()  # moto looks at a condition first, and writes then
+
+    def answer(request: dict[str, object], start: Callable[..., object]) -> Iterable[bytes]:
+        bucket = str(request["PATH_INFO"]).lstrip("/")
+        if bucket.startswith(FORBIDDEN):
+            start("403 Forbidden", [("Content-Type", "application/xml")])
+            return [REFUSAL.encode()]
+        if bucket.startswith(HEEDLESS):
+            for name in ("HTTP_IF_MATCH", "HTTP_IF_NONE_MATCH"):
+                request.pop(name, None)
+        with one_at_a_time:
+            return moto(request, start)
+
+    return answer
+
+
+@pytest.fixture(scope="session")
+def object_store_server() -> Iterator[ObjectStoreServer]:
+    from werkzeug.serving import WSGIRequestHandler, make_server
+
+    class Quiet(WSGIRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log(self, *_message: object) -> None:
+            pass
+
+    server = make_server("127.0.0.1", 0, _make_application(), threaded=True, request_handler=Quiet)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield ObjectStoreServer(f"http://127.0.0.1:{server.server_port}")
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+@pytest.fixture
+def bucket(object_store_server: ObjectStoreServer, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The address of an empty folder on an object store, which the environment leads to."""
+    for name in [name for name in os.environ if re.match("(AWS|GOOGLE|AZURE)_", name)]:
+        monkeypatch.delenv(name)
+    for name, value in object_store_server.environment.items():
+        monkeypatch.setenv(name, value)
+    return object_store_server.make_bucket()
