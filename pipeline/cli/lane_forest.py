@@ -50,45 +50,53 @@ OPTIONS_OF_THEIR_OWN = ("examples", "augmentation")
 """Settings of a forest that have options of their own and are no names for `--set`."""
 
 
+RunsArgument = Annotated[
+    list[str] | None, typer.Argument(help="Runs whose cells are scored, too; none: all runs in the lake.")
+]
+ForestSeedOption = Annotated[
+    int | None, typer.Option("--seed", min=0, help="Seed of the draw, the shifts and the trees (default: 0).")
+]
+ExamplesOption = Annotated[
+    int | None, typer.Option("--examples", min=4, help="Most examples drawn from the training part (default: 10000).")
+]
+AugmentOption = Annotated[
+    bool | None,
+    typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples (default: add)."),
+]
+ForestSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="A setting of the forest; repeatable (start_s=3, trees=200, leaf=5)."
+    ),
+]
+UseOption = Annotated[bool, typer.Option("--use", help="Score the stored forest beside the lake's runs; fit none.")]
+CurveOption = Annotated[
+    bool, typer.Option("--learning-curve", help="Also fit fewer examples, with and without augmentation.")
+]
+AsPublishedOption = Annotated[
+    bool,
+    typer.Option(
+        "--as-published", help="Also fit the publication's forest, and this one, on 70 % of the vehicles; compare."
+    ),
+]
+DecoderEpochsOption = Annotated[
+    int | None,
+    typer.Option("--epochs", min=1, help="With --as-published: also train its decoder, for so many epochs."),
+]
+
+
 def lane_forest(
-    runs: Annotated[
-        list[str] | None, typer.Argument(help="Runs whose cells are scored, too; none: all runs in the lake.")
-    ] = None,
+    runs: RunsArgument = None,
     lake: LakeOption = None,
     protocol: ProtocolOption = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Seed of the draw, the shifts and the trees (default: 0).")
-    ] = None,
-    examples: Annotated[
-        int | None,
-        typer.Option("--examples", min=4, help="Most examples drawn from the training part (default: 10000)."),
-    ] = None,
-    augment: Annotated[
-        bool | None,
-        typer.Option("--augment/--as-recorded", help="Add mirrored and shifted copies of the examples (default: add)."),
-    ] = None,
-    settings_given: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="NAME=VALUE", help="A setting of the forest; repeatable (start_s=3, trees=200, leaf=5)."
-        ),
-    ] = None,
-    use: Annotated[
-        bool, typer.Option("--use", help="Score the stored forest beside the lake's runs; fit none.")
-    ] = False,
-    learning_curve: Annotated[
-        bool, typer.Option("--learning-curve", help="Also fit fewer examples, with and without augmentation.")
-    ] = False,
-    as_published: Annotated[
-        bool,
-        typer.Option(
-            "--as-published", help="Also fit the publication's forest, and this one, on 70 % of the vehicles; compare."
-        ),
-    ] = False,
-    epochs: Annotated[
-        int | None,
-        typer.Option("--epochs", min=1, help="With --as-published: also train its decoder, for so many epochs."),
-    ] = None,
+    seed: ForestSeedOption = None,
+    examples: ExamplesOption = None,
+    augment: AugmentOption = None,
+    settings_given: ForestSetOption = None,
+    use: UseOption = False,
+    learning_curve: CurveOption = False,
+    as_published: AsPublishedOption = False,
+    epochs: DecoderEpochsOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:

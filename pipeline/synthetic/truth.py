@@ -96,8 +96,10 @@ def _lines(path: Path) -> list[str]:
     return [line.removesuffix("\r") for line in lines]
 
 
-def read_highd(folder: Path, recording: str, found: Found) -> None:
-    """Read the three files of a recording back."""
+def _read_meta(
+    folder: Path, recording: str, found: Found
+) -> tuple[dict[int, int], dict[int, str], dict[int, tuple[float, float]], list[str]]:
+    """Read directions, kinds and sizes of a recording's vehicles, and the recording's own facts; count the lines."""
     for suffix, fields in (("recordingMeta", 15), ("tracksMeta", 16)):
         name = f"{recording}_{suffix}.csv"
         count = FileCount(name, "highd", recording)
@@ -114,7 +116,12 @@ def read_highd(folder: Path, recording: str, found: Found) -> None:
         direction[int(meta[0])] = int(meta[7])
         kinds[int(meta[0])] = meta[6].lower()
         sizes[int(meta[0])] = float(meta[1]), float(meta[2])
-    facts = _lines(folder / f"{recording}_recordingMeta.csv")[1].split(",")
+    return direction, kinds, sizes, _lines(folder / f"{recording}_recordingMeta.csv")[1].split(",")
+
+
+def read_highd(folder: Path, recording: str, found: Found) -> None:
+    """Read the three files of a recording back."""
+    direction, kinds, sizes, facts = _read_meta(folder, recording, found)
     upper, lower = ([float(y) for y in field.split(";")] for field in facts[13:15])
     markings = {"upper": [upper[-1] - y for y in reversed(upper)], "lower": [y - lower[0] for y in lower]}
     for side, places in markings.items():

@@ -3,7 +3,7 @@
 The assignment of clusters to expected vehicles is gated, and the most likely as a whole (the Hungarian method). A
 vehicle then takes all returns within its box, from whatever cluster; what its clusters hold beyond is clustered again
 and offered to the others. So a cluster of two vehicles is parted, and a vehicle in two clusters is joined. What remains
-are new vehicles, or no vehicles.
+are new vehicles, or no vehicles (`new_vehicles`).
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ from tracklake.pipeline.transforms.onboard.boxes import (
     pick_boxes,
 )
 from tracklake.pipeline.transforms.onboard.clusters import (
-    HIDING_M,
     Scan,
     cluster_returns,
     describe_clusters,
     describe_scan,
+    find_hidden,
     find_sector,
-    part_at_gaps,
     select_returns,
 )
 from tracklake.pipeline.transforms.onboard.measurements import LidarMeasurement, Measured, Predicted, Scanner
+from tracklake.pipeline.transforms.onboard.new_vehicles import find_new_vehicles
 from tracklake.schemas.arrays import Flags, Floats, Integers, expand_ranges
 from tracklake.schemas.perception import FIRST_LIDAR_ID
 
@@ -42,22 +42,10 @@ CLUTTER_PER_M2 = 1 / 175
 """Density of vehicles that were not predicted: one per lane and 50 m."""
 SEEN_SHARE, SEEN_SHARE_HIDDEN = 0.9, 0.2
 """Probability that a predicted vehicle in free sight, or behind something nearer, gives returns."""
-HEADING_SD_RAD, NEW_HEADING_SD_RAD = 0.03, 0.08
-"""Standard deviation of a predicted heading, and of the ego's axis as the heading of a new vehicle, in rad."""
+HEADING_SD_RAD = 0.03
+"""Standard deviation of a predicted heading, in rad."""
 ROUNDS = 3
 """Times that parted clusters are offered again."""
-NEAR_BOX_M = 1.5
-"""A cluster closer than this to a measured vehicle is a part of it or hangs on it, and no new vehicle, in m."""
-LEAST_RETURNS = 3
-"""Returns in different directions or depths that a new vehicle must have."""
-LONGEST_M, WIDEST_M, NARROWEST_M = 26.0, 3.2, 0.5
-"""Greatest length and width, and least greater extent, of what can be a vehicle, in m."""
-LONG_M, LONG_HEIGHT_M = 7.0, 1.8
-"""What is longer than a car and lower than this is a barrier, in m: the beam above the horizon meets every truck."""
-BARRIER_GAP_M = 30.0
-"""Distance from the end of a barrier up to which clusters in line with it belong to it, in m."""
-ROADSIDE_M = 25.0
-"""What lies farther than this beside the ego is off its road, in m."""
 
 
 @dataclass
@@ -105,7 +93,7 @@ def measure_by_lidar(
     )
     _choose(scan, shifted, choice)
     found, boxes, gate = _locate_chosen(scan, shifted, choice)
-    group, new, new_boxes = _find_new(scan, choice, boxes, shifted.heading_rad[found])
+    group, new, new_boxes = find_new_vehicles(scan, choice.vehicle < 0, boxes, shifted.heading_rad[found])
     cluster = np.concatenate([np.arange(found.size), new + found.size])
     offset = boxes.centre_m - shifted.centre_m[found]
     measured = Measured(
@@ -189,7 +177,7 @@ def _measure_pairs(
     if not row.size:
         return nothing
     within, pair = expand_ranges(first[column], count[column])
-    hidden = _find_hidden(scan, order, first, count)
+    hidden = find_hidden(scan, order, first, count)
     vehicle = waiting[row]
     boxes = _locate(scan, order[within], pair, hidden[column], predicted, vehicle, whole=False)
     mean = np.add.reduceat(scan.place_m[order], first) / count[:, None]
@@ -210,23 +198,6 @@ def _locate(
         predicted.size_m[vehicle],
         predicted.vehicle_id[vehicle] < FIRST_LIDAR_ID,
     )
-
-
-def _find_hidden(scan: Scan, order: Integers, first: Integers, count: Integers) -> Flags:
-    """Tell of (S,) groups of returns whether something nearer stands beside either end: (S, 2) left and right."""
-    place = scan.place_m[order]
-    mean = np.add.reduceat(place, first) / count[:, None]
-    group = np.repeat(np.arange(count.size), count)
-    middle = np.arctan2(mean[:, 1], mean[:, 0])
-    turn = (scan.azimuth_rad[order] - middle[group] + np.pi) % (2 * np.pi) - np.pi
-    sectors = scan.nearest_m.size
-    hidden = []
-    for sign in (-1, 1):
-        last = np.lexsort((sign * turn, group))[np.cumsum(count) - 1]
-        sector = find_sector(scan.azimuth_rad[order[last]], sectors)
-        beside = scan.nearest_m[(sector[:, None] + sign * np.arange(4)) % sectors].min(1)
-        hidden.append(beside < scan.range_m[order[last]] - HIDING_M)
-    return np.column_stack(hidden)
 
 
 def _assign(
@@ -318,78 +289,13 @@ def _locate_chosen(scan: Scan, predicted: Predicted, choice: _Choice) -> tuple[I
         return np.empty(0, np.int64), make_no_boxes(), np.empty(0)
     order = taken[np.argsort(choice.vehicle[taken], kind="stable")]
     found, owner, count = np.unique(choice.vehicle[order], return_inverse=True, return_counts=True)
-    hidden = _find_hidden(scan, order, np.cumsum(count) - count, count)
+    hidden = find_hidden(scan, order, np.cumsum(count) - count, count)
     boxes = _locate(scan, order, owner, hidden, predicted, found, whole=True)
     spread = predicted.covariance_m2[found] + boxes.covariance_m2
     square = _square(boxes.centre_m - predicted.centre_m[found], spread)
     stays = np.flatnonzero(square <= GATE)
     choice.vehicle[~np.isin(choice.vehicle, found[stays])] = -1
     return found[stays], pick_boxes(boxes, stays), square[stays]
-
-
-def _find_new(scan: Scan, choice: _Choice, known: Boxes, heading: Floats) -> tuple[Integers, Integers, Boxes]:
-    """Group the returns that no vehicle has, and tell which groups are vehicles.
-
-    A cluster within the usual box of a nearer one belongs to it: the side of a vehicle far ahead gives returns metres
-    apart.
-
-    Returns:
-        (P,) group of each return from 0, undefined where a vehicle has it; the groups that are vehicles; their boxes.
-    """
-    group = np.zeros(choice.vehicle.size, np.int64)
-    free = np.flatnonzero(choice.vehicle < 0)
-    if not free.size:
-        return group, np.empty(0, np.int64), make_no_boxes()
-    owner = cluster_returns(scan, free)
-    boxes, mean = _locate_new(scan, free, owner, whole=False)
-    straight = np.zeros(len(mean))
-    inside = measure_depth(mean, boxes, straight) <= 0
-    # (child, parent): clusters are numbered from the nearest on, and a parent must not be a child itself.
-    inside = np.tril(inside, -1)
-    inside &= ~inside.any(1)
-    parent = np.where(inside.any(1), inside.argmax(1), np.arange(len(mean)))
-    _, renumbered = np.unique(parent, return_inverse=True)
-    owner = part_at_gaps(scan, free, renumbered[owner])
-    boxes, mean = _locate_new(scan, free, owner, whole=True)
-    vehicle = _is_vehicle(boxes, mean, np.bincount(owner))
-    if known.side.size:
-        vehicle &= (measure_depth(mean, known, heading, NEAR_BOX_M) > 0).all(1)
-    group[free] = owner
-    new = np.flatnonzero(vehicle)
-    return group, new, pick_boxes(boxes, new)
-
-
-def _locate_new(scan: Scan, free: Integers, owner: Integers, whole: bool) -> tuple[Boxes, Floats]:
-    """Measure boxes of groups of returns along the ego's axis, and the means of their returns."""
-    order = np.argsort(owner, kind="stable")
-    points, owner = free[order], owner[order]
-    count = np.bincount(owner)
-    first = np.cumsum(count) - count
-    hidden = _find_hidden(scan, points, first, count)
-    returns = Returns(
-        scan.place_m[points], scan.height_m[points], owner, hidden, scan.on_top[points], scan.step_rad, whole
-    )
-    groups = count.size
-    boxes = locate_boxes(
-        returns,
-        np.zeros(groups),
-        np.full(groups, NEW_HEADING_SD_RAD),
-        np.full((groups, 2), np.nan),
-        np.zeros(groups, np.bool_),
-    )
-    return boxes, np.add.reduceat(scan.place_m[points], first) / count[:, None]
-
-
-def _is_vehicle(boxes: Boxes, mean: Floats, returns: Integers) -> Flags:
-    """Tell what can be a vehicle by its extents, its returns and its place; walls, barriers and posts cannot."""
-    long, wide = boxes.seen_m.T
-    barrier = (long > LONGEST_M) | ((long > LONG_M) & (boxes.height_m < LONG_HEIGHT_M))
-    fits = ~barrier & (wide <= WIDEST_M) & (np.maximum(long, wide) >= NARROWEST_M)
-    if barrier.any():
-        line = pick_boxes(boxes, np.flatnonzero(barrier))
-        line.size_m[:, 0] += 2 * BARRIER_GAP_M
-        fits &= (measure_depth(mean, line, np.zeros(line.side.size), 0.0) > 0).all(1)
-    return np.asarray(fits & (returns >= LEAST_RETURNS) & (np.abs(mean[:, 1]) <= ROADSIDE_M))
 
 
 def _square(offset: Floats, covariance: Floats) -> Floats:

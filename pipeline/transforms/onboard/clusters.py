@@ -220,3 +220,20 @@ def describe_clusters(points_m: Floats, label: Integers, count: int) -> dict[str
     }
     singles = {name: values.astype(np.float32) for name, values in columns.items()}
     return {"cluster": np.arange(count, dtype=np.int32), "returns": returns.astype(np.int32), **singles}
+
+
+def find_hidden(scan: Scan, order: Integers, first: Integers, count: Integers) -> Flags:
+    """Tell of (S,) groups of returns whether something nearer stands beside either end: (S, 2) left and right."""
+    place = scan.place_m[order]
+    mean = np.add.reduceat(place, first) / count[:, None]
+    group = np.repeat(np.arange(count.size), count)
+    middle = np.arctan2(mean[:, 1], mean[:, 0])
+    turn = (scan.azimuth_rad[order] - middle[group] + np.pi) % (2 * np.pi) - np.pi
+    sectors = scan.nearest_m.size
+    hidden = []
+    for sign in (-1, 1):
+        last = np.lexsort((sign * turn, group))[np.cumsum(count) - 1]
+        sector = find_sector(scan.azimuth_rad[order[last]], sectors)
+        beside = scan.nearest_m[(sector[:, None] + sign * np.arange(4)) % sectors].min(1)
+        hidden.append(beside < scan.range_m[order[last]] - HIDING_M)
+    return np.column_stack(hidden)
