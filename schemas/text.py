@@ -33,6 +33,13 @@ def quote_shell(argument: str | Path) -> str:
 
 def suggest_name(name: str, known: Iterable[str]) -> str:
     """Return a question after the known name that is most like an unknown one; where none is, a list of all."""
+    known = list(known)
+    near = find_similar(name, known)
+    return f"did you mean {near}?" if near else f"expected one of {', '.join(known)}"
+
+
+def find_similar(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that is most like an unknown one, whatever the case; None where none is."""
     by_folded = {each.casefold(): each for each in known}
     near = get_close_matches(name.casefold(), by_folded, n=1)
-    return f"did you mean {by_folded[near[0]]}?" if near else f"expected one of {', '.join(by_folded.values())}"
+    return by_folded[near[0]] if near else None

@@ -3,6 +3,7 @@
 import gzip
 import json
 import re
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,8 +19,8 @@ from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
 
-from tracklake.pipeline.cli.train import _read_settings_of_model
-from tracklake.training.models import find_model
+from tracklake.pipeline.cli.train import read_model_settings
+from tracklake.training.models import MODELS, find_model
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEMPLATES = Path(__file__).parents[1] / "benchmarks" / "study"
@@ -125,6 +126,25 @@ def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tin
         ("lstm", 2, 1),
     ]
     assert len(select_complete(jobs, 2)) == 6  # a seed that lacks a fold is left out
+
+
+def test_a_run_with_other_defaults_than_now_is_made_again(tiny, tmp_path, monkeypatch):
+    workshop, _, _ = tiny
+    said = []
+    work = shutil.copytree(workshop.work, tmp_path / "work")
+    other = Workshop(work, workshop.data, at_once=1, call=lambda words, _: said.append(words) or 0)
+    assert all(job.is_done for job in other.list_jobs(TINY))
+    lstm = MODELS["lstm"]
+    for changed in ({"parameters": {**lstm.parameters, "hidden": 24}}, {"recipe": replace(lstm.recipe, batch_size=64)}):
+        monkeypatch.setitem(MODELS, "lstm", replace(lstm, **changed))
+        jobs = list(other.list_jobs(TINY))
+        assert {job.model for job in jobs if not job.is_done} == {"lstm", "elsewhere"}
+        assert {job.model for job in select_complete(jobs, 2)} == {"constant-velocity"}
+    other.work_on(jobs)
+    trained = [words for words in said if words[0] == "train"]
+    assert len(trained) == 6
+    assert all("--anew" in words for words in trained)
+    assert sum(words[0] == "evaluate" for words in said) == 10  # evidence is of the first seed alone
 
 
 def test_pages_of_a_study_print_its_digests_and_call_nothing_better_without_an_interval(tiny, monkeypatch):
@@ -270,7 +290,7 @@ def test_every_setting_of_the_plan_is_one_of_its_model():
     learners = {own.name: own for piece in PIECES for arm in piece.arms for own in arm.learners}
     for own in learners.values():
         settings = [word for option, word in pairwise(own.options) if option == "--set"]
-        assert _read_settings_of_model(find_model(own.model), settings) or not settings, own.name
+        assert read_model_settings(find_model(own.model), settings) or not settings, own.name
 
 
 def test_the_plan_is_printed_and_an_unknown_piece_refused(capsys, tmp_path):

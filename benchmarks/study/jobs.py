@@ -11,8 +11,9 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -20,11 +21,13 @@ from typing import Any
 import polars as pl
 
 from study.plan import Arm, Learner, Source, estimate_run
+from tracklake.pipeline.cli.train import read_model_settings
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS, TENSORS
 from tracklake.schemas.files import write_file
 from tracklake.schemas.tensors import INDEX_FILE, RECORDED_POSITIONS
 from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.models import find_model
 from tracklake.training.runs.run_folder import digest_tensors
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -122,14 +125,51 @@ class Job:
         return None if self.seed else self.lake.root.parents[1] / "evidence" / f"{self.identity}-{asked}"
 
     @property
+    def is_current(self) -> bool:
+        """Whether its run, if it learns, has the parameters and the recipe that its model has now."""
+        return self.learner is None or read_settings(self.run_folder) == resolve_settings(self.learner)
+
+    @property
+    def is_scored(self) -> bool:
+        """Whether it has its scores, and they are those of its model as it is now."""
+        return self.scores.exists() and self.is_current
+
+    @property
     def is_done(self) -> bool:
-        """Whether it has all its scores."""
-        return self.scores.exists() and (self.evidence is None or self.evidence.exists())
+        """Whether it has its scores and all that is looked at besides."""
+        return self.is_scored and (self.evidence is None or self.evidence.exists())
+
+    def discard(self) -> None:
+        """Remove scores, and what was looked at besides."""
+        for folder in filter(None, (self.scores, self.evidence)):
+            shutil.rmtree(folder, ignore_errors=True)
 
     @property
     def seconds(self) -> float:
         """Estimate of the time it takes."""
         return estimate_run(self.learner) if self.learner else 0.0
+
+
+def resolve_settings(own: Learner) -> dict[str, Any]:
+    """Resolve what a training is recorded with now: its parameters and its recipe, defaults of the registry included.
+
+    They are not part of a job's digest, since defaults are not in the plan; a run with others is not done.
+    """
+    entry = find_model(own.model)
+    given = [word for option, word in pairwise(own.options) if option == "--set"]
+    settings = read_model_settings(entry, given)
+    parameters = entry.complete(settings.pop("parameters", {}))
+    recipe = asdict(replace(entry.recipe, **settings)) if entry.recipe else None
+    return dict(json.loads(json.dumps({"parameters": parameters, "recipe": recipe})))
+
+
+def read_settings(run: Path) -> dict[str, Any] | None:
+    """Read the same of a run; None where there is no run."""
+    file = run / "config.json"
+    if not file.exists():
+        return None
+    config = json.loads(file.read_text(encoding="utf-8"))
+    return {name: config.get(name) for name in ("parameters", "recipe")}
 
 
 def make_digest(what: object) -> str:
@@ -233,8 +273,14 @@ class Workshop:
 
     def work_on(self, jobs: Iterable[Job]) -> None:
         """Train and score what is not done yet: the shortest first, and of these one seed in all folds."""
-        todo = (job for job in jobs if not job.is_done)
-        left = sorted(todo, key=lambda job: (job.seconds, job.seed or 0, job.lake.name))
+        jobs = list(jobs)
+        outdated = {job.training for job in jobs if not job.is_current and job.run_folder.exists()}
+        for job in jobs:
+            if job.training in outdated:
+                job.discard()
+        left = sorted(
+            (job for job in jobs if not job.is_done), key=lambda job: (job.seconds, job.seed or 0, job.lake.name)
+        )
         with ThreadPoolExecutor(self.at_once) as pool:
             list(pool.map(self.finish, left))
 
@@ -262,12 +308,13 @@ class Workshop:
 
     def train(self, job: Job, own: Learner) -> bool:
         """Train a run if there is none yet; returns whether there is one."""
-        if (job.run_folder / "metrics.json").exists():
+        if job.is_current:
             return True
         begun = (job.run_folder.with_name(f".{job.run}.unfinished") / "checkpoint.pt").exists()
         how = ("--seed", job.seed, "--samples-per-epoch", own.samples, "--epochs", own.epochs, *own.options)
         words = ("train", own.model, *job.trained_in.options, "--name", job.run, *how, "--threads", 1)
-        return self.run(*words, *(("--resume",) if begun else ()), environment=job.trained_in.environment)
+        again = ("--anew",) if job.run_folder.exists() else ("--resume",) if begun else ()
+        return self.run(*words, *again, environment=job.trained_in.environment)
 
 
 def lend_run(job: Job) -> None:
@@ -278,7 +325,8 @@ def lend_run(job: Job) -> None:
     evaluation part, are scored. It states that lake's protocol, too, which may take other tracks, recorded ones.
     """
     copy = job.lake.root / MODELS / job.run
-    if not copy.exists():
+    if read_settings(copy) != read_settings(job.run_folder):
+        shutil.rmtree(copy, ignore_errors=True)
         aside = copy.with_name(f".{copy.name}.copy")
         shutil.rmtree(aside, ignore_errors=True)
         shutil.copytree(job.run_folder, aside)

@@ -88,7 +88,7 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
 
 def select_complete(jobs: Sequence[Job], folds: int) -> list[Job]:
     """Select the scored jobs of those models and seeds that are scored in all folds."""
-    scored = [job for job in jobs if job.scores.exists()]
+    scored = [job for job in jobs if job.is_scored]
     counts: dict[tuple[str, int | None], int] = {}
     for job in scored:
         counts[job.model, job.seed] = counts.get((job.model, job.seed), 0) + 1

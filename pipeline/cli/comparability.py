@@ -51,7 +51,7 @@ def print_comparability(terminal: Terminal, root: Path, folder: TensorFolder, *,
 
 def print_lane_centres(terminal: Terminal, folder: TensorFolder) -> None:
     """Print which subsets have lane centres in place of lateral positions, with the publication of those of NGSIM."""
-    names = list_lane_centred(folder)
+    names = folder.lane_centred_subsets
     if names:
         cite = f" Cite with NGSIM's I-80: {COIFMAN.full}" if any(own.startswith("ngsim/i-80") for own in names) else ""
         terminal.print_line(
@@ -59,10 +59,3 @@ def print_lane_centres(terminal: Terminal, folder: TensorFolder) -> None:
             f"anything; radial and lateral ones are left out.{cite}",
             style="dim",
         )
-
-
-def list_lane_centred(folder: TensorFolder) -> list[str]:
-    """List the subsets (`dataset/subset`) in use that have lane centres in place of lateral positions."""
-    subsets = (f"{own['dataset']}/{own['subset']}" for own in folder.index["subsets"])
-    named = zip(subsets, folder.lane_centred, strict=True)
-    return sorted(name for name, centred in named if centred and name in folder.origins)

@@ -1,6 +1,6 @@
 """`tracklake evaluate`: runs and models scored on one part, written as a table, beside published figures."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from io import BytesIO
 from pathlib import Path
@@ -10,7 +10,7 @@ import polars as pl
 import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
-from tracklake.pipeline.cli.comparability import list_lane_centred, print_comparability
+from tracklake.pipeline.cli.comparability import print_comparability
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.evidence import show_evidence
 from tracklake.pipeline.cli.options import (
@@ -140,18 +140,14 @@ def evaluate(
     """
     with command(quiet=quiet, json=json) as terminal:
         require_choice("--part", part, PARTS)
-        if evidence is not None and not (compare or calibration or feasibility):
-            raise typer.BadParameter("--evidence DIR needs --compare, --calibration or --feasibility")
-        _check_files(out, vehicle_errors, evidence)
+        _check_files(out, vehicle_errors, evidence, has_evidence=compare or calibration or feasibility)
         settings = read_settings(lake=lake, protocol=protocol)
         root = settings.lake
         tensors = TensorFolder.open(tensor_folder(root, load(root), settings)).narrow(dataset, recording)
         around = NEAREST if nearest is None else nearest
         plain = part == "eval" and around == NEAREST and published and not every_tick and tensors.kept is None
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
-        for file in filter(None, (target, vehicle_errors, evidence and evidence / "comparisons.csv")):
-            with explain_file_errors(file.parent):
-                file.parent.mkdir(parents=True, exist_ok=True)  # before the long work, which would be lost
+        _make_folders(target, vehicle_errors, evidence)
         names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in finished_runs(root))])
         if compare and len(names) < 2:
             raise typer.BadParameter(f"--compare needs two runs or models; got {', '.join(names)} alone")
@@ -159,43 +155,28 @@ def evaluate(
         found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, records, every_tick=every_tick, strict=bool(runs)
         )
-        table = pl.concat([own.to_table() for own in found]) if found else EVALUATIONS.empty()
         comparable = print_comparability(terminal, root, tensors, published=published)
-        if comparable:
-            table = pl.concat([table, published_rows(settings.get_protocol().name, comparable)])
-        table = EVALUATIONS.validate(table.sort(EVALUATIONS.key), where="evaluate")
-        gains = None
+        table = _tabulate(found, settings.get_protocol().name, comparable)
+        scored = [own.model for own in found]
         if found:
-            show_evaluations(terminal, found[0], table, [own.value for own in by or []])
-            for fit in (own.fit for own in found if own.fit):
-                terminal.print_line(fit.describe(), style="dim")
-            tracks_from = found[0].protocol.tracks_from
-            terminal.print_line(describe_causality(tracks_from), style="dim")
-            wanted = gain if gain is not None else tracks_from == RECONSTRUCTED_TRACKS
-            if wanted and list_lane_centred(tensors):
-                terminal.print_line("note: no gain from smoothing: it is one of radial errors, which lane centres lack")
-            elif wanted:
-                gains = _compare_histories(terminal, settings, [own.model for own in found], tensors, part, around)
-        scored = [own.model for own in found] if feasibility else []
-        joint = [open_forecaster(name, tensors, root / MODELS, frozenset({part})) for name in scored]
+            _show_scores(terminal, found, table, by or [])
+        wanted = gain if gain is not None else tensors.protocol.tracks_from == RECONSTRUCTED_TRACKS
+        gains = _compare_histories(terminal, settings, scored, tensors, part, around) if wanted and found else None
+        opened = scored if feasibility else []
+        joint = [open_forecaster(name, tensors, root / MODELS, frozenset({part})) for name in opened]
         tables = show_evidence(terminal, tensors, found, records, joint, compare=compare, out=evidence)
         if vehicle_errors is not None:
             _write_vehicle_errors(terminal, vehicle_errors, found)
-        if target is not None:
-            _write_table(target, table)
-            terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")
-        elif not runs:
-            terminal.print_line(
-                "note: the lake keeps the table of the options' defaults; --out writes this one", style="dim"
-            )
-        rows = table.to_dicts()
-        shown = {"evaluations": [own.to_dict() for own in found], "rows": rows, "table": target}
+        _write_scores(terminal, target, table, named=bool(runs))
+        shown = {"evaluations": [own.to_dict() for own in found], "rows": table.to_dicts(), "table": target}
         further = {"smoothing_gain": gains, **tables}
         terminal.print_json(shown | {name: own.to_dicts() for name, own in further.items() if own is not None})
 
 
-def _check_files(out: Path | None, vehicle_errors: Path | None, evidence: Path | None) -> None:
-    """Refuse files of other formats, and places within a lake."""
+def _check_files(out: Path | None, vehicle_errors: Path | None, evidence: Path | None, *, has_evidence: bool) -> None:
+    """Refuse files of other formats, folders in place of files, and places within a lake."""
+    if evidence is not None and not has_evidence:
+        raise typer.BadParameter("--evidence DIR needs --compare, --calibration or --feasibility")
     if out is not None and out.suffix not in FORMATS:
         raise typer.BadParameter(f"--out ends with one of {', '.join(FORMATS)}; got {out}")
     if vehicle_errors is not None and vehicle_errors.suffix != ".parquet":
@@ -203,6 +184,45 @@ def _check_files(out: Path | None, vehicle_errors: Path | None, evidence: Path |
     refuse_lake(out)
     refuse_lake(evidence, "--evidence")
     refuse_lake(vehicle_errors, "--vehicle-errors")
+    if evidence is not None and evidence.exists() and not evidence.is_dir():
+        raise typer.BadParameter(f"--evidence names a folder, and {evidence} is a file; name another place")
+    for option, file in (("--out", out), ("--vehicle-errors", vehicle_errors)):
+        if file is not None and file.is_dir():
+            raise typer.BadParameter(f"{option} names a file, and {file} is a folder; name a file, in it or elsewhere")
+
+
+def _make_folders(target: Path | None, vehicle_errors: Path | None, evidence: Path | None) -> None:
+    """Make the folders that are written into, before the long work, which would be lost."""
+    for folder in (target and target.parent, vehicle_errors and vehicle_errors.parent, evidence):
+        if folder is not None:
+            with explain_file_errors(folder, "Name another place, where folders can be made."):
+                folder.mkdir(parents=True, exist_ok=True)
+
+
+def _tabulate(found: Iterable[Evaluation], protocol: str, comparable: tuple[str, ...]) -> pl.DataFrame:
+    """Return the rows of all evaluations, and published ones of datasets that are comparable."""
+    tables = [EVALUATIONS.empty(), *(own.to_table() for own in found)]
+    tables += [published_rows(protocol, comparable)] if comparable else []
+    return EVALUATIONS.validate(pl.concat(tables).sort(EVALUATIONS.key), where="evaluate")
+
+
+def _show_scores(terminal: Terminal, found: Sequence[Evaluation], table: pl.DataFrame, by: Iterable[By]) -> None:
+    """Print the scores, what was fitted on the fly, and which tracks the histories are of."""
+    show_evaluations(terminal, found[0], table, [own.value for own in by])
+    for fit in (own.fit for own in found if own.fit):
+        terminal.print_line(fit.describe(), style="dim")
+    terminal.print_line(describe_causality(found[0].protocol.tracks_from), style="dim")
+
+
+def _write_scores(terminal: Terminal, target: Path | None, table: pl.DataFrame, *, named: bool) -> None:
+    """Write the table of scores where one is asked for; where no runs are named, tell why the lake gets none."""
+    if target is not None:
+        _write_table(target, table)
+        terminal.print_line(f"table {target}: {table.height:,} rows", style="dim")
+    elif not named:
+        terminal.print_line(
+            "note: the lake keeps the table of the options' defaults; --out writes this one", style="dim"
+        )
 
 
 def _evaluate_all(
@@ -243,8 +263,11 @@ def _evaluate_all(
 
 def _compare_histories(
     terminal: Terminal, settings: Settings, names: Iterable[str], folder: TensorFolder, part: str, nearest: int
-) -> pl.DataFrame:
-    """Score models with histories of every kind of tracks, and show what smoothing gains."""
+) -> pl.DataFrame | None:
+    """Score models with histories of every kind of tracks, and show what smoothing gains; None on lane centres."""
+    if folder.lane_centred_subsets:
+        terminal.print_line("note: no gain from smoothing: it is one of radial errors, which lane centres lack")
+        return None
     reader = LakeReader(settings.lake, load(settings.lake))
     inputs = open_histories(settings, reader, folder, part, nearest)
     models = [open_forecaster(name, folder, settings.lake / MODELS, frozenset({part})) for name in names]

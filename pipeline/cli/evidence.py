@@ -7,7 +7,7 @@ import polars as pl
 
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.score_tables import HEADINGS, find_headline
-from tracklake.pipeline.cli.tables import format_number, print_table
+from tracklake.pipeline.cli.tables import UNBROKEN, format_number, print_table
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE, DENSITY_CLASSES, FEASIBILITY_RULES
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_output
@@ -71,7 +71,7 @@ def show_comparisons(terminal: Terminal, evaluations: Sequence[Evaluation]) -> p
     for figure in (*find_headline(evaluations[0].protocol.headline, set(table["figure"])), "nll_nats"):
         rows = table.filter(figure=figure)
         lines = [
-            [name or f"{a} - {b}", *(format_number(value, 3) for value in own[column])]
+            [name or f"{a} - {b}", *map(_format_difference, own[column])]
             for (a, b), own in rows.group_by("a", "b", maintain_order=True)
             for name, column in LINES.items()
         ]
@@ -91,6 +91,12 @@ def show_comparisons(terminal: Terminal, evaluations: Sequence[Evaluation]) -> p
     return table
 
 
+def _format_difference(value: float) -> str:
+    """Write a difference or its bound with three decimals, or more where its sign would be lost: 0 is 0 alone."""
+    digits = next((own for own in range(3, 7) if round(value, own)), 3)
+    return format_number(value, digits)
+
+
 def show_uncertainty(terminal: Terminal, folder: TensorFolder, records: Mapping[str, SampleRecord]) -> Tables:
     """Print how far predicted regions hold the truth, sigma beside the error by traffic density, and radii."""
     (one, *_) = records.values()
@@ -103,7 +109,7 @@ def show_uncertainty(terminal: Terminal, folder: TensorFolder, records: Mapping[
     }
     rows = tables["calibration"].filter(pl.col("level").is_in(SHOWN_LEVELS))
     lines = [
-        [f"{run}, {level:.0%} region", *(f"{share:.1%}" for share in own["coverage"])]
+        [f"{run}, {level:.0%}{UNBROKEN}region", *(f"{share:.1%}" for share in own["coverage"])]
         for (run, level), own in rows.group_by("run", "level", maintain_order=True)
     ]
     seconds = [f"{ahead:g} s" for ahead in one.seconds]
@@ -127,7 +133,7 @@ def _show_densities(terminal: Terminal, tables: Tables, seconds: float) -> None:
     figures = ("rmse_longitudinal_m", "sigma_longitudinal_m", "rmse_lateral_m", "sigma_lateral_m", "radius_m")
     lines = [
         [
-            f"{row['run']}, {row['density']}",
+            f"{row['run']}, {row['density'].replace(' ', UNBROKEN)}",
             f"{row['n']:,}",
             *(format_number(row[name]) for name in figures),
             format_number(row["coverage"], 1, 100.0),

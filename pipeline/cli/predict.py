@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.comparability import print_lane_centres
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
 from tracklake.pipeline.lake import load, refuse_lake
@@ -100,6 +101,7 @@ def predict(
         root = settings.lake
         folder = TensorFolder.open(tensor_folder(root, load(root), settings))
         terminal.print_origin(describe_synthetic(folder.origins))
+        print_lane_centres(terminal, folder)
         samples = _find_samples(folder, sample, vehicle, time)
         parts = _list_parts(folder, samples) if samples else frozenset({part})
         forecasters = _open_forecasters(terminal, models or [], folder, root / MODELS, parts, alone=all_vehicles)
@@ -245,12 +247,13 @@ def _show_errors(terminal: Terminal, picture: Picture, file: Path) -> None:
     from tracklake.training.plots.picture_rows import list_errors  # imports Altair
 
     last = {row["model"]: row for row in list_errors(picture) if row["own"]}
-    off = ", ".join(f"{model} {row['distance_m']:.2f} m" for model, row in last.items())
+    figure, where = ("along_m", " along the road") if picture.lane_centred else ("distance_m", "")
+    off = ", ".join(f"{model} {abs(row[figure]):.2f} m" for model, row in last.items())
     seconds = max((row["seconds"] for row in last.values()), default=0.0)
     terminal.print_line(
         f"vehicle {picture.own.vehicle_id} of {picture.subset} at {picture.time_s:.1f} s ({picture.part})"
     )
-    terminal.print_line(f"  off after {seconds:g} s: {off}", style="dim")
+    terminal.print_line(f"  off after {seconds:g} s{where}: {off}", style="dim")
     terminal.print_line(f"  {file}", style="bold green")
 
 

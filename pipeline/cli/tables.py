@@ -9,6 +9,8 @@ from tracklake.schemas.text import make_visible
 
 GAP = 2
 """Space between two columns, in characters; 1 where the terminal is too narrow."""
+UNBROKEN = "\N{NO-BREAK SPACE}"
+"""Space at which first cells are not broken; it is printed as a plain one."""
 MIN_NAME_CHARS = 12
 """Least width of the first column of a folded table, in characters."""
 
@@ -55,6 +57,7 @@ def print_table(
     for row, style in zip_longest(body, styles[: len(body)], fillvalue=""):
         name, *continued = (wrap(row[0], widths[0]) or [""]) if fold else [row[0]]
         lines += [([name, *row[1:]], str(style)), *(([part], str(style)) for part in continued)]
+    lines = [([cells[0].replace(UNBROKEN, " "), *cells[1:]], style) for cells, style in lines]
     for cells, style in lines:
         shown = [
             cell.rjust(width) if to_right else cell.ljust(width)
@@ -69,8 +72,8 @@ def cut_text(text: str, chars: int) -> str:
 
 
 def format_number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Write a number with fixed decimals, and a missing one as `-`."""
-    return "-" if value is None else f"{scale * value:.{digits}f}"
+    """Write a number with fixed decimals, never as -0.0, and a missing one as `-`."""
+    return "-" if value is None else f"{scale * value:z.{digits}f}"
 
 
 def _measure(lines: Sequence[Sequence[str]]) -> list[int]:

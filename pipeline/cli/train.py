@@ -62,7 +62,10 @@ SetOption = Annotated[
 ]
 ResumeOption = Annotated[
     bool | None,
-    typer.Option("--resume/--anew", help="Continue an interrupted training with its own settings; or discard it."),
+    typer.Option(
+        "--resume/--anew",
+        help="Continue an interrupted training with its own settings; or start over, and replace what has this name.",
+    ),
 ]
 NoEvaluationOption = Annotated[
     bool, typer.Option("--no-evaluation", help="Train also where the split has nothing to evaluate on.")
@@ -98,12 +101,12 @@ def train(
             raise typer.BadParameter(f"{model} does not learn; `tracklake evaluate {model}` scores it")
         given: dict[str, Any] = {"seconds": seconds, "epochs": epochs, "steps": steps, "patience": patience}
         given |= {"samples_per_epoch": samples_per_epoch, "seed": seed, "device": device, "threads": threads}
-        unused = [own for own, value in {**given, "resume": resume}.items() if value is not None]
+        unused = [own for own, value in {**given, "resume": resume or None}.items() if value is not None]
         if entry.fitted and unused:
             names = ", ".join(f"--{own.replace('_', '-')}" for own in unused)
             raise typer.BadParameter(f"{model} is fitted in one pass over `train`, without {names}; it takes --set")
         given |= {"dataset": dataset, "recording": recording}
-        given |= _read_settings_of_model(entry, settings or [])
+        given |= read_model_settings(entry, settings or [])
         config = _make_config({key: value for key, value in given.items() if value is not None}, resume=resume)
         found = read_settings(lake=lake, protocol=protocol)
         tensors = tensor_folder(found.lake, load(found.lake), found)
@@ -139,7 +142,7 @@ def _check_name(name: str, model: str) -> str:
     return name
 
 
-def _read_settings_of_model(entry: Model, settings: list[str]) -> dict[str, Any]:
+def read_model_settings(entry: Model, settings: list[str]) -> dict[str, Any]:
     """Read NAME=VALUE pairs as keywords of TrainConfig: settings of the recipe, and `parameters` of the model."""
     recipe = {name: getattr(entry.recipe, name) for name in RECIPE_SETTINGS} if entry.recipe else {}
     known = {**recipe, **entry.settings}

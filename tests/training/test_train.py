@@ -353,7 +353,7 @@ def test_patience_ends_the_last_phase_and_keeps_the_best_weights(tensors, tmp_pa
 
 def test_validation_is_the_loss_over_val_without_dropout(tensors, tmp_path, monkeypatch):
     built = register(monkeypatch, recipe=replace(RECIPE, phases=(Phase("mse", 1),)))
-    monkeypatch.setattr("tracklake.training.train.VALIDATION_BATCH", 50)
+    monkeypatch.setattr("tracklake.training.loop.VALIDATION_BATCH", 50)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(patience=1))
     shown = sorted(
         tuple(row.flatten().tolist()) for _, training, future in built[0].seen if not training for row in future

@@ -10,8 +10,9 @@ from tracklake.schemas.comparisons import COMPARED_FIGURES, COMPARISONS, VEHICLE
 from tracklake.schemas.errors import UsageError
 from tracklake.training.comparison.bootstrap import compare_errors
 from tracklake.training.evaluation.evaluate import Evaluation
+from tracklake.training.runs.run_folder import UNCHANGING
 
-IGNORED_SETTINGS = frozenset({"seed", "threads", "device", "log_steps", "checkpoint_s"})
+IGNORED_SETTINGS = UNCHANGING | {"seed"}
 """Settings of a training in which the runs of one arm may differ."""
 
 

@@ -173,6 +173,13 @@ class TensorFolder:
         return {f"{named['dataset']}/{named['subset']}": named["origin"] for named in kept}
 
     @property
+    def lane_centred_subsets(self) -> list[str]:
+        """Names (`dataset/subset`) of the kept subsets that have lane centres in place of lateral positions, sorted."""
+        subsets = (f"{own['dataset']}/{own['subset']}" for own in self.index["subsets"])
+        named = zip(subsets, self.lane_centred, strict=True)
+        return sorted(name for name, centred in named if centred and name in self.origins)
+
+    @property
     def split(self) -> str:
         """Name of the split."""
         return str(self.index["split"])

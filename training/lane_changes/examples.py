@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.errors import UsageError
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.gathers import gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -294,7 +294,16 @@ def label_samples(folder: TensorFolder, part: str | None, settings: LaneForestSe
     None stands for all parts.
 
     The same samples serve all scores: cells need the horizon alone, but are scored by maneuver, too.
+
+    Raises:
+        TracklakeError: lateral positions are lane centres, so that no lane change has a beginning or an end.
     """
+    if folder.lane_centred_subsets:
+        raise TracklakeError(
+            f"{folder.path}: lateral positions of {', '.join(folder.lane_centred_subsets)} are lane centres. Lane "
+            "changes are labelled and predicted by offsets in the lane and lateral speeds, which such recordings lack; "
+            "fit the forest in a lake without them"
+        )
     maneuvers = find_maneuvers(
         folder,
         start_s=settings.start_s,

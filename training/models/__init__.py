@@ -11,6 +11,7 @@ from tracklake.schemas import references
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.text import suggest_name
 from tracklake.training.models.prediction import Prediction
 
 MAX_PARAMETER = 2048
@@ -288,7 +289,7 @@ def find_model(name: str) -> Model:
 
         return find_own_model(name)
     if name not in MODELS:
-        raise UsageError(f"unknown model `{name}`: expected one of {', '.join(MODELS)}, or your own by `module:Class`")
+        raise UsageError(f"unknown model `{name}`: {suggest_name(name, MODELS)} (or your own, by `module:Class`)")
     return MODELS[name]
 
 

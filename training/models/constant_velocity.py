@@ -1,7 +1,7 @@
 """Constant velocity, the baseline of all models: of the last 0.2 s, damped, and by a Kalman filter; NumPy only."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -60,6 +60,8 @@ class DampedVelocity(ConstantVelocity):
     T; fitted, it has the least sum of squared lateral errors over all known positions ahead.
     """
 
+    bounds: ClassVar = {"decay_s": DECAY_S}
+
     def __init__(self, protocol: Protocol, *, decay_s: float) -> None:
         super().__init__(protocol)
         _require_positive(decay_s=decay_s)
@@ -80,7 +82,7 @@ class DampedVelocity(ConstantVelocity):
             squares: Floats = moments.sum_squared_errors(1, weights).sum(axis=1)
             return squares
 
-        (decay_s,) = search(measure, DECAY_S[:1], DECAY_S[1:])
+        (decay_s,) = search(measure, *zip(DECAY_S, strict=True))
         return {"decay_s": float(decay_s)}
 
 
@@ -115,6 +117,11 @@ class KalmanConstantVelocity:
         acceleration_lateral_m2ps3: the same across the road.
     """
 
+    bounds: ClassVar = {
+        **{f"measurement_{axis}_m": MEASUREMENT_RANGE_M for axis in AXES},
+        **{f"acceleration_{axis}_m2ps3": ACCELERATION_RANGE_M2PS3 for axis in AXES},
+    }
+
     def __init__(
         self,
         protocol: Protocol,
@@ -137,6 +144,7 @@ class KalmanConstantVelocity:
     def fit(protocol: Protocol, moments: Moments, given: Mapping[str, float]) -> dict[str, float]:
         """Return the noise that is not given, of both axes."""
         fitted: dict[str, float] = {}
+        bounds = KalmanConstantVelocity.bounds
         for axis, axis_name in enumerate(AXES):
 
             def measure(noise: Floats, axis: int = axis) -> Floats:
@@ -146,8 +154,8 @@ class KalmanConstantVelocity:
                 return nats
 
             names = f"measurement_{axis_name}_m", f"acceleration_{axis_name}_m2ps3"
-            ranges = zip(names, (MEASUREMENT_RANGE_M, ACCELERATION_RANGE_M2PS3), strict=True)
-            low, high = zip(*((given[own], given[own]) if own in given else span for own, span in ranges), strict=True)
+            spans = ((given[own], given[own]) if own in given else bounds[own] for own in names)
+            low, high = zip(*spans, strict=True)
             found = dict(zip(names, search(measure, low, high).tolist(), strict=True))
             fitted |= {own: value for own, value in found.items() if own not in given}
         return fitted

@@ -46,19 +46,28 @@ class Moments:
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters of a fitted model, those of them that were set, and the number of samples the others are fitted on."""
+    """Parameters of a fitted model, and the number of samples that they are fitted on.
+
+    Those in `given` were set. Those in `at_bounds` are the least or the largest value that was searched: a better one
+    may lie beyond.
+    """
 
     model: str
     samples: int
     parameters: Mapping[str, float]
     given: Sequence[str] = ()
+    at_bounds: Sequence[str] = ()
 
     def describe(self) -> str:
         """Return a line for people."""
         how = f"fitted on {self.samples:,} samples of `train`" if self.samples else "not fitted: `train` has no samples"
         groups = {how: set(self.parameters).difference(self.given), "set, not fitted": set(self.given)}
+        values = {
+            name: f"{name} = {value:g}" + (" (bound of the search)" if name in self.at_bounds else "")
+            for name, value in self.parameters.items()
+        }
         shown = [
-            ", ".join(f"{name} = {value:g}" for name, value in self.parameters.items() if name in names) + f", {how}"
+            ", ".join(text for name, text in values.items() if name in names) + f", {how}"
             for how, names in groups.items()
             if names
         ]
@@ -77,10 +86,10 @@ def fit_model(model: Model, folder: TensorFolder, samples: Integers, given: Mapp
     chosen = samples[:: -(-len(samples) // FITTED_SAMPLES) or 1]
     fitted: dict[str, float] = {**model.parameters, **given}
     builder = type(model.build(folder.protocol, **fitted))  # refuses parameters that are wrong
-    if len(chosen):
-        fitted |= builder.fit(folder.protocol, sum_moments(folder, chosen), given)
-    rounded = {name: float(f"{value:.4g}") for name, value in fitted.items()}
-    return Fit(model.name, len(chosen), rounded | dict(given), sorted(given))
+    found = builder.fit(folder.protocol, sum_moments(folder, chosen), given) if len(chosen) else {}
+    rounded = {name: float(f"{value:.4g}") for name, value in (fitted | found).items()}
+    at_bounds = sorted(name for name in found if rounded[name] in builder.bounds[name])
+    return Fit(model.name, len(chosen), rounded | dict(given), sorted(given), at_bounds)
 
 
 def sum_moments(folder: TensorFolder, samples: Integers) -> Moments:

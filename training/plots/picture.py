@@ -128,6 +128,7 @@ class Picture:
         markings_m: y of the lanes' borders, from the left edge to the right one.
         marked: whether the borders are known; else lanes are NOMINAL_LANE_M wide.
         vehicles: the sample's own first, then by id.
+        lane_centred: whether lateral positions are lane centres, so that only errors along the road mean anything.
     """
 
     sample: int
@@ -143,6 +144,7 @@ class Picture:
     markings_m: tuple[float, ...]
     marked: bool
     vehicles: tuple[Vehicle, ...]
+    lane_centred: bool = False
 
     @property
     def place(self) -> str:
@@ -211,6 +213,7 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
         markings_m=tuple(float(border) for border in markings),
         marked=bool(facts["lane_markings_m"]),
         vehicles=vehicles,
+        lane_centred=bool(folder.lane_centred[folder.run_subset[run]]),
     )
 
 

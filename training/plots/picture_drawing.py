@@ -72,7 +72,8 @@ def draw_picture(picture: Picture) -> Drawing:
     maneuvers, marks = describe_maneuvers(picture), describe_marks(picture, view)
     name = f"{picture.place}, vehicle {picture.own.vehicle_id} at {picture.time_s:.1f} s"
     title = alt.Title(f"{name} (sample {picture.sample}, {picture.part})", subtitle=[*maneuvers, *marks], offset=14)
-    errors = alt.hconcat(*(_draw_error(to, error, picture.own.has_density) for error in ERRORS), spacing=ERROR_GAP)
+    known = ["along"] if picture.lane_centred else list(ERRORS)
+    errors = alt.hconcat(*(_draw_error(to, error, picture.own.has_density) for error in known), spacing=ERROR_GAP)
     return Drawing(alt.vconcat(road, errors, title=title, spacing=18), rows)
 
 
@@ -95,6 +96,7 @@ def describe_marks(picture: Picture, view: picture_rows.View) -> list[str]:
         "thin lines: less probable, with probability": any(map(picture_rows.find_likely, picture.own.forecasts)),
         "outlined vehicle: size unknown": not all(box["known"] for box in picture_rows.list_boxes(picture, view)),
         "lanes of 12 ft, as no markings are known": not picture.marked,
+        "lateral positions are lane centres": picture.lane_centred,
     }
     line = "; ".join(text for text, present in marks.items() if present)
     return [line] if line else []

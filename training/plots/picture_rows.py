@@ -216,8 +216,10 @@ def separate_labels(wanted: Floats, least: float) -> Floats:
 def list_errors(picture: Picture) -> list[Row]:
     """List errors, predicted - true, of every forecast at every known tick; `second`: whether it is a whole one.
 
-    Standard deviations are of the most probable alternative, null where the model gives none.
+    Standard deviations are of the most probable alternative, null where the model gives none. Where lateral positions
+    are lane centres, what depends on them is null.
     """
+    unknown = dict.fromkeys(("distance_m", "across_m", "across_sigma_m")) if picture.lane_centred else {}
     return [
         {
             "vehicle_id": vehicle.vehicle_id,
@@ -230,6 +232,7 @@ def list_errors(picture: Picture) -> list[Row]:
             "across_m": across,
             "along_sigma_m": along_sigma,
             "across_sigma_m": across_sigma,
+            **unknown,
         }
         for vehicle in picture.vehicles
         for forecast in vehicle.forecasts

@@ -106,13 +106,18 @@ def _prefer(samples: Integers, flagged: Flags) -> Integers:
 
 
 def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Forecaster) -> Floats:
-    """Measure the distance in m between predicted and true position at each sample's last known tick (B,)."""
+    """Measure the distance in m between predicted and true position at each sample's last known tick (B,).
+
+    Where lateral positions are lane centres, it is the distance along the road.
+    """
     distances = []
+    centred = folder.lane_centred[folder.run_subset[folder.runs_of(folder.sample_row[samples])]]
     for start in range(0, len(samples), BATCH_SIZE):
         observed, everything = read_samples(folder, samples[start : start + BATCH_SIZE], judge.reads)
         truth = truth_of_ego(everything)
         position_m = judge.predictor.predict(observed).position_m.astype(np.float64)
         last = truth.future_mask.sum(axis=1) - 1
         apart = (position_m - truth.future)[np.arange(len(last)), last]
-        distances.append(np.hypot(apart[:, 0], apart[:, 1]))
+        across = np.where(centred[start : start + BATCH_SIZE], 0.0, apart[:, 1])
+        distances.append(np.hypot(apart[:, 0], across))
     return np.concatenate(distances)

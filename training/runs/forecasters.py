@@ -5,14 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.errors import UsageError
+from tracklake.schemas.text import find_similar
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, Reads, find_model
 from tracklake.training.models.fitting import Fit, fit_model
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
 
 
-class UnknownRunError(TracklakeError):
+class UnknownRunError(UsageError):
     """There is no run, and no model that needs no training, of this name."""
 
 
@@ -61,7 +62,9 @@ def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozen
         raise UnknownRunError(f"{models / name}: no trained run; run `tracklake train {name}` first")
     runs = sorted(path.parent.name for path in models.glob("[!.]*/config.json"))
     known = [name for name, model in MODELS.items() if not model.learns]
+    similar = find_similar(name, (*runs, *MODELS))
     raise UnknownRunError(
-        f"no run or model `{name}`: expected one of the runs {', '.join(runs) or '(none yet)'}, or of the models that "
+        f"no run or model `{name}`{f' (did you mean {similar}?)' if similar else ''}: expected one of the runs "
+        f"{', '.join(runs) or '(none yet)'}, or of the models that "
         f"need no training, {', '.join(known)}; `tracklake train MODEL --name {name}` trains one"
     )

@@ -36,6 +36,8 @@ TRAINED_BY = ("tracklake", "torch")
 """Distributions whose versions a run records."""
 KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "val_subsets": list, "blocks": list}
 """Keys that a run's config must hold, and their types."""
+UNCHANGING = frozenset({"threads", "device", "log_steps", "checkpoint_s"})
+"""Settings of a training that say how it is run and logged, not what is learned."""
 HASHED_BYTES = 1 << 22
 """Size of the pieces that are hashed, in bytes, so that Ctrl-C does not wait for a whole array."""
 
@@ -178,6 +180,47 @@ def refuse_unfinished(path: Path) -> None:
     if not (path / "config.json").is_file() and is_unfinished(path):
         command = f"`tracklake train MODEL --name {path.name} --resume`"
         raise StaleRunError(f"{path}: the training of this run was interrupted; finish it first: {command}")
+
+
+def refuse_replacement(out: Path, run: dict[str, Any]) -> None:
+    """Raise UsageError where there is a run of that name of another model, protocol, or of other settings.
+
+    One of other tensors, or one that cannot be read, may be replaced: it is of no more use.
+    """
+    try:
+        there, asked = select_settings(read_config(out)), select_settings(run)
+    except (StaleRunError, OSError):
+        return
+    names = there.keys() & asked.keys() if there["model"] == asked["model"] else {"model"}
+    differing = [
+        f"{name} {show_setting(there[name])} there, {show_setting(asked[name])} asked for"
+        for name in sorted(names)
+        if there[name] != asked[name]
+    ]
+    if differing:
+        raise UsageError(
+            f"{out}: there is a run of this name, and another one was asked for: {'; '.join(differing)}. Give the new "
+            "one another name (`--name`), or replace the old one (`--anew`)"
+        )
+
+
+def select_settings(run: dict[str, Any]) -> dict[str, Any]:
+    """Select from a run's config what decides its weights besides the data, by name; without what ran it alone."""
+    training = dict(run["training"])
+    given, recipe = training.pop("parameters", None), run["recipe"] or {}
+    settings = {name: value for name, value in training.items() if name not in {*UNCHANGING, *recipe}}
+    if recipe:
+        settings |= {**recipe, **run["parameters"]}
+    elif given is not None:  # of a fitted model; what was fitted follows from the data
+        settings["--set"] = given
+    return {**settings, "model": run["model"], "protocol": run["protocol"]["name"]}
+
+
+def show_setting(value: object) -> str:
+    """Show a setting in a message."""
+    if isinstance(value, dict):
+        return " ".join(f"{name}={own}" for name, own in value.items()) or "nothing"
+    return "not set" if value is None else str(value)
 
 
 def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:

@@ -13,7 +13,8 @@ import pytest
 from rich.console import Console
 
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.cli.evidence import _format_difference
+from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.comparisons import COMPARISON_TABLES, VEHICLE_ERRORS
 from tracklake.schemas.evaluations import EVALUATIONS
@@ -56,7 +57,7 @@ def test_scores_of_synthetic_data_say_so_and_have_no_published_rows(command, lak
     assert "published [" not in out
 
 
-def test_lane_centres_are_announced_and_errors_along_the_road_shown(command, lake):
+def test_lane_centres_are_announced_and_errors_along_the_road_shown(command, lake, tmp_path):
     centred = property(lambda folder: np.ones(len(folder.index["subsets"]), dtype=bool))
     with mock.patch("tracklake.training.data.tensor_folder.TensorFolder.lane_centred", centred):
         models = ("constant-velocity", "ctrv", "--compare", "--gain")
@@ -69,6 +70,12 @@ def test_lane_centres_are_announced_and_errors_along_the_road_shown(command, lak
     assert "longitudinal RMSE, m" in said
     assert not any(line.startswith("RMSE, m") for line in done.out.splitlines())
     assert "lateral RMSE" not in said
+    with mock.patch("tracklake.training.data.tensor_folder.TensorFolder.lane_centred", centred):
+        drawn = command.here("predict", "constant-velocity", "--lake", lake.root, "--out", tmp_path / "a.svg")
+        forest = command.here("lane-forest", "--lake", lake.root)
+    assert re.search(r"off after 5 s along the road: constant-velocity \d+\.\d\d m\n", drawn.out)
+    assert "are lane centres: only errors along the road mean anything" in drawn.out
+    assert (forest.code, "are lane centres. Lane changes are labelled and predicted by" in forest.err) == (1, True)
 
 
 @pytest.mark.usefixtures("comparable")
@@ -206,6 +213,17 @@ def test_names_and_figures_are_never_cut_off(width):
     assert shown == "".join(names)
 
 
+def test_labels_of_traffic_densities_are_not_broken_and_bounds_keep_their_signs(command, lake, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    out = command.here("evaluate", "constant-velocity", "--calibration", "--lake", lake.root).out
+    table = out[out.index("by vehicles per km of lane") :].splitlines()
+    assert any(re.search(r"\b\d+ to \d+\b", line) for line in table)
+    assert not any(re.search(r"\bto$|^\d+$", line.strip()) for line in table)
+    shown = [_format_difference(value) for value in (-0.0004, -0.000012, 0.0, -0.0, 0.0005, 1.23456, -1e-9)]
+    assert shown == ["-0.0004", "-0.00001", "0.000", "0.000", "0.001", "1.235", "0.000"]
+    assert format_number(-0.001) == "0.00"
+
+
 @pytest.mark.parametrize("option", ["--nearest=2", "--no-published", "--every-tick", "--part=train"])
 def test_what_the_options_change_is_not_written_into_the_lake(command, lake, option):
     before = list_files(lake)
@@ -217,8 +235,10 @@ def test_what_the_options_change_is_not_written_into_the_lake(command, lake, opt
 
 def test_what_is_not_there_is_named_with_what_is(command, lake):
     unknown = command.here("evaluate", "unknown", "--lake", lake.root)
-    assert unknown.code == 1
+    assert unknown.code == 2
     assert "no run or model `unknown`: expected one of the runs constant-velocity" in unknown.err
+    misspelt = command.here("evaluate", "Kalman_cv", "--lake", lake.root)
+    assert (misspelt.code, "no run or model `Kalman_cv` (did you mean kalman-cv?)" in misspelt.err) == (2, True)
     other = command.here("evaluate", "constant-velocity", "--lake", lake.root, "--protocol", "grid-2021")
     assert other.code == 1
     reported = r"another protocol than grid-2021 \(\w{12}\) as it is set now: by csp \(\w{12}\)\. Run `tracklake run`"
@@ -244,3 +264,13 @@ def test_a_part_without_samples_and_misuses(command, lake, tmp_path):
         ("--nearest", "-1"),
     ):
         assert command.here("evaluate", *misuse, "--lake", lake.root).code == 2, misuse
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.csv").mkdir()
+    calibration = ("--calibration", "--evidence", tmp_path / "file")
+    for misuse, code, reported in (
+        (calibration, 2, f"--evidence names a folder, and {tmp_path / 'file'} is a file; name another place"),
+        (("--out", tmp_path / "folder.csv"), 2, f"--out names a file, and {tmp_path / 'folder.csv'} is a folder"),
+        ((*calibration[:-1], tmp_path / "file" / "in"), 1, "Not a directory. Name another place"),
+    ):
+        done = command.here("evaluate", "constant-velocity", *misuse, "--lake", lake.root)
+        assert (done.code, reported in " ".join(done.err.replace("│", " ").split())) == (code, True), done.err

@@ -30,10 +30,45 @@ def test_options_come_to_the_training(command, lake, models):
     assert config["training"]["seed"] == 3
     recipe = config["recipe"]
     assert (recipe["batch_size"], recipe["learning_rate"], recipe["optimizer"]) == (32, 1.0, "adam")
-    said = command.here("train", "lstm", "--lake", lake.root, "--steps", "2", "--name", "small")
+    said = command.here("train", "lstm", "--lake", lake.root, "--steps", "2", "--name", "small", "--anew")
     assert "2 steps in" in said.out
     assert "samples/s" in said.out
     assert "reading them took" in said.out
+
+
+def test_a_run_is_not_replaced_by_another_unless_that_is_said(command, lake, models):
+    small = ("--lake", lake.root, "--name", "taken")
+    first = ("train", "lstm", *small, "--steps", "2", "--set", "hidden=8")
+    assert command.here(*first).code == 0
+    written = (models / "taken" / "weights.pt").read_bytes()
+    refused = {
+        ("lstm", "--steps", "3", "--set", "hidden=8"): "steps 2 there, 3 asked for. Give the new",
+        ("lstm", "--steps", "2"): "hidden 8 there, 48 asked for. Give the new",
+        ("lstm", "--steps", "2", "--set", "hidden=8", "--seed", "1"): "seed 0 there, 1 asked for. Give the new",
+        (
+            "lstm",
+            "--epochs",
+            "1",
+            "--set",
+            "hidden=8",
+        ): "epochs not set there, 1 asked for; steps 2 there, not set asked",
+        ("v-lstm", "--steps", "2"): "model lstm there, v-lstm asked for. Give the new",
+        ("damped-velocity",): "model lstm there, damped-velocity asked for. Give the new",
+    }
+    for words, reported in refused.items():
+        done = command.here("train", *words, *small)
+        assert done.code == 2, words
+        assert reported in done.err
+        assert "another name (`--name`), or replace the old one (`--anew`)" in done.err
+    assert (models / "taken" / "weights.pt").read_bytes() == written
+    assert not [path.name for path in models.iterdir() if path.name.startswith(".taken")]
+    again = command.here(*first, "--threads", "2", "--set", "learning_rate=0.004")
+    assert again.code == 0, "the same settings, whether said or by default, train it again"
+    assert command.here("train", "damped-velocity", *small, "--anew").code == 0
+    assert json.loads((models / "taken" / "config.json").read_text())["model"] == "damped-velocity"
+    assert command.here("train", "damped-velocity", *small).code == 0
+    other = command.here("train", "damped-velocity", *small, "--set", "decay_s=2")
+    assert (other.code, "--set nothing there, decay_s=2.0 asked for" in other.err) == (2, True)
 
 
 def test_one_data_set_is_trained_and_scored_alone(command, lake, models):
@@ -96,6 +131,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
     ("arguments", "reported"),
     [
         (("foo",), "unknown model `foo`: expected one of constant-velocity"),
+        (("lstn",), "unknown model `lstn`: did you mean lstm?"),
         (("constant-velocity",), "constant-velocity does not learn"),
         (("lstm", "--name", "kalman-cv"), "kalman-cv does not learn"),
         (("damped-velocity", "--epochs", "3"), "is fitted in one pass over `train`, without --epochs; it takes --set"),

@@ -19,9 +19,10 @@ from tracklake.schemas.protocols import CSP
 from tracklake.training.data.augmentation import augment
 from tracklake.training.data.observed import Observed
 from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.loop import _load_batches, make_reader
 from tracklake.training.models import find_model
 from tracklake.training.runs.config import TrainConfig, make_plan
-from tracklake.training.train import _load_batches, make_reader, train
+from tracklake.training.train import train
 
 MIRROR = np.array([1, -1], dtype=np.float32)
 OPPOSITE = {"keep": "keep", "left": "right", "right": "left"}

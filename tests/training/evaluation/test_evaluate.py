@@ -333,7 +333,8 @@ def test_unknown_and_untrained_models(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").touch()
     with pytest.raises(
-        UnknownRunError, match=r"no run or model `cv`: expected one of the runs mine, .*constant-velocity"
+        UnknownRunError,
+        match=r"no run or model `cv` .did you mean ctrv.*: expected one of the runs mine, .*constant-velocity",
     ):
         evaluate("cv", tensors, tmp_path)
     with pytest.raises(UnknownRunError, match="no trained run; run `tracklake train lstm` first"):

@@ -11,9 +11,16 @@ from lane_tracks import CODES, MARKINGS, SHORT, open_tracks, track
 from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, random_tables
 from tensor_tables import write
 
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.lane_changes.examples import find_labelled, find_maneuvers, label_rows
+from tracklake.training.lane_changes.examples import (
+    LaneForestSettings,
+    find_labelled,
+    find_maneuvers,
+    label_rows,
+    label_samples,
+)
 
 
 def letters(folder, **settings):
@@ -178,3 +185,11 @@ def test_as_an_obvious_loop_finds_them(seed, splits, storage, markings, start_s,
         found = letters(folder, start_s=start_s, tolerance_m=tolerance_m, measured_start=measured_start)
         assert found == expected
         del folder
+
+
+def test_lane_centres_are_refused(tmp_path):
+    """A vehicle that is at one lane's centre and then at the other's has not been seen to change lanes."""
+    folder = open_tracks(tmp_path / "t", {"a": track(3, [2, 2, 2, 2, 2, 2, 6.0, 6, 6])})
+    folder.index["subsets"][0]["lateral_positions"] = "lane centres"
+    with pytest.raises(TracklakeError, match=r"lateral positions of highd/a are lane centres. .* a lake without them"):
+        label_samples(folder, None, LaneForestSettings())

@@ -126,6 +126,22 @@ def test_parameters_that_are_set_are_not_said_to_be_fitted():
     )
 
 
+def test_a_value_at_the_bound_of_the_search_is_marked():
+    """Vehicles with one speed and no noise at all: the least noise that was searched is the best."""
+    tracks = np.zeros((9, CSP.history_ticks + CSP.horizon_ticks, 2), dtype=np.float32)
+    tracks[..., 0] = np.arange(tracks.shape[1])
+    samples = Samples(tracks[:, : CSP.history_ticks], reveal(tracks[:, CSP.history_ticks :], np.random.default_rng(0)))
+    fit = fit_model(MODELS["kalman-cv"], samples, np.arange(9), {"measurement_lateral_m": 0.2})
+    assert fit.at_bounds == [
+        "acceleration_lateral_m2ps3",
+        "acceleration_longitudinal_m2ps3",
+        "measurement_longitudinal_m",
+    ]
+    assert "measurement_longitudinal_m = 0.001 (bound of the search)," in fit.describe()
+    assert "measurement_lateral_m = 0.2, set, not fitted" in fit.describe()
+    assert fit.to_dict()["at_bounds"] == fit.at_bounds
+
+
 # Runs
 
 

@@ -11,6 +11,9 @@ from lane_tracks import open_tracks, track
 from tracklake.training.data.observed import FutureInputError, ObservedScene
 from tracklake.training.models.prediction import NotFiniteError, Prediction
 from tracklake.training.plots.picture import forecast_samples, forecast_scene, take_picture
+from tracklake.training.plots.picture_drawing import describe_marks, draw_picture
+from tracklake.training.plots.picture_rows import choose_view, list_errors
+from tracklake.training.plots.sample_choice import measure_last_distance
 from tracklake.training.runs.forecasters import Forecaster, UnknownRunError, open_forecaster
 
 
@@ -63,6 +66,26 @@ def test_lanes_without_markings_are_nominal(tmp_path):
     picture = take_picture(open_moment(tmp_path, markings=None), OWN_SAMPLE, {})
     assert picture.markings_m == pytest.approx((0.0, 12 * 0.3048, 24 * 0.3048))
     assert not picture.marked
+
+
+def test_errors_across_the_road_are_unknown_where_lateral_positions_are_lane_centres(tmp_path):
+    folder = open_moment(tmp_path)
+    for subset in folder.index["subsets"]:
+        subset["lateral_positions"] = "lane centres"
+    model = sure()
+    found = forecast_samples(folder, [OWN_SAMPLE], [model])
+    picture = take_picture(folder, OWN_SAMPLE, {OWN: found[OWN_SAMPLE]})
+    assert picture.to_dict()["lane_centred"]
+    truth = [x for x, _ in places(OWN, 3, 4, 5, 6)]
+    rows = list_errors(picture)
+    assert [row["along_m"] for row in rows] == [x - true for x, true in zip((31, 42, 53, 64), truth, strict=True)]
+    assert all(row[name] is None for row in rows for name in ("distance_m", "across_m", "across_sigma_m"))
+    assert "lateral positions are lane centres" in describe_marks(picture, choose_view(picture))[0]
+    drawn = draw_picture(picture).render(".svg").decode()
+    assert "true, along the road (m)" in drawn
+    assert not any(text in drawn for text in ("true, across the road (m)", "distance from the truth (m)"))
+    (far,) = measure_last_distance(folder, np.array([OWN_SAMPLE]), model)
+    assert far == abs(64 - truth[-1])
 
 
 def test_forecasts_stand_on_the_carriageway(folder):
@@ -190,7 +213,8 @@ def test_unknown_names_are_answered_with_the_known_ones(folder, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").touch()
     with pytest.raises(
-        UnknownRunError, match=r"no run or model `cv`: expected one of the runs mine, or of .*constant-velocity"
+        UnknownRunError,
+        match=r"no run or model `cv` .did you mean ctrv.*: expected one of the runs mine, or of .*constant-velocity",
     ):
         open_forecaster("cv", folder, tmp_path, frozenset({"eval"}))
     with pytest.raises(UnknownRunError, match="run `tracklake train lstm` first"):

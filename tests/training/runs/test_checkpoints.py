@@ -238,7 +238,7 @@ def test_there_must_be_something_to_resume(tensors, tmp_path):
 def test_a_finished_run_stays_until_the_next_is_done(tensors, tmp_path):
     train("forgetful", tensors, tmp_path / "run", replace(CONFIG, epochs=1))
     with pytest.raises(TrainingInterruptedError):
-        train("forgetful", tensors, tmp_path / "run", CONFIG, stop_after(5))
+        train("forgetful", tensors, tmp_path / "run", CONFIG, stop_after(5), resume=False)
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["steps"] == 4
     assert evaluate("run", tensors, tmp_path).samples > 0
     train("forgetful", tensors, tmp_path / "run", resume=True)

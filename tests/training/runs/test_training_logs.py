@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_network import read_log, register, write_tiny
 
-import tracklake.training.train
+import tracklake.training.loop
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.models.inputs import read_on_device
@@ -23,9 +23,9 @@ def tensors(tmp_path_factory):
 def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
     losses = []
-    real = tracklake.training.train.TrainingState.count_step
+    real = tracklake.training.loop.TrainingState.count_step
     monkeypatch.setattr(
-        tracklake.training.train.TrainingState,
+        tracklake.training.loop.TrainingState,
         "count_step",
         lambda self, loss, *counts: (losses.append((loss, counts[0])), real(self, loss, *counts)),
     )
@@ -49,13 +49,13 @@ def test_the_logs_say_what_was_done(tensors, tmp_path, monkeypatch):
 
 def test_the_share_of_reading_is_measured(tensors, tmp_path, monkeypatch):
     register(monkeypatch)
-    real = tracklake.training.train.read_samples
+    real = tracklake.training.loop.read_samples
 
     def read_slowly(*given):
         time.sleep(0.1)
         return real(*given)
 
-    monkeypatch.setattr(tracklake.training.train, "read_samples", read_slowly)
+    monkeypatch.setattr(tracklake.training.loop, "read_samples", read_slowly)
     metrics = train("forgetful", tensors, tmp_path / "run", TrainConfig(steps=9, log_steps=2))
     assert 0.5 < metrics["data_share"] < 1.0
     assert 0 < metrics["samples_per_s"] < 32 / 0.1
