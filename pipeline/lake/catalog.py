@@ -125,7 +125,7 @@ def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -
 
 
 def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest) -> None:
-    """Create the views, the macros over them, and a comment on each with its meaning.
+    """Create the views and the macros over them, in one transaction: each statement in its own takes a third longer.
 
     Args:
         connection: connection to an empty database.
@@ -135,13 +135,22 @@ def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: 
     Raises:
         LakeError: a live file is missing or unreadable.
     """
+    connection.execute("SET parquet_metadata_cache = true")  # or every statement reads each file's columns again
+    connection.begin()
     for name, select in _write_selects(root, manifest).items():
         _create(connection, root, name, f'CREATE VIEW "{name}" AS {select}')
-    for table in TABLES:
-        connection.execute(f'COMMENT ON VIEW "{table.name}" IS {quote(table.meaning)}')
     for macro in MACROS:
         connection.execute(macro.statement)
-        connection.execute(f"COMMENT ON MACRO TABLE {macro.name} IS {quote(macro.meaning)}")
+    connection.commit()
+
+
+def describe_views(connection: "duckdb.DuckDBPyConnection") -> None:
+    """Comment on each view and macro with its meaning."""
+    views = (f'VIEW "{table.name}" IS {quote(table.meaning)}' for table in TABLES)
+    macros = (f"MACRO TABLE {macro.name} IS {quote(macro.meaning)}" for macro in MACROS)
+    connection.begin()
+    connection.execute(";".join(f"COMMENT ON {each}" for each in (*views, *macros)))
+    connection.commit()
 
 
 def _write_selects(root: Path, manifest: Manifest) -> dict[str, str]:

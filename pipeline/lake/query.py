@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 from tracklake.pipeline.lake.admission import admit_select, query_errors
-from tracklake.pipeline.lake.catalog import create_views, escape_pattern, quote
+from tracklake.pipeline.lake.catalog import create_views, describe_views, escape_pattern, quote
 from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.manifest import Manifest, load
@@ -117,6 +117,7 @@ def connect(lake: Path | str) -> LakeConnection:
         },
     )
     create_views(connection, root, manifest)
+    describe_views(connection)
     live = [f"{root.as_posix()}/{file.path}" for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
     allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})

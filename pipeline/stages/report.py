@@ -3,6 +3,7 @@
 import platform
 import shlex
 from dataclasses import asdict
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -143,13 +144,19 @@ def read_quality(root: Path) -> dict[str, Any]:
     file = root / REPORTS / DOCUMENT
     try:
         quality = read_json(file)
-        TypeAdapter(Quality).validate_python(quality)
+        _make_quality_type().validate_python(quality)
     except ValidationError as wrong:
         first = wrong.errors()[0]
         raise make_report_error(file, f"`{'.'.join(map(str, first['loc']))}`: {first['msg']}") from None
     except (OSError, ValueError) as broken:
         raise make_report_error(file, str(broken)) from broken
     return dict(quality)
+
+
+@cache
+def _make_quality_type() -> TypeAdapter[Quality]:
+    """Make what validates quality.json, once: that takes longer than to validate one."""
+    return TypeAdapter(Quality)
 
 
 def make_report_error(file: Path, reason: str) -> LakeError:

@@ -198,9 +198,10 @@ def _data(rows: Iterable[Row]) -> alt.InlineData:
 
 def _svg(chart: alt.Chart | alt.LayerChart | alt.FacetChart | alt.HConcatChart | alt.VConcatChart, label: str) -> str:
     """Render a chart, transparent and in the report's ink; `label` describes it in plain text of our own."""
-    styled = chart.configure(**CONFIG)
     # Rows are aggregates: a few thousand at most, but more than Altair's limit for unaggregated data.
     with alt.data_transformers.enable("default", max_rows=None):
-        svg: str = vl_convert.vegalite_to_svg(styled.to_dict(validate=False))
+        specification = chart.to_dict(validate=False)
+    specification["config"] = alt.utils.update_nested(specification["config"], CONFIG)  # configure() copies the chart
+    svg: str = vl_convert.vegalite_to_svg(specification)
     # Sizes are the style sheet's business; without a viewBox's own width and height the drawing fills its figure.
     return re.sub(r"^<svg ", f'<svg role="img" aria-label="{label}" ', svg, count=1)

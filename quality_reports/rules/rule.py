@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import polars as pl
@@ -113,13 +114,13 @@ class Rule:
         """Defaults of the thresholds by name."""
         return {threshold.name: threshold.default for threshold in self.thresholds}
 
-    @property
+    @cached_property
     def reads(self) -> tuple[str, ...]:
         """Columns of prepared entries that its expressions name, derived ones included."""
         names = self.breaks(self.defaults).meta.root_names() + self.measure(self.defaults).meta.root_names()
         return tuple(dict.fromkeys(names))
 
-    @property
+    @cached_property
     def columns(self) -> tuple[str, ...]:
         """Columns of `tracks`, `vehicles` and `subsets` that it needs; without one of them it is not checked."""
         return trace(self.reads)
