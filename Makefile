@@ -1,5 +1,5 @@
 # make run     environment, generated sample, the whole pipeline to a report
-# make test    every test
+# make test    every test, property tests with fewer examples than in `make test-thorough`
 # make test-lowest  the core's tests with the lowest versions that pyproject.toml admits
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory
@@ -15,7 +15,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 ARGS ?=
 
-.PHONY: install run test test-lowest lint bench study onboard-study docs clean
+.PHONY: install run test test-thorough test-lowest lint bench study onboard-study docs clean
 
 install: $(INSTALLED)
 
@@ -34,6 +34,9 @@ run: install
 # Bytecode is kept, whatever the environment says: tests start many commands.
 test: install
 	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadgroup $(ARGS)
+
+test-thorough: install
+	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadgroup --thorough $(ARGS)
 
 # The tests in which versions matter most: files, SQL, validation, charts, the whole pipeline (in the fixture `lake`).
 # Without torch, whose lowest version comes with 5 GB of CUDA: it was tried by hand, see pyproject.toml.

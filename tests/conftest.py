@@ -19,6 +19,7 @@ from unittest import mock
 
 import duckdb
 import pytest
+import vl_convert
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
 from object_stores import bucket as bucket
@@ -36,6 +37,21 @@ os.environ.setdefault("POLARS_MAX_THREADS", "1")
 # How fast an example is depends on what else the machine does; what is claimed about speed stands in benchmarks/.
 settings.register_profile("tracklake", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("tracklake")
+
+
+QUICK_SHARE, LEAST_EXAMPLES = 0.4, 6
+"""Share of the examples that a property test asks for which are drawn without --thorough, and the fewest drawn."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--thorough", action="store_true", help="draw all the examples that property tests ask for")
+
+
+def reduce_examples(test: Callable[..., object]) -> None:
+    """Let a property test draw fewer examples than it asks for."""
+    asked = getattr(test, "_hypothesis_internal_use_settings", settings.default)
+    fewer = max(round(QUICK_SHARE * asked.max_examples), min(asked.max_examples, LEAST_EXAMPLES))
+    test._hypothesis_internal_use_settings = settings(asked, max_examples=fewer)
 
 
 @dataclass(frozen=True)
@@ -226,6 +242,28 @@ def plain_flows() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def convert_once() -> Iterator[Callable[[dict], str]]:
+    """Convert every chart of this process once: many lakes and tests have the same, at half a second each."""
+    convert, converted = vl_convert.vegalite_to_svg, {}
+
+    def look_up(spec: dict) -> str:
+        key = json.dumps(spec, default=str)
+        if key not in converted:
+            converted[key] = convert(spec)
+        return converted[key]
+
+    with mock.patch("vl_convert.vegalite_to_svg", look_up):
+        yield convert
+
+
+@pytest.fixture
+def convert_again(convert_once: Callable[[dict], str]) -> Iterator[None]:
+    """Convert every chart as often as it is drawn: for tests that compare what is drawn twice."""
+    with mock.patch("vl_convert.vegalite_to_svg", convert_once):
+        yield
+
+
 @pytest.fixture(scope="module")
 def empty_charts() -> Iterator[None]:
     """Charts of this process show nothing: for tests of something else, which would spend half their time on them."""
@@ -290,7 +328,10 @@ def choose_group(item: pytest.Item) -> str:
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--thorough"):
+        for test in {item.obj for item in items if getattr(getattr(item, "obj", None), "is_hypothesis_test", False)}:
+            reduce_examples(test)
     for item in items:
         item.add_marker(pytest.mark.xdist_group(choose_group(item)))
     # A server costs a tenth of a processor while it waits: the files that need it come last.
@@ -308,6 +349,16 @@ def one_duckdb_thread() -> Iterator[None]:
 
     with mock.patch.object(duckdb, "connect", connect_with_one):
         yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Import all tests without garbage collections, which would find nothing and look through all modules each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_collection_finish() -> None:

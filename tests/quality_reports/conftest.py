@@ -1,6 +1,5 @@
 """Lakes in memory: DuckDB views named and shaped like the catalog's, over hand-made Polars frames."""
 
-import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import duckdb
 import polars as pl
 import pytest
-import vl_convert
 from known_drive import make_drive
 
 from tracklake.pipeline.lake.macros import MACROS
@@ -23,25 +21,6 @@ JOINED = {
     VEHICLES.name: (VEHICLE_STARTS.name, ("dataset", "subset", "vehicle_id")),
     SUBSETS.name: (SUBSET_STATUS.name, ("dataset", "subset")),
 }
-
-
-convert = vl_convert.vegalite_to_svg
-converted: dict[str, str] = {}
-"""SVGs by the specification they were made of: many tests draw the same charts, at half a second each."""
-
-
-@pytest.fixture(autouse=True)
-def convert_once(request, monkeypatch) -> None:
-    """Convert every chart once, but where a test compares what is drawn twice."""
-
-    def look_up(spec: dict) -> str:
-        key = json.dumps(spec, sort_keys=True)
-        if key not in converted:
-            converted[key] = convert(spec)
-        return converted[key]
-
-    if "same_bytes" not in request.node.name:
-        monkeypatch.setattr(vl_convert, "vegalite_to_svg", look_up)
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import pytest
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterId
 from prefect.client.schemas.sorting import FlowRunSort
+from prefect.settings import PREFECT_API_URL, temporary_settings
 from small_recordings import write_highd
 
 from tracklake.pipeline.lake import load
@@ -83,7 +84,8 @@ def test_a_scheduled_run_on_a_changed_folder(command, tmp_path):
 
 
 def test_serve_says_what_it_misses(command):
-    alone = command.alone("serve")
+    with temporary_settings({PREFECT_API_URL: None}):
+        alone = command.here("serve")
     assert (alone.code, "PREFECT_API_URL is not set" in alone.err) == (1, True)
     for wrong, words in [
         (("--cron", "0 3 * * *"), "need SOURCE"),

@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from pathlib import Path
@@ -14,6 +15,7 @@ from unittest.mock import Mock
 
 import httpx
 import pytest
+from plain_flows import replace_prefect
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.client.schemas.sorting import ArtifactSort, FlowRunSort
@@ -205,13 +207,14 @@ def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(raw, t
 
 
 @pytest.fixture
-def searches(monkeypatch) -> tuple[Mock, Mock]:
-    """Counts how often the source was searched, and compared with the lake."""
+def searches(monkeypatch) -> Iterator[tuple[Mock, Mock]]:
+    """Counts how often the source was searched, and compared with the lake; Prefect has no part in that."""
     discover, plan = Mock(wraps=run_plan.discover), Mock(wraps=run_plan.plan_ingest)
     monkeypatch.setattr(run_plan, "discover", discover)
     for user in (run_plan, tasks):
         monkeypatch.setattr(user, "plan_ingest", plan)
-    return discover, plan
+    with replace_prefect():
+        yield discover, plan
 
 
 def count_calls(mocks: tuple[Mock, Mock]) -> tuple[int, ...]:

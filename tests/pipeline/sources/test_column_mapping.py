@@ -150,7 +150,7 @@ def test_a_mapping_that_cannot_be_is_refused(tmp_path, text, reason):
         load_mapping(tmp_path / "absent.toml")
 
 
-@pytest.mark.usefixtures("prefect_here")
+@pytest.mark.usefixtures("plain_flows")
 def test_the_command(command, tmp_path):
     write(tmp_path / "raw" / "drive.csv", drive().write_csv().encode())
     (example,) = re.findall(r"```toml\n# mapping\.toml\n(.*?)```", DOCS.read_text(), flags=re.DOTALL)

@@ -280,6 +280,7 @@ def test_quality_json_is_strict_and_says_what_it_is(report):
     assert read["schema"] == QUALITY_SCHEMA == "tracklake/quality/1"
 
 
+@pytest.mark.usefixtures("convert_again")
 def test_the_same_lake_gives_the_same_bytes(open_lake, small_lake):
     one, two = (build_report(open_lake(**small_lake), {}) for _ in range(2))
     reversed_rows = build_report(open_lake(**{name: rows[::-1] for name, rows in small_lake.items()}), {})

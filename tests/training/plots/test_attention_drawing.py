@@ -123,16 +123,21 @@ def test_what_is_drawn_of_a_head(shown):
     assert (top, bottom) == pytest.approx((-6 - 2.5, 2 + 2.5))  # the markings at 0, 4 and 8 m, the ego at 6 m
 
 
+@pytest.mark.usefixtures("convert_again")
+def test_the_same_map_gives_the_same_bytes(shown):
+    assert draw_attention(shown).render(".svg") == draw_attention(shown).render(".svg")
+
+
 def test_drawings_name_every_head_and_fetch_nothing(folder, shown, tmp_path):
-    svg = draw_attention(shown).render(".svg").decode()
-    assert draw_attention(shown).render(".svg").decode() == svg, "the same bytes"
+    drawn = draw_attention(shown)
+    svg = drawn.render(".svg").decode()
     assert not re.search(r"(href|src|@import|url\()[^>]*http", svg)
     for words in ("head 1", "head 2", "vehicle 1 of highd b", "encoder: vehicles", "decoder: vehicles", "2 (50%)"):
         assert words in svg
     drawing, _ = export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path)
     assert drawing.read_text() == svg
-    assert draw_attention(shown).render(".png").startswith(b"\x89PNG")
-    assert len(draw_attention(shown).to_vega_lite()["datasets"]["weights"]) == HEADS * (9 + 6 + 9)
+    assert drawn.render(".png").startswith(b"\x89PNG")
+    assert len(drawn.to_vega_lite()["datasets"]["weights"]) == HEADS * (9 + 6 + 9)
 
 
 @pytest.mark.parametrize("markings", [(0.0, 4.0, 8.0), None])

@@ -86,6 +86,7 @@ def test_the_svg_says_what_is_drawn_and_fetches_nothing(svg):
     assert svg.count("http") == svg.count("http://www.w3.org/"), "names of XML, no addresses"
 
 
+@pytest.mark.usefixtures("convert_again")
 def test_the_same_picture_gives_the_same_bytes(picture, svg):
     assert draw_picture(picture).render(".SVG").decode() == svg
     assert 'id="clip0"' in svg
