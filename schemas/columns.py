@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
-Dataset = Literal["ngsim", "highd", "custom", "v2v"]
+Dataset = Literal["ngsim", "highd", "tgsim", "custom", "v2v"]
 DATASETS: tuple[Dataset, ...] = get_args(Dataset)
 Origin = Literal["recorded", "synthetic"]
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
@@ -47,6 +47,7 @@ class Column:
         le: greatest value.
         lt: bound that a value stays under.
         isin: the only values.
+        added: whether files of earlier lakes of the same schema version lack the column, which then is null.
     """
 
     dtype: DType
@@ -59,6 +60,7 @@ class Column:
     le: float | None = None
     lt: float | None = None
     isin: tuple[str, ...] | None = None
+    added: bool = False
 
     @property
     def comment(self) -> str:
@@ -103,7 +105,7 @@ BOUNDS: Mapping[str, tuple[Callable[[pl.Expr, Any], pl.Expr], str]] = {
 
 column = Column
 
-DATASET = column(pl.String, "ngsim, highd, custom (read with --columns), or v2v (drives)", isin=DATASETS)
+DATASET = column(pl.String, "ngsim, highd, tgsim, custom (read with --columns), or v2v (drives)", isin=DATASETS)
 SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording; v2v: one drive")
 PLACE = {"dataset": DATASET, "subset": SUBSET}
 """Columns that say where a row belongs, the folders of most tables."""
@@ -177,6 +179,11 @@ class Table:
     def required(self) -> frozenset[str]:
         """Columns in which null is no legal value."""
         return frozenset(name for name, declared in self.columns.items() if not declared.nullable)
+
+    @cached_property
+    def added(self) -> dict[str, pl.DataType]:
+        """Columns that files of earlier lakes lack, and their dtypes."""
+        return {name: self.dtypes[name] for name, declared in self.columns.items() if declared.added}
 
     def empty(self) -> pl.DataFrame:
         """Return a frame without rows."""

@@ -53,6 +53,14 @@ NGSIM = Reference(
     "the data set, its units and meanings",
     doi="10.21949/1504477",
 )
+TGSIM = Reference(
+    "Ammourah et al. (2024)",
+    "Ammourah, R., Beigi, P., Fan, B., Hamdar, S. H., Hourdos, J., Hsiao, C.-C., James, R., Khajeh-Hosseini, M., "
+    "Mahmassani, H. S., Monzer, D., Radvand, T., Talebpour, A., Yousefi, M., Zhang, Y. (2024). Introduction to the "
+    "Third Generation Simulation Dataset: Data Collection and Trajectory Extraction. Transportation Research Record.",
+    "the TGSIM data set, its units and meanings",
+    doi="10.1177/03611981241257257",
+)
 KRAJEWSKI = Reference(
     "Krajewski et al. (2018)",
     "Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset: A Drone Dataset of Naturalistic "
@@ -219,7 +227,7 @@ DAGANZO = Reference(
 )
 
 REFERENCES = (
-    *(HAMALAINEN, NGSIM, KRAJEWSKI, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
+    *(HAMALAINEN, NGSIM, KRAJEWSKI, TGSIM, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
     *(GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER, GETTMAN),
     *(RAKHA, RAJAMANI, DAGANZO),
 )

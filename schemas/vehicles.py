@@ -15,6 +15,13 @@ VEHICLES = Table(
         "class": column(
             pl.String, "car, truck or motorcycle; null where the source has none", nullable=True, isin=VEHICLE_CLASSES
         ),
+        "automated": column(
+            pl.Boolean,
+            "whether it is one of the source's automated vehicles (TGSIM: with adaptive cruise control or more); null "
+            "where the source does not say",
+            nullable=True,
+            added=True,
+        ),
         "length_m": column(pl.Float32, "along the direction of travel", unit="m", nullable=True, ge=0, le=100),
         "width_m": column(pl.Float32, "across the direction of travel", unit="m", nullable=True, ge=0, le=20),
         "length_range_m": column(

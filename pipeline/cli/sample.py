@@ -16,7 +16,8 @@ from tracklake.pipeline.synthetic import UNIFORM
 def sample(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
     format: Annotated[
-        list[str] | None, typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives; repeatable.")
+        list[str] | None,
+        typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives, tgsim; repeatable."),
     ] = None,
     noise: Annotated[
         list[str] | None,

@@ -111,7 +111,7 @@ def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
         if contents is None:
             continue
         for recording in contents["recordings"]:
-            by_recording.setdefault((source.name, recording), []).append(unit.files[0])
+            by_recording.setdefault((source.name, recording), []).extend(unit.files)
         if contents["unassigned"]:
             jobs.append(_make_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
     jobs += [_make_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
@@ -186,9 +186,10 @@ def list_files(job: Job) -> list[RawFile]:
     return [RawFile.from_dict(file) for file in job.inputs["files"]]
 
 
-def needs_spill(job: Job) -> bool:
-    """Return whether the job's files must have been read into the staging folder first."""
-    return SOURCE_BY_NAME[job.inputs["dataset"]].spill is not None
+def list_spilled(job: Job) -> list[RawFile]:
+    """Return the raw files of an ingest job that must have been read into the staging folder first."""
+    source = SOURCE_BY_NAME[job.inputs["dataset"]]
+    return [] if source.spill is None else [file for file in list_files(job) if file.dialect not in source.beside]
 
 
 def build(root: Path, job: Job) -> Commit:
@@ -201,8 +202,9 @@ def build(root: Path, job: Job) -> Commit:
     recording, files = job.inputs["recording"], list_files(job)
     if recording is None:
         tables, info = _build_unassigned(root, job, files[0])
-    elif needs_spill(job):
-        tables, info = _build_recording(root, job, [_open_spilled(root, file, recording) for file in files])
+    elif spilled := list_spilled(job):
+        parts = [_open_spilled(root, file, recording) if file in spilled else Part(file) for file in files]
+        tables, info = _build_recording(root, job, parts)
     else:
         with MEMORY_BUDGET.reserve(sum(map(measure_unpacked, files))):
             tables, info = _build_recording(root, job, [Part(file) for file in files])
@@ -264,7 +266,7 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
         f"{file.name}: exactly {SPREADSHEET_ROWS:,} rows, a spreadsheet's limit: probably TRUNCATED. Compare with the "
         "publisher's count and download the file again."
         for file in files
-        if rows[file.sha256] == SPREADSHEET_ROWS
+        if rows.get(file.sha256) == SPREADSHEET_ROWS
     ]
 
 

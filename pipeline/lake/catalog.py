@@ -106,13 +106,20 @@ def _write_read(table: Table, manifest: Manifest, locate: Callable[[str], str]) 
     # Qualified, as a macro's parameter takes the place of every other name like it.
     columns = ", ".join(f'file."{name}"' for name in table.dtypes)
     if not table.partition:
-        return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], hive_partitioning = false) AS file"
+        return f"SELECT {columns} FROM {_read_files(table, files, 'hive_partitioning = false')} AS file"
     if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
         # A folder above the lake looks like a partition, and DuckDB would believe it.
         return " UNION ALL ".join(_write_read_of_file(table, path, locate) for path in paths)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
     options = f"hive_partitioning = true, hive_types = {{{types}}}"
-    return f"SELECT {columns} FROM read_parquet([{', '.join(files)}], {options}) AS file"
+    return f"SELECT {columns} FROM {_read_files(table, files, options)} AS file"
+
+
+def _read_files(table: Table, files: list[str], options: str) -> str:
+    """Return what reads files given as literals, with null for columns that files of earlier lakes lack."""
+    read = f"read_parquet([{', '.join(files)}], {options}{', union_by_name = true' if table.added else ''})"
+    nothing = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.added.items())
+    return f"(SELECT {nothing} WHERE false UNION ALL BY NAME SELECT * FROM {read})" if nothing else read
 
 
 def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
@@ -121,7 +128,7 @@ def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -
         f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'file."{name}"'
         for name, dtype in table.dtypes.items()
     )
-    return f"SELECT {columns} FROM read_parquet([{quote(locate(path))}], hive_partitioning = false) AS file"
+    return f"SELECT {columns} FROM {_read_files(table, [quote(locate(path))], 'hive_partitioning = false')} AS file"
 
 
 def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest) -> None:

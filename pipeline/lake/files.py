@@ -8,6 +8,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from typing import Any
 from urllib.parse import quote, unquote
 
 import polars as pl
@@ -279,8 +280,10 @@ def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.Lazy
             by_values.setdefault(tuple(stated.items()), []).append(root / file.path)
     if not by_values:
         return table.empty().lazy()
+    stored = {name: dtype for name, dtype in table.dtypes.items() if name not in table.partition}
+    options: dict[str, Any] = {"schema": stored, "missing_columns": "insert"} if table.added else {}
     return pl.concat(
-        pl.scan_parquet(paths, hive_partitioning=False, glob=False)
+        pl.scan_parquet(paths, hive_partitioning=False, glob=False, **options)
         .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in stated)
         .select(*table.dtypes)
         for stated, paths in by_values.items()

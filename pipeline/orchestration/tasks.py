@@ -153,8 +153,7 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
     needed = {
         file.sha256: (job.inputs["dataset"], file)
         for job in plan.jobs
-        if ingest.needs_spill(job)
-        for file in ingest.list_files(job)
+        for file in ingest.list_spilled(job)
         if not ingest.locate_spill(writer.root, file).exists()
     }
     _read_all(writer, needed, request, result)

@@ -4,8 +4,9 @@ from tracklake.pipeline.sources.custom import CUSTOM
 from tracklake.pipeline.sources.highd import HIGHD
 from tracklake.pipeline.sources.ngsim import NGSIM
 from tracklake.pipeline.sources.source import RawFile, Source, SourceError
+from tracklake.pipeline.sources.tgsim import TGSIM
 from tracklake.pipeline.sources.v2v.source import V2V
 
-SOURCES: tuple[Source, ...] = (HIGHD, V2V, NGSIM, CUSTOM)
+SOURCES: tuple[Source, ...] = (HIGHD, V2V, TGSIM, NGSIM, CUSTOM)
 
 __all__ = ["SOURCES", "RawFile", "Source", "SourceError"]

@@ -9,6 +9,7 @@ from tracklake.pipeline.sources.source import RawFile, Subset
 from tracklake.pipeline.transforms.tracks.flow import compute_flow
 from tracklake.pipeline.transforms.tracks.gaps import add_gaps
 from tracklake.pipeline.transforms.tracks.kinematics import add_kinematics, central_difference
+from tracklake.pipeline.transforms.tracks.leaders import derive_leaders
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import Dataset
 
@@ -25,24 +26,25 @@ def assemble_subset(
 ) -> Subset:
     """Compute the derived columns of oriented entries and cast everything to the schemas.
 
-    `entries` are sorted by vehicle_id, frame and have x_m, y_m, lane, speed_mps, accel_mps2, leader_id, follower_id,
-    headway_recorded_m, and lateral_speed_mps if the source has it; `sizes` have source_vehicle_id, class, length_m,
-    width_m, entries_announced per vehicle_id, and length_range_m, width_range_m if rows have sizes; `facts` are the
-    columns of SUBSETS that do not follow from these. For `use_recorded_headway` see `add_gaps`.
+    `entries` are sorted by vehicle_id, frame and have x_m, y_m, lane, speed_mps, accel_mps2, and if the source has them
+    leader_id, follower_id (else derived), headway_recorded_m, heading_rad, lateral_speed_mps; `sizes` have
+    source_vehicle_id, class, length_m, width_m, entries_announced per vehicle_id, and if the source has them
+    length_range_m, width_range_m, automated; `facts` are the columns of SUBSETS that do not follow from these. For
+    `use_recorded_headway` see `add_gaps`.
     """
     rate_hz, first_frame = facts["frame_rate_hz"], facts["first_frame"]
     entries = add_kinematics(entries, rate_hz).with_columns(
         dataset=pl.lit(dataset), subset=pl.lit(name), time_s=(pl.col("frame") - first_frame) / rate_hz
     )
-    if "heading_rad" not in entries.columns:
-        entries = entries.with_columns(heading_rad=pl.lit(None, pl.Float32))
+    if "leader_id" not in entries.columns:
+        entries = derive_leaders(entries)
+    entries = _add_absent(entries, "heading_rad", "headway_recorded_m")
     if "lateral_speed_mps" not in entries.columns:
         entries = entries.with_columns(lateral_speed_mps=central_difference("y_m", rate_hz))
     entries = add_gaps(entries, sizes, use_recorded_headway=use_recorded_headway)
     tracks = entries.lazy().pipe(TRACKS.conform).collect()
     del entries
-    if "length_range_m" not in sizes.columns:
-        sizes = sizes.with_columns(length_range_m=pl.lit(None, pl.Float32), width_range_m=pl.lit(None, pl.Float32))
+    sizes = _add_absent(sizes, "length_range_m", "width_range_m", "automated")
     vehicles = _summarise_vehicles(tracks).join(sizes, on="vehicle_id", how="left", maintain_order="left")
     vehicles = (
         vehicles.with_columns(dataset=pl.lit(dataset), subset=pl.lit(name)).lazy().pipe(VEHICLES.conform).collect()
@@ -62,6 +64,11 @@ def assemble_subset(
         "source_files": [{"file": file.name, "sha256": file.sha256} for file in files],
     }
     return Subset(name, tracks, vehicles, pl.DataFrame([row], schema=SUBSETS.dtypes))
+
+
+def _add_absent(frame: pl.DataFrame, *names: str) -> pl.DataFrame:
+    """Add columns that the source does not have, without values."""
+    return frame.with_columns(pl.lit(None).alias(name) for name in names if name not in frame.columns)
 
 
 def _summarise_vehicles(tracks: pl.DataFrame) -> pl.DataFrame:

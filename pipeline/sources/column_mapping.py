@@ -77,8 +77,8 @@ class ColumnMapping(BaseModel):
 
     @model_validator(mode="after")
     def _check_dataset(self) -> "ColumnMapping":
-        if self.dataset == "highd":
-            raise ValueError("expected the dataset ngsim or custom; highD's three files need no mapping")
+        if self.dataset not in ("ngsim", "custom"):
+            raise ValueError("expected the dataset ngsim or custom; the files of others need no mapping")
         if self.dataset == "ngsim" and self.rate_hz != NGSIM_RATE_HZ:
             raise ValueError(f"expected rate_hz {NGSIM_RATE_HZ:g} for the dataset ngsim; leave `dataset` out")
         return self

@@ -35,6 +35,7 @@ from tracklake.pipeline.sources.source import (
     Subset,
     Unit,
 )
+from tracklake.pipeline.sources.spill import spill_rows
 from tracklake.pipeline.transforms.tracks.identities import identify_vehicles
 from tracklake.pipeline.transforms.tracks.orientation import DIRECTIONS, orient_ngsim
 from tracklake.schemas import references
@@ -93,15 +94,9 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
     own_name = None if _tells_recordings(heading, mapping) else name_file(file, mapping.site if mapping else None)
 
     def spill_chunk(number: int, chunk: Chunk) -> tuple[Counter[str], pl.DataFrame, int]:
-        counts: Counter[str] = Counter()
         raw = RAW_NGSIM.validate(_to_raw(chunk.frame, heading), where=file.name)
         parts = _split_recordings(raw) if own_name is None else [(own_name, raw.drop("Location"))]
-        for share, (recording, rows) in enumerate(parts):
-            counts[recording] += rows.height
-            target = folder / recording
-            target.mkdir(parents=True, exist_ok=True)
-            # Plain Arrow takes a quarter of the time of compressed Parquet; the files are deleted after the run.
-            rows.write_ipc(target / f"{number:06d}-{share:06d}.arrow", compression="uncompressed")
+        counts = spill_rows(folder, number, parts)
         _require_constant_keys(counts, file)
         return counts, chunk.rejects, chunk.rows_read
 

@@ -166,6 +166,7 @@ class Source:
         to_canonical: function of the parts of one recording and its name; returns its tables.
         spill: function that reads a file of several recordings into a staging folder, a folder per recording.
         lacking: words for a recording of which no row can be used.
+        beside: dialects of files that hold no recordings and describe those of the first file of their unit.
     """
 
     name: Dataset
@@ -179,3 +180,4 @@ class Source:
     to_canonical: Callable[[Sequence[Part], str], Canonical]
     spill: Callable[[RawFile, Path], Spilled] | None = None
     lacking: str = "no carriageway has entries"
+    beside: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.build import README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
+from tracklake.pipeline.synthetic.build import PLAIN, README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
 from tracklake.pipeline.synthetic.drivers import TRAFFICS, UNIFORM
 from tracklake.pipeline.synthetic.noise import NOISE_MODELS, SMOOTH
 from tracklake.pipeline.synthetic.scenarios import (
@@ -127,6 +127,8 @@ def _read_dose(defect: str | None, dose: float | None, formats: tuple[str, ...])
         raise UsageError(f"defect: expected one of {', '.join(DOSED)}, got {defect}")
     if not 0 <= dose <= 1:
         raise UsageError(f"dose: expected a share of the vehicles from 0 to 1, got {dose}")
+    if plain := [name for name in formats if name in PLAIN]:
+        raise UsageError(f"{', '.join(plain)}: generated without defects; leave --defect out, or choose other formats")
     if set(formats) <= {DRIVES}:
         raise UsageError(
             f"{defect}: drives do not have it by dose; add --format highd, or another of overhead recordings"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
-from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, true_tracks, truth
+from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, tgsim, true_tracks, truth
 from tracklake.pipeline.synthetic.drivers import UNIFORM
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.scenarios import (
@@ -21,11 +21,11 @@ from tracklake.pipeline.synthetic.scenarios import (
     NGSIM_CSV,
     NGSIM_SOCRATA,
     NGSIM_TEXT,
+    TGSIM,
     Dose,
     HighdScenario,
+    Job,
     NgsimScenario,
-    Road,
-    Traffic,
     plan_dose,
 )
 from tracklake.pipeline.synthetic.sumo import find_sumo, simulate, stop_programs
@@ -35,34 +35,23 @@ AT_ONCE = 2
 STOP_POLL_S = 0.05
 """Time between two attempts to end what is still simulated, in seconds."""
 BOM = b"\xef\xbb\xbf"
+PLAIN = {TGSIM: tgsim}
+"""Writers of formats that are generated without defects."""
 TRUTH_FILE, TRUE_TRACKS_FILE = "truth.parquet", "true_tracks.parquet"
 README_FILE = "README.md"
 README = """# A generated sample
 
-These files have the raw formats of highD and NGSIM, but were not recorded: SUMO simulated the traffic, and tracking
+These files have raw formats of publishers, but were not recorded: SUMO simulated the traffic, and tracking
 noise and known defects were added. `tracklake sample` wrote them (seed {seed}, {minutes:g} minutes, {noise}).
 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
 - `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
+- files of TGSIM, if asked for: its two dialects, without defects.
 - `drive-1`, `drive-2`: what two cars of recording 02 would have logged as instrumented vehicles, each with `truth.csv`.
 - `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
 - `true_tracks.parquet`: where every vehicle truly was, without noise and defects, in the frame of the lake's `tracks`.
 """
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One subset: its file, and the carriageway to simulate; `index` is part of its random seed."""
-
-    dataset: str
-    recording: str
-    subset: str
-    file: str
-    index: int
-    road: Road
-    traffic: Traffic
-    frames: int
 
 
 def build_sample(
@@ -91,10 +80,10 @@ def build_sample(
         if kind in formats
     ]
     driven = DRIVES in formats
-    jobs = [
-        replace(job, traffic=replace(job.traffic, drivers=traffic))
-        for job in _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
-    ]
+    plain = {name: PLAIN[name].list_jobs(minutes) for name in formats if name in PLAIN}
+    listed = _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
+    listed += [job for own in plain.values() for job in own]
+    jobs = [replace(job, traffic=replace(job.traffic, drivers=traffic)) for job in listed]
     progress(f"simulating {len(jobs)} carriageways")
     clean = _simulate_all(home, jobs, seed, progress)
     if dose is not None:
@@ -119,6 +108,11 @@ def build_sample(
         true += [_find_true_tracks(job, numbered[job.subset], found) for job in of_file]
         names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
         truth.read_ngsim(folder / file, names, found)
+    for name, own in plain.items():
+        progress(f"writing {name}")
+        noisy = {job.subset: _add_noise(clean[job.subset], job, seed, noise) for job in own}
+        found.files += PLAIN[name].write_files(folder, noisy)
+        rows += [row for job in own for row in _list_first_frames(clean[job.subset], job)]
     for drive in drives.SCENARIOS if driven else ():
         progress(f"writing {drive.folder}")
         pair = _list_pair(jobs, drives.RECORDING)
@@ -139,10 +133,11 @@ def build_sample(
     (folder / README_FILE).write_text(text, encoding="utf-8")
     lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
     count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
+    count += len({job.recording for own in plain.values() for job in own})
     return lines, count + driven * len(drives.SCENARIOS), _find_share(rows) if dose is not None else None
 
 
-def _measure_dose(dose: Dose, jobs: list[_Job], rows: list[dict[str, object]]) -> list[dict[str, object]]:
+def _measure_dose(dose: Dose, jobs: list[Job], rows: list[dict[str, object]]) -> list[dict[str, object]]:
     """Measure the dose reached in each subset, by the rows of truth about its vehicles and defects."""
     table = truth.build_truth(rows)
     measured = []
@@ -173,14 +168,14 @@ def _find_driven() -> tuple[HighdScenario, ...]:
     return tuple(scenario for scenario in HIGHD if scenario.recording == drives.RECORDING)
 
 
-def _list_pair(jobs: list[_Job], recording: str) -> list[_Job]:
+def _list_pair(jobs: list[Job], recording: str) -> list[Job]:
     """Return both carriageways of a recording in highD's format."""
     return [job for job in jobs if job.dataset == "highd" and job.recording == recording]
 
 
 def _list_jobs(
     recordings: tuple[HighdScenario, ...], groups: list[tuple[str, str, tuple[NgsimScenario, ...]]], minutes: float
-) -> list[_Job]:
+) -> list[Job]:
     jobs = []
     for place, scenario in enumerate(HIGHD):
         if scenario not in recordings:
@@ -189,18 +184,18 @@ def _list_jobs(
         for side, traffic in (("upper", scenario.upper), ("lower", scenario.lower)):
             name, index = scenario.recording, 2 * place + (side == "lower")
             file = f"{name}_tracks.csv"
-            jobs.append(_Job("highd", name, f"{name}-{side}", file, index, scenario.road, traffic, frames))
+            jobs.append(Job("highd", name, f"{name}-{side}", file, index, scenario.road, traffic, frames))
     order = {each.start_time: 100 + i for i, each in enumerate(NGSIM_TEXT + NGSIM_SOCRATA + NGSIM_CSV)}
     for _, file, scenarios in groups:
         for each in scenarios:
             frames = max(1, round(each.share * minutes * 60 * FREEWAY.rate_hz))
             name = ngsim.name_recording(each.start_time)
-            jobs.append(_Job("ngsim", name, name, file, order[each.start_time], FREEWAY, each.traffic, frames))
+            jobs.append(Job("ngsim", name, name, file, order[each.start_time], FREEWAY, each.traffic, frames))
     return jobs
 
 
-def _simulate_all(home: Path, jobs: list[_Job], seed: int, progress: Callable[[str], None]) -> dict[str, pl.DataFrame]:
-    def simulate_job(job: _Job, folder: Path) -> pl.DataFrame:
+def _simulate_all(home: Path, jobs: list[Job], seed: int, progress: Callable[[str], None]) -> dict[str, pl.DataFrame]:
+    def simulate_job(job: Job, folder: Path) -> pl.DataFrame:
         own_folder = folder / job.subset
         own_folder.mkdir()
         # SUMO's seed is a non-negative 32-bit number.
@@ -229,7 +224,7 @@ def _stop(simulations: Collection[Future[pl.DataFrame]]) -> None:
         stop_programs()
 
 
-def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
+def _list_first_frames(tracks: pl.DataFrame, job: Job) -> list[dict[str, object]]:
     firsts = tracks.group_by("vehicle", maintain_order=True).agg(
         pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"), pl.len(), pl.col("x").first()
     )
@@ -244,7 +239,7 @@ def _list_first_frames(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object
 
 
 def _damage_tracks(
-    tracks: pl.DataFrame, job: _Job, seed: int, noise: tuple[str, ...], next_vehicle: int | None = None
+    tracks: pl.DataFrame, job: Job, seed: int, noise: tuple[str, ...], next_vehicle: int | None = None
 ) -> tuple[pl.DataFrame, list[dict[str, object]]]:
     """Add noise and defects; also return the truth about them. `next_vehicle` is the first unused id."""
     random = np.random.default_rng([seed, job.index, 1])
@@ -270,7 +265,7 @@ def _damage_tracks(
     return injected.tracks, _list_first_frames(tracks, job) + _list_lane_changes(tracks, job) + declared
 
 
-def _list_lane_changes(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object]]:
+def _list_lane_changes(tracks: pl.DataFrame, job: Job) -> list[dict[str, object]]:
     changes = tracks.drop_nulls("change_begin").select("vehicle", "change_begin", "change_end", "change_side").unique()
     return [
         {
@@ -280,6 +275,10 @@ def _list_lane_changes(tracks: pl.DataFrame, job: _Job) -> list[dict[str, object
         }
         for vehicle, begin, end, side in changes.sort("vehicle", "change_begin").iter_rows()
     ]  # fmt: skip
+
+
+def _add_noise(tracks: pl.DataFrame, job: Job, seed: int, noise: tuple[str, ...]) -> pl.DataFrame:
+    return add_noise(tracks, job.road, MAST, noise, np.random.default_rng([seed, job.index, 1]))
 
 
 def _list_line_defects(
@@ -294,7 +293,7 @@ def _list_line_defects(
     ]  # fmt: skip
 
 
-def _number_vehicles(pair: list[_Job], clean: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+def _number_vehicles(pair: list[Job], clean: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     """Return tracks by subset under the ids of highD's files, which count over both carriageways by first frame."""
     both = [clean[job.subset].with_columns(side=pl.lit(i)) for i, job in enumerate(pair)]
     numbered = (
@@ -315,7 +314,7 @@ def _number_vehicles(pair: list[_Job], clean: dict[str, pl.DataFrame]) -> dict[s
 
 
 def _shift_vehicles(
-    scenarios: tuple[NgsimScenario, ...], jobs: list[_Job], clean: dict[str, pl.DataFrame]
+    scenarios: tuple[NgsimScenario, ...], jobs: list[Job], clean: dict[str, pl.DataFrame]
 ) -> dict[str, pl.DataFrame]:
     """Return tracks by subset under the ids of an NGSIM file."""
     return {
@@ -324,7 +323,7 @@ def _shift_vehicles(
     }
 
 
-def _find_true_tracks(job: _Job, tracks: pl.DataFrame, found: truth.Found) -> pl.DataFrame:
+def _find_true_tracks(job: Job, tracks: pl.DataFrame, found: truth.Found) -> pl.DataFrame:
     """Find a subset's true tracks by its simulated ones under the file's ids, and by its file, read back."""
     # On the upper carriageway x_m counts from the hindmost recorded position.
     counted = job.subset.endswith("-upper")
@@ -339,7 +338,7 @@ def _find_true_tracks(job: _Job, tracks: pl.DataFrame, found: truth.Found) -> pl
 def _write_highd(
     folder: Path,
     scenario: HighdScenario,
-    pair: list[_Job],
+    pair: list[Job],
     tracks: dict[str, pl.DataFrame],
     seed: int,
     noise: tuple[str, ...],
@@ -368,7 +367,7 @@ def _write_ngsim(
     kind: str,
     file: str,
     scenarios: tuple[NgsimScenario, ...],
-    jobs: list[_Job],
+    jobs: list[Job],
     tracks: dict[str, pl.DataFrame],
     seed: int,
     noise: tuple[str, ...],

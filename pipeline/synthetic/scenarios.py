@@ -7,7 +7,9 @@ from tracklake.pipeline.synthetic.drivers import UNIFORM
 
 DRIVES = "drives"
 """Format of instrumented vehicles: a folder of logs each."""
-FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES)
+TGSIM = "tgsim"
+"""Format of TGSIM's freeway sites."""
+FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES, TGSIM)
 """Raw formats that the generator writes."""
 DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata", DRIVES)
 """Formats of a sample, unless set."""
@@ -160,6 +162,20 @@ class NgsimScenario:
     first_vehicle_id: int
     share: float
     traffic: Traffic
+
+
+@dataclass(frozen=True)
+class Job:
+    """One subset: its file, and the carriageway to simulate; `index` is part of its random seed."""
+
+    dataset: str
+    recording: str
+    subset: str
+    file: str
+    index: int
+    road: Road
+    traffic: Traffic
+    frames: int
 
 
 TWO_LANES = Road(lanes=2, lane_width_m=3.75, window_m=420.0, rate_hz=25.0, limit_mps=34.0)

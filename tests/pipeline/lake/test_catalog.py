@@ -24,7 +24,7 @@ from tracklake.pipeline.lake import (
 )
 from tracklake.pipeline.lake.errors import DamagedFileError
 from tracklake.pipeline.lake.lake import open_lake
-from tracklake.schemas import SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS
+from tracklake.schemas import SPLITS, SUBSET_STATUS, TABLES, VEHICLE_STARTS, VEHICLES
 from tracklake.schemas import SUBSETS as SUBSETS_TABLE
 from tracklake.schemas.errors import FileAccessError
 
@@ -169,6 +169,35 @@ def test_scan_reads_only_what_is_asked_for(tmp_path: Path):
     for table, values in ((SPLITS, {"dataset": "highd"}), (VEHICLE_STARTS, {"vehicle_id": "3"})):
         with pytest.raises(ValueError, match="has no partition"):
             scan(tmp_path, manifest, table, **values)
+
+
+@pytest.mark.parametrize("stored", [0, 1_000])
+@pytest.mark.parametrize("older", [("a",), ("b",), ("a", "b")])
+def test_files_of_an_earlier_lake_lack_a_column_that_is_null_then(tmp_path: Path, monkeypatch, older, stored: int):
+    monkeypatch.setattr(catalog, "STORED_ROWS", stored)
+    parts = {key: {"dataset": "tgsim", "subset": key} for key in ("a", "b")}
+    with open_for_writing(tmp_path) as writer:
+        for key, values in parts.items():
+            row = {
+                **dict.fromkeys(VEHICLES.dtypes), **values, "vehicle_id": 1, "source_vehicle_id": 1, "automated": True,
+                "first_frame": 1, "last_frame": 2, "entries": 2, "start_x_m": 0.0, "end_x_m": 1.0,
+                "mean_speed_mps": 5.0,
+            }  # fmt: skip
+            made = pl.DataFrame([row], schema=VEHICLES.dtypes)
+            writer.commit(put(tmp_path, key, 1, made, VEHICLES, **values))
+            if key in older:
+                (file,) = (one for one in load(tmp_path).live("vehicles") if f"subset={key}" in one.path)
+                before = pl.read_parquet(tmp_path / file.path, hive_partitioning=False, glob=False).drop("automated")
+                (tmp_path / file.path).unlink()
+                before.write_parquet(tmp_path / file.path)
+    expected = [(key, None if key in older else True) for key in parts]
+    assert (
+        scan(tmp_path, load(tmp_path), VEHICLES).select("subset", "automated").sort("subset").collect().rows()
+        == expected
+    )
+    query_text = "SELECT subset, automated FROM vehicles ORDER BY subset"
+    with connect(tmp_path) as ours, duckdb.connect(str(tmp_path / "catalog.duckdb"), read_only=True) as plain:
+        assert ours.execute(query_text).fetchall() == plain.execute(query_text).fetchall() == expected
 
 
 def test_a_moved_lake_works_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

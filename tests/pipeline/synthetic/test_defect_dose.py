@@ -71,6 +71,7 @@ def test_samples_differ_by_the_dose_alone_and_say_what_was_reached(tmp_path):
         ({"defect": "frame_gap", "dose": np.nan}, "got nan"),
         ({"defect": "size_change", "dose": 0.1}, "cannot be recorded in ngsim-csv; choose --format highd"),
         ({"defect": "frame_gap", "dose": 0.1, "formats": ("drives",)}, "add --format highd"),
+        ({"defect": "frame_gap", "dose": 0.1, "formats": ("highd", "tgsim")}, "tgsim: generated without defects"),
     ],
 )
 def test_wrong_doses_are_refused(tmp_path, given, message):

@@ -7,10 +7,12 @@ from pathlib import Path
 import polars as pl
 import pytest
 from lake_sources import SAMPLE
-from raw_texts import read_highd, read_ngsim
+from raw_texts import raw_file, read_highd, read_ngsim
 from simulated import count_once, simulate_once
 
 from tracklake.pipeline import synthetic
+from tracklake.pipeline.sources.source import Part
+from tracklake.pipeline.sources.tgsim import TGSIM
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, build, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
@@ -42,10 +44,10 @@ def highd_tracks(out, recording):
 def test_summary_names_every_file(written):
     out, summary = written
     assert sorted(path.name for path in out.iterdir()) == [path.name for path in summary.files]
-    assert summary.recordings == 4 + 1 + 2 + 1 + 2  # highD, NGSIM in three formats, drives
+    assert summary.recordings == 4 + 1 + 2 + 1 + 2 + 3  # highD, NGSIM in three formats, drives, TGSIM
     lines = sum(path.read_bytes().count(b"\n") for path in summary.files if path.suffix in (".csv", ".txt"))
     metadata = sum(path.read_bytes().count(b"\n") for path in summary.files if path.name.endswith("Meta.csv"))
-    headers = 4 + 1 + 1  # the text has none
+    headers = 4 + 1 + 1 + 3  # the text has none
     assert summary.rows == lines - metadata - headers
     assert not [path for path in out.parent.iterdir() if path != out]
 
@@ -102,6 +104,29 @@ def test_a_generated_ngsim_file_that_another_program_rewrote_is_recognised(writt
     kept.write_csv(tmp_path / "derived.csv")
     found, _ = read_ngsim(tmp_path / "spilled", tmp_path / "derived.csv")
     assert find_origins(found.values()) == {"synthetic"}
+
+
+def test_generated_tgsim_files_are_recognised_as_such_and_hold_what_was_simulated(written, truth, tmp_path):
+    out, _ = written
+    recordings = {}
+    for name in ("I395_final.csv", "TGSIM_I-294_L1_Trajectories.csv"):
+        file = raw_file(out / name, TGSIM)
+        spilled = TGSIM.spill(file, tmp_path / name)
+        assert spilled.rejects.is_empty()
+        for recording in spilled.recordings:
+            parts = [Part(file, pl.scan_ipc(tmp_path / name / recording / "*.arrow"))]
+            recordings[recording] = TGSIM.to_canonical(parts, recording)
+    assert find_origins(recordings.values()) == {"synthetic"}
+    for (subset,) in (made.subsets for made in recordings.values()):
+        simulated = truth.filter(kind="first_frame", subset=subset.name).sort("vehicle_id")
+        assert (
+            subset.vehicles.select("vehicle_id", "entries").rows() == simulated.select("vehicle_id", "entries").rows()
+        )
+        # Positions have noise; they count from the hindmost entry, near the window's entrance.
+        assert (subset.vehicles["start_x_m"] - simulated["value"]).abs().max() < 2.5
+        assert subset.vehicles.filter("automated")["vehicle_id"].to_list() == [
+            vehicle for vehicle in simulated["vehicle_id"] if vehicle % 10 == 0
+        ]
 
 
 def test_a_generated_highd_recording_is_recognised_without_its_folder(written, tmp_path):
@@ -283,7 +308,10 @@ def test_traffic_is_lively(written):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"formats": ("highD",)}, "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, got highD"),
+        (
+            {"formats": ("highD",)},
+            "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, got highD",
+        ),
         ({"formats": ()}, "got none"),
         ({"minutes": 0.0}, "minutes: expected 0.1 to 15, got 0.0"),
         ({"minutes": float("nan")}, "minutes: expected"),
