@@ -7,12 +7,13 @@ from tracklake.schemas import SCHEMA_VERSION, TABLES, Table
 from tracklake.schemas.comparisons import COMPARISON_TABLES
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
+from tracklake.schemas.raw_i24 import RAW_I24
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 from tracklake.schemas.raw_tgsim import RAW_TGSIM, RAW_TGSIM_CENTRELINES
 
 RAW_TABLES = (
     *(RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS),
-    *(RAW_TGSIM, RAW_TGSIM_CENTRELINES),
+    *(RAW_TGSIM, RAW_TGSIM_CENTRELINES, RAW_I24),
 )
 
 SCORE_TABLES = (EVALUATIONS, *COMPARISON_TABLES)

@@ -61,6 +61,13 @@ TGSIM = Reference(
     "the TGSIM data set, its units and meanings",
     doi="10.1177/03611981241257257",
 )
+GLOUDEMANS = Reference(
+    "Gloudemans et al. (2023)",
+    "Gloudemans, D., Wang, Y., Ji, J., Zachar, G., Barbour, W., Hall, E., Cebelak, M., Smith, L., Work, D. B. (2023). "
+    "I-24 MOTION: An instrument for freeway traffic science. Transportation Research Part C 155, 104311.",
+    "the I-24 MOTION data set, its units and meanings",
+    doi="10.1016/j.trc.2023.104311",
+)
 KRAJEWSKI = Reference(
     "Krajewski et al. (2018)",
     "Krajewski, R., Bock, J., Kloeker, L., Eckstein, L. (2018). The highD Dataset: A Drone Dataset of Naturalistic "
@@ -227,9 +234,9 @@ DAGANZO = Reference(
 )
 
 REFERENCES = (
-    *(HAMALAINEN, NGSIM, KRAJEWSKI, TGSIM, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN, BAR_SHALOM, SCHUBERT),
-    *(GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER, GETTMAN),
-    *(RAKHA, RAJAMANI, DAGANZO),
+    *(HAMALAINEN, NGSIM, KRAJEWSKI, TGSIM, GLOUDEMANS, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN),
+    *(BAR_SHALOM, SCHUBERT, GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER),
+    *(GETTMAN, RAKHA, RAJAMANI, DAGANZO),
 )
 """All references, the one whose method tracklake builds on first."""
 

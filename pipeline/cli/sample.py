@@ -17,7 +17,7 @@ def sample(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
     format: Annotated[
         list[str] | None,
-        typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives, tgsim; repeatable."),
+        typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, i24; repeatable."),
     ] = None,
     noise: Annotated[
         list[str] | None,

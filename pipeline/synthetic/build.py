@@ -11,13 +11,14 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
-from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, tgsim, true_tracks, truth
+from tracklake.pipeline.synthetic import defects, drives, highd, i24, ngsim, tgsim, true_tracks, truth
 from tracklake.pipeline.synthetic.drivers import UNIFORM
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.scenarios import (
     DRIVES,
     FREEWAY,
     HIGHD,
+    I24,
     NGSIM_CSV,
     NGSIM_SOCRATA,
     NGSIM_TEXT,
@@ -35,7 +36,7 @@ AT_ONCE = 2
 STOP_POLL_S = 0.05
 """Time between two attempts to end what is still simulated, in seconds."""
 BOM = b"\xef\xbb\xbf"
-PLAIN = {TGSIM: tgsim}
+PLAIN = {TGSIM: tgsim, I24: i24}
 """Writers of formats that are generated without defects."""
 TRUTH_FILE, TRUE_TRACKS_FILE = "truth.parquet", "true_tracks.parquet"
 README_FILE = "README.md"
@@ -47,7 +48,7 @@ noise and known defects were added. `tracklake sample` wrote them (seed {seed}, 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
 - `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
-- files of TGSIM, if asked for: its two dialects, without defects.
+- files of TGSIM and I-24 MOTION, if asked for, without defects.
 - `drive-1`, `drive-2`: what two cars of recording 02 would have logged as instrumented vehicles, each with `truth.csv`.
 - `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
 - `true_tracks.parquet`: where every vehicle truly was, without noise and defects, in the frame of the lake's `tracks`.

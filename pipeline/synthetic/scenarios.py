@@ -9,7 +9,9 @@ DRIVES = "drives"
 """Format of instrumented vehicles: a folder of logs each."""
 TGSIM = "tgsim"
 """Format of TGSIM's freeway sites."""
-FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES, TGSIM)
+I24 = "i24"
+"""Format of I-24 MOTION."""
+FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES, TGSIM, I24)
 """Raw formats that the generator writes."""
 DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata", DRIVES)
 """Formats of a sample, unless set."""

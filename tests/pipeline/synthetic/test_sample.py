@@ -11,6 +11,7 @@ from raw_texts import raw_file, read_highd, read_ngsim
 from simulated import count_once, simulate_once
 
 from tracklake.pipeline import synthetic
+from tracklake.pipeline.sources.i24 import I24
 from tracklake.pipeline.sources.source import Part
 from tracklake.pipeline.sources.tgsim import TGSIM
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, build, write_sample
@@ -44,11 +45,12 @@ def highd_tracks(out, recording):
 def test_summary_names_every_file(written):
     out, summary = written
     assert sorted(path.name for path in out.iterdir()) == [path.name for path in summary.files]
-    assert summary.recordings == 4 + 1 + 2 + 1 + 2 + 3  # highD, NGSIM in three formats, drives, TGSIM
+    assert summary.recordings == 4 + 1 + 2 + 1 + 2 + 3 + 1  # highD, NGSIM in three formats, drives, TGSIM, I-24
     lines = sum(path.read_bytes().count(b"\n") for path in summary.files if path.suffix in (".csv", ".txt"))
     metadata = sum(path.read_bytes().count(b"\n") for path in summary.files if path.name.endswith("Meta.csv"))
     headers = 4 + 1 + 1 + 3  # the text has none
-    assert summary.rows == lines - metadata - headers
+    documents = (out / "i24-inception.json").read_bytes().count(b"\n")
+    assert summary.rows == lines - metadata - headers + documents
     assert not [path for path in out.parent.iterdir() if path != out]
 
 
@@ -127,6 +129,23 @@ def test_generated_tgsim_files_are_recognised_as_such_and_hold_what_was_simulate
         assert subset.vehicles.filter("automated")["vehicle_id"].to_list() == [
             vehicle for vehicle in simulated["vehicle_id"] if vehicle % 10 == 0
         ]
+
+
+def test_the_generated_list_of_i24_is_recognised_as_such_and_holds_what_was_simulated(written, truth, tmp_path):
+    file = raw_file(written[0] / "i24-inception.json", I24)
+    spilled = I24.spill(file, tmp_path)
+    assert spilled.rejects.is_empty()
+    (recording,) = spilled.recordings
+    made = I24.to_canonical([Part(file, pl.scan_ipc(tmp_path / recording / "*.arrow"))], recording)
+    assert find_origins([made]) == {"synthetic"}
+    for subset, miles in zip(made.subsets, (59 - 58, 64 - 62), strict=True):
+        simulated = truth.filter(kind="first_frame", subset=subset.name).sort("vehicle_id")
+        assert subset.vehicles.height == simulated.height
+        # Of four trajectories three lie between frames, so that the first position is up to a frame later.
+        found = subset.vehicles["start_x_m"] - miles * 1609.344
+        assert (found - simulated["value"]).abs().max() < 2
+        assert (subset.vehicles["entries"] - simulated["entries"]).unique().sort().to_list() in ([-1, 0], [0])
+        assert subset.facts["lanes"][0] == 4
 
 
 def test_a_generated_highd_recording_is_recognised_without_its_folder(written, tmp_path):
@@ -310,7 +329,7 @@ def test_traffic_is_lively(written):
     [
         (
             {"formats": ("highD",)},
-            "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, got highD",
+            "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, i24, got highD",
         ),
         ({"formats": ()}, "got none"),
         ({"minutes": 0.0}, "minutes: expected 0.1 to 15, got 0.0"),

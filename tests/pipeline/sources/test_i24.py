@@ -1,0 +1,224 @@
+"""I-24 MOTION by hand: documents in blocks, frames, lanes, both directions, and lists that are damaged."""
+
+import io
+import json
+from itertools import pairwise
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from raw_texts import raw_file, write
+
+from tracklake.pipeline.sources import i24_documents
+from tracklake.pipeline.sources.i24 import I24, PERIOD_S, detect, find_lanes, put_on_frames
+from tracklake.pipeline.sources.source import Part, SourceError
+from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+
+FILE = "637c399add50d54aa5af0cf4__post2.json"
+START = 1_669_118_400.0
+"""22 November 2022, 06:00 in Nashville, a period's beginning, in s since 1970."""
+EAST, WEST = 60 * 5280, 62 * 5280
+
+
+def document(*, first=0, frames=50, late=0.0, x=EAST, y=18.0, direction=1, feet=4.0, number=1, **values):
+    """A trajectory that advances `feet` a frame from frame `first`, `late` frames late."""
+    steps = range(frames)
+    return {
+        "_id": {"$oid": f"{number:024x}"},
+        "timestamp": [START + (first + late + step) / 25 for step in steps],
+        "x_position": [x + direction * feet * (step + late) for step in steps],
+        "y_position": [y] * frames,
+        "flags": ["Lost"],
+        "length": 15.0,
+        "width": [6.0, 7.0, 6.5],
+        "height": 5.0,
+        "merged_ids": [[{"$oid": "638bb843e38fd878abf4f6fe"}]],
+        "coarse_vehicle_class": 0,
+        "direction": direction,
+    } | values
+
+
+def read(folder, text, name=FILE):
+    """{recording: Canonical} and Spilled of one file."""
+    file = raw_file(write(folder / name, text if isinstance(text, bytes) else text.encode()), I24)
+    spilled = I24.spill(file, folder / "spilled")
+    made = {}
+    for recording in spilled.recordings:
+        rejects = spilled.rejects if len(spilled.recordings) == 1 else None
+        rows = pl.scan_ipc(folder / "spilled" / recording / "*.arrow")
+        made[recording] = I24.to_canonical([Part(file, rows, rejects)], recording)
+        for subset in made[recording].subsets:
+            TRACKS.validate(subset.tracks, where=subset.name)
+            VEHICLES.validate(subset.vehicles, where=subset.name)
+            SUBSETS.validate(subset.facts, where=subset.name)
+    return made, spilled
+
+
+def as_list(documents):
+    lines = ",\n".join(map(json.dumps, documents))
+    return f"[{lines}]\n"
+
+
+def test_golden_numbers_of_both_carriageways(tmp_path):
+    documents = [
+        document(),
+        document(x=EAST + 120, length=[30.0, 31.0, 29.0], coarse_vehicle_class=4, number=2),
+        document(y=30.0, number=3),
+        document(x=WEST, y=18.0, direction=-1, number=4),
+    ]
+    made, spilled = read(tmp_path, as_list(documents))
+    assert spilled.rows_read == 4
+    assert spilled.recordings == {"i-24-20221122-0600": 200}
+    east, west = made["i-24-20221122-0600"].subsets
+    assert (east.name, west.name) == ("i-24-20221122-0600-east", "i-24-20221122-0600-west")
+    first = east.tracks.filter(frame=0)
+    # Backs are 2 miles beyond mile post 58, 120 ft further, and as the first; fronts 15, 30 and 15 ft ahead of them.
+    assert first["x_m"].to_list() == pytest.approx(
+        [(10560 + 15) * 0.3048, (10560 + 150) * 0.3048, 10575 * 0.3048], abs=1e-3
+    )
+    # The first strip of 12 ft with traffic begins at 12 ft: lane 1.
+    assert first["y_m"].to_list() == pytest.approx([6 * 0.3048, 6 * 0.3048, 18 * 0.3048], abs=1e-3)
+    assert first["lane"].to_list() == [1, 1, 2]
+    assert first["leader_id"].to_list() == [2, None, None]
+    assert first["follower_id"].to_list() == [None, 1, None]
+    # From front to front 135 ft, less the leader's 30 ft.
+    assert first["gap_m"].to_list() == [pytest.approx(105 * 0.3048, abs=1e-3), None, None]
+    assert east.tracks["speed_mps"].to_numpy() == pytest.approx(4 * 25 * 0.3048, abs=1e-3)
+    assert east.tracks["accel_mps2"].null_count() == east.tracks.height
+    assert east.vehicles["class"].to_list() == ["car", "truck", "car"]
+    assert east.vehicles["length_m"].to_list() == pytest.approx([15 * 0.3048, 30 * 0.3048, 15 * 0.3048], rel=1e-6)
+    assert east.vehicles["width_m"].to_list() == pytest.approx([6.5 * 0.3048] * 3, rel=1e-6)
+    facts = east.facts.row(0, named=True)
+    assert (facts["lanes"], facts["lane_markings_m"], facts["seconds"]) == (2, [0.0, 3.6576, 7.3152], 2.0)
+    assert (facts["site"], facts["origin"], facts["direction"]) == ("i-24", "recorded", "east")
+    # Westbound x falls, and x_m counts from mile post 64.
+    assert west.tracks["x_m"][0] == pytest.approx((2 * 5280 + 15) * 0.3048, abs=1e-3)
+    assert west.tracks["speed_mps"].to_numpy() == pytest.approx(4 * 25 * 0.3048, abs=1e-3)
+
+
+def test_a_vehicle_on_the_road_at_a_periods_border_is_in_both_and_shares_its_source_id(tmp_path):
+    step = [*range(20), *range(21, 51)]  # the speed at the border is that of the whole trajectory
+    cut = document(first=PERIOD_S * 25 - 20, number=2, x_position=[EAST + 4.0 * place for place in step])
+    made, spilled = read(tmp_path, as_list([document(), cut]))
+    assert spilled.recordings == {"i-24-20221122-0600": 50 + 20, "i-24-20221122-0605": 30}
+    later = made["i-24-20221122-0605"].subsets[0]
+    assert later.vehicles.select("source_vehicle_id", "first_frame", "last_frame").rows() == [(2, 0, 29)]
+    assert later.tracks["time_s"][0] == 0
+    assert later.tracks["speed_mps"].head(2).to_list() == pytest.approx([6 * 25 * 0.3048, 4 * 25 * 0.3048], rel=1e-6)
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.0, 0.004, 0.25, 0.5, 0.8, 0.97, 0.996]),
+            st.sets(st.integers(0, 12), min_size=2, max_size=13),
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_positions_on_frames_are_those_of_a_loop(tracks):
+    """The true position at a frame between two successive times, whatever phase; nothing over a gap or at the ends."""
+    documents, expected = [], []
+    for number, (late, steps) in enumerate(tracks, start=1):
+        times = [step + late for step in sorted(steps)]
+        documents.append(
+            {"line": number, "timestamp": [START + time / 25 for time in times], "x_position": [7 * t for t in times]}
+        )
+        for frame in range(14):
+            near = [time for time in times if abs(time - frame) <= 0.011]
+            around = [(a, b) for a, b in pairwise(times) if a < frame < b and b - a < 1.4]
+            if near or around:
+                expected.append((number, frame, 7 * (near[0] if near else frame)))
+    numbers = [each[0] for each in expected]
+    expected = [each for each in expected if numbers.count(each[0]) > 1]
+    lists = pl.DataFrame(documents).with_columns(
+        y_position="x_position", direction=1.0, length=pl.lit([1.0]), width=pl.lit([1.0]), coarse_vehicle_class=0.0,
+        _id=pl.struct(pl.lit("").alias("$oid")),
+    )  # fmt: skip
+    points, _ = put_on_frames(lists)
+    assert points["period"].unique().to_list() in ([], [int(START / PERIOD_S)])
+    assert points.select("vehicle", "frame").rows() == [each[:2] for each in expected]
+    assert np.allclose(points["x_ft"].to_numpy(), [each[2] for each in expected], atol=1e-4)
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 400), st.sampled_from(["[%s]", " [\n%s\n]\n", "\ufeff[%s]"]), st.booleans())
+def test_documents_are_the_same_however_the_file_is_cut_into_blocks(size, shape, indented):
+    made = [document(frames=3, number=number, x_score=float("nan")) for number in (1, 2, 3)]
+    made[1]["_id"] = "some-text"
+    text = shape % ",\n".join(json.dumps(each, indent=2 if indented else None) for each in made)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(i24_documents, "BLOCK_BYTES", max(size, 30))
+        blocks = list(i24_documents.read_documents(io.BytesIO(text.encode()), "list.json"))
+    frame = pl.concat([block.frame for block in blocks])
+    assert frame["line"].to_list() == [1, 2, 3]
+    assert frame["timestamp"].to_list() == [each["timestamp"] for each in made]
+    assert frame["length"].to_list() == [[15.0]] * 3
+    assert frame["_id"].struct.field("$oid")[1] == "some-text"
+    assert not any(block.rejects.height for block in blocks)
+
+
+def test_broken_documents_are_rejected_with_their_number_and_spoil_no_other(tmp_path):
+    texts = [json.dumps(document(number=number)) for number in range(1, 8)]
+    texts[1] = texts[1].replace('"x_position": [', '"x_position": [["')
+    texts[2] = texts[2][:300]
+    broken = (
+        document(direction=0),
+        document(frames=1),
+        document(y_position=[1.0]),
+        document(timestamp=[None] * 50),
+        document(timestamp=[START] * 50),
+        document(x=10_000.0),
+        {"_id": {"$oid": "x"}, "flags": []},
+        document(late=0.5, timestamp=[START + 0.1 * step + 0.01 for step in range(50)]),
+    )
+    made, spilled = read(tmp_path, f"[{','.join([*texts, *map(json.dumps, broken), texts[0][:400]])}")
+    assert spilled.rows_read == 16
+    assert spilled.rejects["line"].to_list() == [2, 3, *range(8, 17)]
+    reasons = spilled.rejects["reason"].to_list()
+    assert reasons[0].startswith("no trajectory's document: ")
+    assert reasons[1] == reasons[-1] == "cut short"
+    assert reasons[2:8] == [
+        "direction is neither 1 nor -1",
+        "fewer than two times",
+        "arrays of positions are not as long as that of times",
+        "a time or position is no number",
+        "times do not increase",
+        "x_position beyond 300,960 to 343,200",
+    ]
+    assert reasons[9] == "fewer than two positions on frames"
+    assert spilled.notes == (f"{FILE}: ends within document 16: probably TRUNCATED. Download the file again.",)
+    (canonical,) = made.values()
+    assert canonical.subsets[0].vehicles["source_vehicle_id"].to_list() == [1, 4, 5, 6, 7]
+    (row,) = canonical.log.to_dicts()
+    assert (row["rows_kept"], row["rows_dropped"], row["rows_read"]) == (250, 11, 261)
+
+
+def test_lists_are_recognised_by_their_beginning_and_other_json_is_not():
+    text = as_list([document()]).encode()
+    assert detect(text[:70], FILE) == "i24-json"
+    assert detect(b"[" + text[1:].replace(b'"_id"', b'"first_timestamp": 1, "_id"', 1), FILE) == "i24-json"
+    assert detect(b'{"timestamp": [1]}', FILE) is None
+    assert detect(b'[{"metadata": {}}]', FILE) is None
+    assert detect(b"", FILE) is None
+
+
+def test_a_document_without_end_and_no_list_are_refused(monkeypatch):
+    monkeypatch.setattr(i24_documents, "BLOCK_BYTES", 50)
+    monkeypatch.setattr(i24_documents, "MAX_DOCUMENT_BYTES", 100)
+    with pytest.raises(SourceError, match=r"big\.json: a document of more than 0 MiB"):
+        list(i24_documents.read_documents(io.BytesIO(as_list([document()]).encode()), "big.json"))
+    with pytest.raises(SourceError, match=r"no\.json: no list of documents"):
+        list(i24_documents.read_documents(io.BytesIO(b"{}"), "no.json"))
+
+
+@pytest.mark.parametrize(
+    ("places", "left", "lanes"),
+    [([6, 18, 30], 0, 3), ([18, 30, 42, 54, 66], 12, 5), ([6] + [18] * 30 + [30] * 30, 12, 2), ([18, 42], 12, 1)],
+)
+def test_lanes_begin_with_the_first_strip_that_has_traffic(places, left, lanes):
+    assert find_lanes(pl.Series("y", places, dtype=pl.Float64)) == (left, lanes)
