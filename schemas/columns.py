@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 """Metres in one international foot, exactly."""
-Dataset = Literal["ngsim", "highd", "tgsim", "i24", "custom", "v2v"]
+Dataset = Literal["ngsim", "highd", "exid", "ind", "round", "tgsim", "i24", "custom", "v2v"]
 DATASETS: tuple[Dataset, ...] = get_args(Dataset)
 Origin = Literal["recorded", "synthetic"]
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
@@ -105,7 +105,11 @@ BOUNDS: Mapping[str, tuple[Callable[[pl.Expr, Any], pl.Expr], str]] = {
 
 column = Column
 
-DATASET = column(pl.String, "ngsim, highd, tgsim, i24, custom (read with --columns), or v2v (drives)", isin=DATASETS)
+DATASET = column(
+    pl.String,
+    "ngsim, highd, exid, ind, round, tgsim, i24, custom (read with --columns), or v2v (drives)",
+    isin=DATASETS,
+)
 SUBSET = column(pl.String, "one carriageway (arterials: one direction) of one recording; v2v: one drive")
 PLACE = {"dataset": DATASET, "subset": SUBSET}
 """Columns that say where a row belongs, the folders of most tables."""

@@ -43,7 +43,7 @@ COMPLETENESS = Table(
         "measure": column(pl.String, "what is counted", isin=tuple(MEASURES)),
         "authority": column(
             pl.String,
-            "who announces it: recordingMeta, tracksMeta (highD), Total_Frames (NGSIM, per vehicle) or published "
+            "who announces it: recordingMeta, tracksMeta (levelXdata), Total_Frames (NGSIM, per vehicle) or published "
             "(NGSIM's freeways)",
             isin=AUTHORITIES,
         ),

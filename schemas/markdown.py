@@ -8,12 +8,19 @@ from tracklake.schemas.comparisons import COMPARISON_TABLES
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.raw_highd import RAW_HIGHD_RECORDING, RAW_HIGHD_TRACKS, RAW_HIGHD_VEHICLES
 from tracklake.schemas.raw_i24 import RAW_I24
+from tracklake.schemas.raw_levelx import (
+    RAW_EXID_TRACKS,
+    RAW_LEVELX_RECORDING,
+    RAW_LEVELX_VEHICLES,
+    RAW_URBAN_TRACKS,
+)
 from tracklake.schemas.raw_ngsim import RAW_NGSIM
 from tracklake.schemas.raw_tgsim import RAW_TGSIM, RAW_TGSIM_CENTRELINES
 
 RAW_TABLES = (
     *(RAW_NGSIM, RAW_HIGHD_RECORDING, RAW_HIGHD_VEHICLES, RAW_HIGHD_TRACKS),
     *(RAW_TGSIM, RAW_TGSIM_CENTRELINES, RAW_I24),
+    *(RAW_LEVELX_RECORDING, RAW_LEVELX_VEHICLES, RAW_EXID_TRACKS, RAW_URBAN_TRACKS),
 )
 
 SCORE_TABLES = (EVALUATIONS, *COMPARISON_TABLES)

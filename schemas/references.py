@@ -76,6 +76,30 @@ KRAJEWSKI = Reference(
     "the highD data set and its format",
     doi="10.1109/ITSC.2018.8569552",
 )
+MOERS = Reference(
+    "Moers et al. (2022)",
+    "Moers, T., Vater, L., Krajewski, R., Bock, J., Zlocki, A., Eckstein, L. (2022). The exiD Dataset: A Real-World "
+    "Trajectory Dataset of Highly Interactive Highway Scenarios in Germany. IEEE Intelligent Vehicles Symposium (IV), "
+    "958-964.",
+    "the exiD data set and its format",
+    doi="10.1109/IV51971.2022.9827305",
+)
+BOCK = Reference(
+    "Bock et al. (2020)",
+    "Bock, J., Krajewski, R., Moers, T., Runde, S., Vater, L., Eckstein, L. (2020). The inD Dataset: A Drone Dataset "
+    "of Naturalistic Road User Trajectories at German Intersections. IEEE Intelligent Vehicles Symposium (IV), "
+    "1929-1934.",
+    "the inD data set and its format",
+    doi="10.1109/IV47402.2020.9304839",
+)
+KRAJEWSKI_2020 = Reference(
+    "Krajewski et al. (2020)",
+    "Krajewski, R., Moers, T., Bock, J., Vater, L., Eckstein, L. (2020). The rounD Dataset: A Drone Dataset of Road "
+    "User Trajectories at Roundabouts in Germany. IEEE International Conference on Intelligent Transportation Systems "
+    "(ITSC), 1-6.",
+    "the rounD data set and its format",
+    doi="10.1109/ITSC45102.2020.9294728",
+)
 COIFMAN = Reference(
     "Coifman and Li (2017)",
     "Coifman, B., Li, L. (2017). A critical evaluation of the Next Generation Simulation (NGSIM) vehicle trajectory "
@@ -236,7 +260,7 @@ DAGANZO = Reference(
 REFERENCES = (
     *(HAMALAINEN, NGSIM, KRAJEWSKI, TGSIM, GLOUDEMANS, COIFMAN, PUNZO, EDIE, DEO, KIM, CHOI, MESSAOUD, CHEN),
     *(BAR_SHALOM, SCHUBERT, GRAVES, TREIBER_2013, SHARMA, VOGEL, TOLEDO, HAYWARD, ALLEN, COOPER, ALMQVIST, ARCHER),
-    *(GETTMAN, RAKHA, RAJAMANI, DAGANZO),
+    *(GETTMAN, RAKHA, RAJAMANI, DAGANZO, MOERS, BOCK, KRAJEWSKI_2020),
 )
 """All references, the one whose method tracklake builds on first."""
 

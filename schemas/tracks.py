@@ -16,7 +16,8 @@ TRACKS = Table(
         "time_s": column(pl.Float64, "since the recording's first frame", unit="s", ge=0),
         "x_m": column(
             pl.Float64,
-            "front centre along the direction of travel; highD: box's middle + length/2 * cos(heading), to 1 mm",
+            "front centre along the direction of travel, or along the road's axis (exiD, inD, rounD); with headings: "
+            "body's middle + length/2 * cos(heading), to 1 mm",
             unit="m",
             ge=-2_000,
             le=20_000,
@@ -24,15 +25,16 @@ TRACKS = Table(
         "y_m": column(
             pl.Float64,
             "front centre from the carriageway's left edge (arterials: the street's), positive to the driver's right; "
-            "highD: box's middle + length/2 * sin(heading), to 1 mm",
+            "with headings: body's middle + length/2 * sin(heading), to 1 mm",
             unit="m",
             ge=-2_000,
             le=2_000,
         ),
         "heading_rad": column(
             pl.Float32,
-            "direction in which the body points, 0 along the road, positive to the driver's right, to 0.0001: that of "
-            "the recorded velocity over 0.2 s, below 2 m/s the last one; null where the source has none (NGSIM)",
+            "direction in which the body points, 0 along the road, positive to the driver's right, to 0.0001: as "
+            "recorded, or (highD) that of the recorded velocity over 0.2 s, below 2 m/s the last one; null where the "
+            "source has none (NGSIM)",
             unit="rad",
             nullable=True,
             ge=-1.6,
@@ -47,7 +49,7 @@ TRACKS = Table(
         ),
         "speed_mps": column(
             pl.Float32,
-            "recorded, signed along the direction of travel: negative is backwards",
+            "recorded, signed along the direction of travel or the road's axis: negative is backwards",
             unit="m/s",
             ge=-40,
             le=100,
@@ -74,7 +76,7 @@ TRACKS = Table(
         ),
         "lateral_speed_mps": column(
             pl.Float32,
-            "positive to the driver's right; recorded where the source has it (highD: of the body's middle), else "
+            "positive to the driver's right; recorded where the source has it (of the body's middle), else "
             "central difference of y_m",
             unit="m/s",
             nullable=True,

@@ -26,6 +26,7 @@ COMMANDS = {
     "split": "Divide the subsets into train and eval.",
     "tensors": "Write the split as flat arrays.",
     "fuse": "Track the vehicles around an instrumented vehicle, by its messages, LiDAR and camera.",
+    "probe": "Print the format, columns, counts and units of raw files, without any value: to paste into an issue.",
     "report": "Write the quality report.",
     "check": 'Compare every file with its checksum, and judge quality gates such as "error_share > 0.05".',
     "info": "Show a lake's recordings, stages, what is stale and why, and sizes on disk.",

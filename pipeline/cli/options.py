@@ -20,7 +20,10 @@ ProtocolOption = Annotated[
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and no progress.")]
 DatasetOption = Annotated[
-    str | None, typer.Option("--dataset", help="Read SOURCE as this only: ngsim, highd, custom or v2v.")
+    str | None,
+    typer.Option(
+        "--dataset", help="Read SOURCE as this only: ngsim, highd, exid, ind, round, tgsim, i24, custom or v2v."
+    ),
 ]
 ColumnsOption = Annotated[
     Path | None,
@@ -30,7 +33,8 @@ RecordingOption = Annotated[
     str | None, typer.Option("--recording", help="Name of the recording, where a file's times do not tell it.")
 ]
 OnlyDatasetOption = Annotated[
-    str | None, typer.Option("--dataset", help="Only samples of this dataset (ngsim, highd or custom).")
+    str | None,
+    typer.Option("--dataset", help="Only samples of this dataset (ngsim, highd, exid, tgsim, i24 or custom)."),
 ]
 OnlyRecordingOption = Annotated[
     str | None, typer.Option("--recording", help="Only samples of this recording or subset (us-101-0750, 01-upper).")

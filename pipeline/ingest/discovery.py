@@ -31,9 +31,11 @@ TABLES = (".parquet", ".feather", ".arrow", ".mat")
 """Endings of binary tables."""
 LOGS = (".json", ".jsonl", ".ndjson", ".log", ".hex", ".db3", ".zstd", ".yaml")
 """Endings of an instrumented vehicle's logs that other files have, too."""
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", ".bag", ".mcap", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
+MAPS = (".osm",)
+"""Endings of maps, which lie beside recordings and are none."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".gz", ".bag", ".mcap", *TABLES, *LOGS, *MAPS, ARCHIVE_SUFFIX, "")
 """Endings under which trajectory files circulate; files with others (pictures, documents) are skipped."""
-PROSE = (".txt", ".dat", *TABLES, *LOGS, ARCHIVE_SUFFIX, "")
+PROSE = (".txt", ".dat", *TABLES, *LOGS, *MAPS, ARCHIVE_SUFFIX, "")
 """Endings that other files share: an unrecognised file with one is skipped and named, not refused."""
 HASHES = ".hashes.json"
 """Name of the file in the lake that remembers raw files' hashes."""
@@ -76,9 +78,18 @@ def discover(
     recognised = search.hash_files()
     units: list[tuple[Source, Unit]] = []
     refusals = search.refusals
+    by_name = {item.name: item for item in search.sources}
     for item in search.sources:
         grouping = item.group(recognised[item.name])
-        units += [(item, unit) for unit in grouping.units]
+        for unit in grouping.units:
+            owner = item if unit.dataset is None else by_name.get(unit.dataset)
+            if owner is not None:
+                units.append((owner, unit))
+            else:
+                refusals.append(
+                    f"recording {unit.recording}: its files are of {unit.dataset}, and --dataset asks for {dataset}. "
+                    "Leave --dataset out, or name the other one."
+                )
         refusals += grouping.refusals
     if not units and not refusals:
         raise SourceError(_explain_nothing(source, candidates, search.sources))
@@ -95,6 +106,25 @@ def recognise(source: Path, dataset: str) -> list[RawFile]:
     for path in _list_candidates(source)[0]:
         search.sort_file(_open_raw(path, source))
     return [file for _, file in search.found]
+
+
+def find_raw_files(source: Path) -> list[tuple[Source | None, RawFile]]:
+    """Find the raw files of a file, folder or archive by their first lines, with the source that recognises each.
+
+    Files of no known format are among them, with None, where their endings promise data, or the user named them.
+
+    Raises:
+        SourceError: no such file or folder.
+    """
+    search = _Search([*SOURCES], source, digest=lambda _file: "")
+    files: list[tuple[Source | None, RawFile]] = []
+    for path in _list_candidates(source)[0]:
+        file, known, skipped = _open_raw(path, source), len(search.found), len(search.skipped)
+        search.sort_file(file)
+        files += search.found[known:]
+        if len(search.found) == known and (len(search.skipped) == skipped or path == source):
+            files.append((None, file))
+    return files
 
 
 @dataclass

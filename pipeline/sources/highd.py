@@ -188,4 +188,5 @@ HIGHD = Source(
     detect=HIGHD_FORMAT.detect,
     group=HIGHD_FORMAT.group,
     to_canonical=to_canonical,
+    describe_columns=HIGHD_FORMAT.describe_columns,
 )

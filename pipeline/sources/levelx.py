@@ -12,8 +12,8 @@ from typing import Any
 import polars as pl
 
 from tracklake.pipeline.sources.accounting import CONFLICT, DUPLICATE, FILE, split_duplicates
-from tracklake.pipeline.sources.csv import BOM, LINE, Chunk, Layout, read_chunks
-from tracklake.pipeline.sources.source import Grouping, Part, RawFile, SourceError, Unit
+from tracklake.pipeline.sources.csv import BOM, LINE, Chunk, Layout, read_chunks, read_head
+from tracklake.pipeline.sources.source import ColumnsOfFile, Grouping, Part, RawFile, SourceError, Unit
 from tracklake.schemas import Table
 from tracklake.schemas.columns import Dataset
 
@@ -51,6 +51,7 @@ class LevelxFormat:
         choices: allowed values of text columns, in lower case, by kind.
         recording_id: recordingMeta's column of the recording's number.
         vehicle_id: the column of the vehicle's id in tracksMeta and tracks.
+        any_header: whether columns may stand in any order and case, among others; nullable ones may be missing.
     """
 
     dataset: Dataset
@@ -60,6 +61,7 @@ class LevelxFormat:
     choices: Mapping[str, Mapping[str, tuple[str, ...]]] = field(default_factory=dict)
     recording_id: str = "id"
     vehicle_id: str = "id"
+    any_header: bool = False
 
     def name_dialect(self, kind: str) -> str:
         """Return the dialect of a kind of file."""
@@ -67,12 +69,11 @@ class LevelxFormat:
 
     def find_kind(self, file: RawFile) -> str:
         """Return which of the three files one is."""
-        return file.dialect.removeprefix(f"{self.dataset}-")
+        return file.dialect.rpartition("-")[2]
 
     def detect(self, head: bytes, _name: str) -> str | None:
         """Recognise one of the three files by its header."""
-        line = head.removeprefix(BOM).split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
-        header = tuple(field.strip().strip('"') for field in line.split(","))
+        header = read_header(head)
         return next((self.name_dialect(kind) for kind, fields in self.fields.items() if header == fields), None)
 
     def group(self, files: Sequence[RawFile]) -> Grouping:
@@ -82,12 +83,20 @@ class LevelxFormat:
         three archives of one file each are a recording too. Of two files of one kind, the one named as shipped is
         used and the other refused.
         """
+        sets, refusals = self.gather_recordings(files)
+        grouping = self.group_recordings(sets)
+        return Grouping(grouping.units, (*refusals, *grouping.refusals))
+
+    def gather_recordings(self, files: Sequence[RawFile]) -> tuple[list[FileSet], list[str]]:
+        """Gather the files of recordings; also return messages about files that fit nowhere."""
         sets, refusals = self._gather_sets(files, lambda file: file.folder)
         scattered = [file for _, found in sets if len(found) < len(KINDS) for file in found.values()]
         beside, more_refusals = self._gather_sets(scattered, lambda file: str(file.path.parent))
-        sets = [*(each for each in sets if len(each[1]) == len(KINDS)), *beside]
-        grouping = self._group_sets(sets, KINDS, f"A {self.title} recording needs its three files in one folder")
-        return Grouping(grouping.units, (*refusals, *more_refusals, *grouping.refusals))
+        return [*(each for each in sets if len(each[1]) == len(KINDS)), *beside], [*refusals, *more_refusals]
+
+    def group_recordings(self, sets: Sequence[FileSet]) -> Grouping:
+        """Make a unit of each recording's files; incomplete sets and second ones are refused."""
+        return self._group_sets(sets, KINDS, f"A {self.title} recording needs its three files in one folder")
 
     def group_metadata(self, files: Sequence[RawFile]) -> Grouping:
         """Gather each recording's recordingMeta and tracksMeta, to plan with; other files are left out."""
@@ -181,26 +190,35 @@ class LevelxFormat:
         vehicles, _ = self._split_vehicles(self._read(files[1]).frame, files[1])
         return meta, vehicles
 
-    def build_layout(self, kind: str) -> Layout:
-        """Build the layout of a kind of file from its raw schema."""
-        raw = self.raw[kind]
-        wanted = [name for name in raw.dtypes if name != LINE]
+    def build_layout(self, kind: str, names: tuple[str, ...] | None = None) -> Layout:
+        """Build the layout of a kind of file from its raw schema, and from its header where that may be another."""
+        raw, names = self.raw[kind], names or self.fields[kind]
+        wanted = [name for name in raw.dtypes if name in names]
         return Layout(
-            names=self.fields[kind],
+            names=names,
             dtypes={name: raw.dtypes[name] for name in wanted},
             required=raw.required & set(wanted),
-            bounds={name: limits for name, limits in raw.bounds.items() if name != LINE},
+            bounds={name: limits for name, limits in raw.bounds.items() if name in wanted},
             choices=self.choices.get(kind, {}),
         )
 
+    def describe_columns(self, file: RawFile) -> ColumnsOfFile:
+        """Return the columns of a file."""
+        kind = self.find_kind(file)
+        names = match_names(read_header(read_head(file)), self.raw[kind]) if self.any_header else None
+        return ColumnsOfFile(self.build_layout(kind, names), self.raw[kind])
+
     def _read(self, file: RawFile) -> Chunk:
-        raw, layout = self.raw[self.find_kind(file)], self.build_layout(self.find_kind(file))
+        columns = self.describe_columns(file)
+        layout, raw = columns.layout, columns.raw
         chunks = list(read_chunks(file, layout))
         if not chunks:
             raise SourceError(
                 f"{file.name}: empty. Expected the header {','.join(layout.names[:4])}, ... and rows under it."
             )
-        frame = pl.concat([chunk.frame for chunk in chunks]).select(*raw.dtypes)
+        frame = pl.concat([chunk.frame for chunk in chunks])
+        absent = [pl.lit(None, dtype).alias(name) for name, dtype in raw.dtypes.items() if name not in frame.columns]
+        frame = frame.with_columns(absent).select(*raw.dtypes)
         rejects = pl.concat([chunk.rejects for chunk in chunks])
         return Chunk(raw.validate(frame, where=file.name), rejects, sum(chunk.rows_read for chunk in chunks))
 
@@ -247,6 +265,20 @@ class LevelxFormat:
                 "together or one is cut short; restore the originals."
             )
         return entries.join(vehicles, on=self.vehicle_id, how="semi", maintain_order="left"), unknown
+
+
+def read_header(head: bytes) -> tuple[str, ...]:
+    """Read the names of a CSV file's columns from its first bytes."""
+    line = head.removeprefix(BOM).split(b"\n", 1)[0].decode("utf-8", errors="replace").strip()
+    return tuple(name.strip().strip('"') for name in line.split(","))
+
+
+def match_names(header: Sequence[str], raw: Table) -> tuple[str, ...] | None:
+    """Write a header's names as a raw schema spells them; None where one that may not be null is missing or twice."""
+    spelled = {name.lower(): name for name in raw.dtypes if name != LINE}
+    names = tuple(spelled.get(name.lower(), name) for name in header)
+    missing = raw.required - set(names) - {LINE}
+    return None if missing or len(set(names)) < len(names) else names
 
 
 def split_conflicts(entries: pl.DataFrame, key: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:

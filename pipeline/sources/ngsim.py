@@ -26,6 +26,7 @@ from tracklake.pipeline.sources.ngsim_plausibility import (
 )
 from tracklake.pipeline.sources.source import (
     Canonical,
+    ColumnsOfFile,
     Grouping,
     Part,
     RawFile,
@@ -111,6 +112,12 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
 def read_mapping(file: RawFile) -> ColumnMapping | None:
     """Return the user's description of a file's columns, if there is one."""
     return ColumnMapping.model_validate_json(file.columns) if file.columns else None
+
+
+def describe_columns(file: RawFile) -> ColumnsOfFile | None:
+    """Return the columns of a file, with the units that are not NGSIM's."""
+    heading = read_heading(read_head(file), file.name, read_mapping(file))
+    return None if heading is None else ColumnsOfFile(heading.to_layout(), RAW_NGSIM, heading.units)
 
 
 def _tells_recordings(heading: Heading, mapping: ColumnMapping | None) -> bool:
@@ -352,4 +359,5 @@ NGSIM = Source(
     group=group,
     to_canonical=to_canonical,
     spill=spill_file,
+    describe_columns=describe_columns,
 )

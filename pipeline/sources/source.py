@@ -1,12 +1,13 @@
 """A dataset's source: data and a few functions, listed in an explicit registry."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import polars as pl
 
+from tracklake.pipeline.sources.layout import Layout
 from tracklake.schemas.columns import Dataset, Table
 from tracklake.schemas.errors import TracklakeError
 
@@ -139,11 +140,22 @@ class Canonical:
 class Unit:
     """Raw files to be read together, in the order of their source: a highD recording's three, or one NGSIM file.
 
-    `recording` is None if only the rows tell it.
+    `recording` is None if only the rows tell it; `dataset` is that of the files where several datasets share formats,
+    and else that of the source that grouped them.
     """
 
     files: tuple[RawFile, ...]
     recording: str | None = None
+    dataset: Dataset | None = None
+
+
+@dataclass(frozen=True)
+class ColumnsOfFile:
+    """Layout of a text file's lines, the raw table that they fill, and units by column that are not the table's."""
+
+    layout: Layout
+    raw: Table
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -167,6 +179,7 @@ class Source:
         spill: function that reads a file of several recordings into a staging folder, a folder per recording.
         lacking: words for a recording of which no row can be used.
         beside: dialects of files that hold no recordings and describe those of the first file of their unit.
+        describe_columns: function of a recognised file; returns its columns, None for a file without lines of columns.
     """
 
     name: Dataset
@@ -181,3 +194,4 @@ class Source:
     spill: Callable[[RawFile, Path], Spilled] | None = None
     lacking: str = "no carriageway has entries"
     beside: tuple[str, ...] = ()
+    describe_columns: Callable[[RawFile], ColumnsOfFile | None] | None = None

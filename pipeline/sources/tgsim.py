@@ -24,6 +24,7 @@ from tracklake.pipeline.sources.spill import spill_rows
 from tracklake.pipeline.sources.tgsim_files import (
     CENTRELINES,
     build_layout,
+    describe_columns,
     detect,
     find_run,
     find_site,
@@ -290,4 +291,5 @@ TGSIM = Source(
     to_canonical=to_canonical,
     spill=spill_file,
     beside=(CENTRELINES,),
+    describe_columns=describe_columns,
 )

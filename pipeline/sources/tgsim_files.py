@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import polars as pl
 
 from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, read_chunks, read_head
-from tracklake.pipeline.sources.source import Grouping, RawFile, SourceError, Unit
+from tracklake.pipeline.sources.source import ColumnsOfFile, Grouping, RawFile, SourceError, Unit
 from tracklake.schemas.raw_tgsim import RAW_TGSIM, RAW_TGSIM_CENTRELINES
 
 PORTAL, ORIGINAL, URBAN, CENTRELINES = "tgsim-portal", "tgsim-file", "tgsim-urban", "tgsim-centrelines"
@@ -60,6 +60,11 @@ def find_run(file: RawFile) -> int | None:
 
 def _write_plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower())
+
+
+def describe_columns(file: RawFile) -> ColumnsOfFile | None:
+    """Return the columns of a trajectory file; None for another."""
+    return ColumnsOfFile(build_layout(read_head(file)), RAW_TGSIM) if file.dialect in (PORTAL, ORIGINAL) else None
 
 
 def group(files: Sequence[RawFile]) -> Grouping:

@@ -20,8 +20,8 @@ from tracklake.pipeline.sources.csv.reader import NULL_WORDS as NULL_WORDS
 from tracklake.pipeline.sources.csv.reader import REJECT_SCHEMA as REJECT_SCHEMA
 from tracklake.pipeline.sources.csv.reader import UNNAMED as UNNAMED
 from tracklake.pipeline.sources.csv.reader import Chunk as Chunk
-from tracklake.pipeline.sources.csv.reader import Layout as Layout
 from tracklake.pipeline.sources.csv.reader import map_chunks as map_chunks
 from tracklake.pipeline.sources.csv.reader import map_lines as map_lines
 from tracklake.pipeline.sources.csv.reader import read_chunks as read_chunks
 from tracklake.pipeline.sources.csv.table_files import NoTableError as NoTableError
+from tracklake.pipeline.sources.layout import Layout as Layout

@@ -8,7 +8,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import TypeVar
 
@@ -25,6 +25,7 @@ from tracklake.pipeline.sources.csv.line_bytes import (
 )
 from tracklake.pipeline.sources.csv.quoting import are_paired, unquote_thousands
 from tracklake.pipeline.sources.csv.raw_files import CHUNK_BYTES, open_raw, read_whole_lines
+from tracklake.pipeline.sources.layout import Layout
 from tracklake.pipeline.sources.source import RawFile
 
 Result = TypeVar("Result")
@@ -45,36 +46,6 @@ UNNAMED = "#"
 """Mark before the number of an unwanted field whose own name is missing or taken."""
 WELL_QUOTED = r'^("[^"]*"|[^",]*)(,("[^"]*"|[^",]*))*$'
 """Pattern of a line whose quotes surround whole fields."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The layout of a file's lines.
-
-    Args:
-        names: names of all fields, in the file's order, as in the raw schema.
-        dtypes: types of the wanted fields.
-        required: wanted fields that may not be empty.
-        thousands: wanted numeric fields that may carry thousands separators.
-        bounds: lowest and highest allowed value of numeric fields.
-        choices: allowed values of text fields, in lower case.
-        header_lines: 1 if line 1 names the fields, else 0.
-        blanks: whether runs of blanks separate fields instead of commas.
-    """
-
-    names: tuple[str, ...]
-    dtypes: Mapping[str, pl.DataType]
-    required: frozenset[str]
-    thousands: frozenset[str] = frozenset()
-    bounds: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
-    choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    header_lines: int = 1
-    blanks: bool = False
-
-    @property
-    def separator(self) -> str:
-        """Character between fields, once runs of blanks are squeezed."""
-        return " " if self.blanks else ","
 
 
 @dataclass(frozen=True)
