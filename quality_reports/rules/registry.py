@@ -119,11 +119,17 @@ def select_broken(
 ) -> tuple[Rule, ...]:
     """Select the rules that any of a subset's prepared entries breaks, by the Pandera checks.
 
+    Pandera makes a pass per rule: a single pass over all of them leaves it the few that are broken.
+
     Raises:
         ThresholdError: see `resolve`.
     """
+    limits = resolve(rules, thresholds)
+    passed = entries.select(~rule.broken(limits).any().alias(rule.name) for rule in rules).to_dicts()
+    doubtful = tuple(rule for rule in rules if not passed[0][rule.name])
+    own = {name: limits[name] for rule in doubtful for name in rule.defaults}
     try:
-        as_schema(rules, thresholds).validate(entries, lazy=True)
+        as_schema(doubtful, own).validate(entries, lazy=True)
     except SchemaErrors as broken:
         names = {error.check.name for error in broken.schema_errors if error.check is not None}
         return tuple(rule for rule in rules if rule.name in names)
