@@ -12,6 +12,7 @@ import polars as pl
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.ingest.memory_budget import MemoryBudget
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_table
+from tracklake.pipeline.lake.catalog import ADDED
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import account_rows
@@ -208,7 +209,7 @@ def build(root: Path, job: Job) -> Commit:
     else:
         with MEMORY_BUDGET.reserve(sum(map(measure_unpacked, files))):
             tables, info = _build_recording(root, job, [Part(file) for file in files])
-    facts = {"dataset": job.inputs["dataset"], "recording": recording}
+    facts = {"dataset": job.inputs["dataset"], "recording": recording, ADDED: sorted(VEHICLES.added)}
     return make_commit(job, tables, {**facts, **info}, started)
 
 

@@ -36,6 +36,9 @@ JOINED: dict[str, tuple[Table, tuple[str, ...]]] = {
 }
 """Views that show columns of a later stage beside those that ingestion wrote."""
 
+ADDED = "added_columns"
+"""Fact of a commit: columns in its files that files of earlier lakes of the same schema version lack."""
+
 _TABLE = r"\bmain\.(\w+)"
 """Pattern of a table's name in a macro's statement."""
 
@@ -100,35 +103,46 @@ def _write_select(table: Table, manifest: Manifest, locate: Callable[[str], str]
 def _write_read(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
     paths = [file.path for file in manifest.live(table.name)]
     files = [quote(locate(path)) for path in paths]
+    complete = _are_complete(table, manifest)
     if not files:
         columns = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.dtypes.items())
         return f"SELECT {columns} WHERE false"
     # Qualified, as a macro's parameter takes the place of every other name like it.
     columns = ", ".join(f'file."{name}"' for name in table.dtypes)
     if not table.partition:
-        return f"SELECT {columns} FROM {_read_files(table, files, 'hive_partitioning = false')} AS file"
+        read = _read_files(table, files, "hive_partitioning = false", complete=complete)
+        return f"SELECT {columns} FROM {read} AS file"
     if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
         # A folder above the lake looks like a partition, and DuckDB would believe it.
-        return " UNION ALL ".join(_write_read_of_file(table, path, locate) for path in paths)
+        return " UNION ALL ".join(_write_read_of_file(table, path, locate, complete=complete) for path in paths)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
     options = f"hive_partitioning = true, hive_types = {{{types}}}"
-    return f"SELECT {columns} FROM {_read_files(table, files, options)} AS file"
+    return f"SELECT {columns} FROM {_read_files(table, files, options, complete=complete)} AS file"
 
 
-def _read_files(table: Table, files: list[str], options: str) -> str:
-    """Return what reads files given as literals, with null for columns that files of earlier lakes lack."""
-    read = f"read_parquet([{', '.join(files)}], {options}{', union_by_name = true' if table.added else ''})"
+def _read_files(table: Table, files: list[str], options: str, *, complete: bool) -> str:
+    """Return what reads files given as literals; where they are not complete, with null for columns that they lack."""
+    if complete:
+        return f"read_parquet([{', '.join(files)}], {options})"
     nothing = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.added.items())
-    return f"(SELECT {nothing} WHERE false UNION ALL BY NAME SELECT * FROM {read})" if nothing else read
+    read = f"read_parquet([{', '.join(files)}], {options}, union_by_name = true)"
+    return f"(SELECT {nothing} WHERE false UNION ALL BY NAME SELECT * FROM {read})"
 
 
-def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str]) -> str:
+def _are_complete(table: Table, manifest: Manifest) -> bool:
+    """Return whether no file of a table lacks a column; to look into each would take longer than all else."""
+    commits = manifest.commits.values() if table.added else ()
+    return all({*table.added} <= {*commit.info.get(ADDED, ())} for commit in commits if table.name in commit.files)
+
+
+def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str], *, complete: bool) -> str:
     stated = read_partition(table, path)
     columns = ", ".join(
         f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'file."{name}"'
         for name, dtype in table.dtypes.items()
     )
-    return f"SELECT {columns} FROM {_read_files(table, [quote(locate(path))], 'hive_partitioning = false')} AS file"
+    read = _read_files(table, [quote(locate(path))], "hive_partitioning = false", complete=complete)
+    return f"SELECT {columns} FROM {read} AS file"
 
 
 def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest) -> None:

@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -169,7 +170,7 @@ def test_scan_reads_only_what_is_asked_for(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stored", [0, 1_000])
-@pytest.mark.parametrize("older", [("a",), ("b",), ("a", "b")])
+@pytest.mark.parametrize("older", [("a",), ("b",), ("a", "b"), ()])
 def test_files_of_an_earlier_lake_lack_a_column_that_is_null_then(tmp_path: Path, monkeypatch, older, stored: int):
     monkeypatch.setattr(catalog, "STORED_ROWS", stored)
     parts = {key: {"dataset": "tgsim", "subset": key} for key in ("a", "b")}
@@ -181,7 +182,8 @@ def test_files_of_an_earlier_lake_lack_a_column_that_is_null_then(tmp_path: Path
                 "mean_speed_mps": 5.0,
             }  # fmt: skip
             made = pl.DataFrame([row], schema=VEHICLES.dtypes)
-            writer.commit(put(tmp_path, key, 1, made, VEHICLES, **values))
+            facts = {} if key in older else {catalog.ADDED: ["automated"]}
+            writer.commit(replace(put(tmp_path, key, 1, made, VEHICLES, **values), info=facts))
             if key in older:
                 (file,) = (one for one in load(tmp_path).live("vehicles") if f"subset={key}" in one.path)
                 before = pl.read_parquet(tmp_path / file.path, hive_partitioning=False, glob=False).drop("automated")
