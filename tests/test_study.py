@@ -21,6 +21,7 @@ from study.tables import NOTHING, TABLES, pool_scores, read_table, select_comple
 
 from tracklake.pipeline.cli.train import read_model_settings
 from tracklake.training.models import MODELS, find_model
+from tracklake.training.onboard.as_published import CONSTANT, DIFFERENCE, OURS, PUBLISHED
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEMPLATES = Path(__file__).parents[1] / "benchmarks" / "study"
@@ -144,7 +145,44 @@ def test_a_run_with_other_defaults_than_now_is_made_again(tiny, tmp_path, monkey
     trained = [words for words in said if words[0] == "train"]
     assert len(trained) == 6
     assert all("--anew" in words for words in trained)
-    assert sum(words[0] == "evaluate" for words in said) == 10  # evidence is of the first seed alone
+    assert sum(words[0] == "evaluate" for words in said) == 6
+    assert sum("--evidence" in words for words in said) == 4  # of the first seed alone
+
+
+def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_path, monkeypatch):
+    workshop, _, _ = tiny
+    arm = replace(TINY, name="woods", plain=(), learners=(), folds=(0,), forest=("--as-published",), pairs=())
+    row = {"figure": "cell", "model": "ctrv", "grid": "around the place now", "seconds": 2.0, "n": 50, "vehicles": 7}
+    shares = [
+        row | {"forest": forest, "value": value, "low": value - 0.1, "high": value + 0.1}
+        for forest, value in ((OURS, 0.5), (PUBLISHED, 0.7), (DIFFERENCE, 0.2), (CONSTANT, 0.4))
+    ]
+    said = []
+
+    def call(words, _):
+        said.append(words)
+        if words[0] == "lane-forest":
+            out = Path(words[words.index("--lake") + 1]) / "models" / "lane-forest"
+            out.mkdir()
+            (out / "lane_forest.json").write_text(json.dumps({"as_published": {"shares": shares}}))
+        return 0
+
+    other = Workshop(shutil.copytree(workshop.work, tmp_path / "work"), workshop.data, at_once=1, call=call)
+    for module in ("study.page", "study.results"):
+        monkeypatch.setattr(f"{module}.PIECES", (replace(PIECES[0], name="woods", arms=(arm,)),))
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    for _ in range(2):
+        run_arms([arm], other, docs, only_gather=False)
+    assert [words[0] for words in said] == ["run", "lane-forest", "run"]
+    assert "--as-published" in said[1]
+    table = read_table(docs, "forests")
+    assert (table.height, table["arm"].unique().to_list()) == (4, ["woods"])
+    page = render_pages(Results.read(docs))["results.md"]
+    assert "| 40.0 (30.0 to 50.0) | 50.0 (40.0 to 60.0) | 70.0 (60.0 to 80.0) | **+20.00 (+10.00 to +30.00)** |" in page
+    assert "| cell | 2 s, ctrv, around the place now | 50 | 7 |" in page
+    assert "none has been run" not in page
+    assert read_table(docs, "lakes")["arm"].to_list() == ["woods"]
 
 
 def test_pages_of_a_study_print_its_digests_and_call_nothing_better_without_an_interval(tiny, monkeypatch):

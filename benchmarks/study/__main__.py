@@ -19,7 +19,7 @@ from study.jobs import ROOT, Workshop
 from study.page import write_pages
 from study.pieces import PIECES
 from study.plan import Arm, Piece, estimate_pieces, make_quick
-from study.tables import update_tables
+from study.tables import update_forests, update_tables
 
 
 def main(words: Sequence[str] | None = None, **tools: object) -> int:
@@ -55,6 +55,9 @@ def run_arms(arms: Sequence[Arm], workshop: Workshop, docs: Path, *, only_gather
         workshop.work_on(job for arm in arms for job in workshop.list_jobs(arm))
     for arm in arms:
         update_tables(docs, arm, list(workshop.list_jobs(arm)))
+        for lake in workshop.find_lakes(arm) if arm.forest else ():
+            if file := workshop.score_forest(lake, only_gather=only_gather):
+                update_forests(docs, lake, file)
 
 
 def print_plan(pieces: Sequence[Piece]) -> None:

@@ -21,6 +21,8 @@ from typing import Any
 import polars as pl
 
 from study.plan import Arm, Learner, Source, estimate_run
+from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST_FOLDER
+from tracklake.pipeline.cli.lane_forest import SCORES as FOREST_SCORES
 from tracklake.pipeline.cli.train import read_model_settings
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS, TENSORS
@@ -290,21 +292,33 @@ class Workshop:
             return
         if job.home is not None:
             lend_run(job)
-        if not job.scores.exists():
-            self.evaluate(job, job.scores, "--out", SCORES, "--vehicle-errors", VEHICLES)
-        if job.evidence is not None and not job.evidence.exists():
-            self.evaluate(job, job.evidence, *EVIDENCE, "--evidence", "")
+        due = {job.scores: ("--out", SCORES, "--vehicle-errors", VEHICLES)}
+        if job.evidence is not None:
+            due[job.evidence] = (*EVIDENCE, "--evidence", "")
+        self.evaluate(job, {out: options for out, options in due.items() if not out.exists()})
 
-    def evaluate(self, job: Job, out: Path, *options: str) -> None:
-        """Evaluate a run into a folder that exists once it is complete; options that are files are put into it."""
-        aside = out.with_name(f"{out.name}.unfinished")
-        shutil.rmtree(aside, ignore_errors=True)
-        aside.mkdir(parents=True)
-        files = [str(aside / word) if not word.startswith("--") else word for word in options]
-        tested = job.learner.tested if job.learner else ()
-        words = ("evaluate", job.run, *job.lake.options, "--no-published", *tested, *files)
-        if self.run(*words, environment=job.lake.environment):
-            aside.rename(out)
+    def evaluate(self, job: Job, due: Mapping[Path, tuple[str, ...]]) -> None:
+        """Evaluate a run into folders that exist once they are complete; options that are files are put into them."""
+        words = ["evaluate", job.run, *job.lake.options, "--no-published", *(job.learner.tested if job.learner else ())]
+        aside = {out: out.with_name(f"{out.name}.unfinished") for out in due}
+        for out, options in due.items():
+            shutil.rmtree(aside[out], ignore_errors=True)
+            aside[out].mkdir(parents=True)
+            words += [word if word.startswith("--") else str(aside[out] / word) for word in options]
+        if due and self.run(*words, environment=job.lake.environment):
+            for out, unfinished in aside.items():
+                unfinished.rename(out)
+
+    def score_forest(self, lake: Lake, *, only_gather: bool) -> Path | None:
+        """Fit and score the forests of a lake, unless that is done; returns their scores, None where there are none."""
+        digest = make_digest([lake.root.name, lake.digest, lake.arm.forest])
+        file = self.work / "scores" / f"forest-{digest}.json"
+        words = ("lane-forest", "constant-velocity", *lake.options, *lake.arm.forest)
+        is_due = lake.index is not None and not file.exists() and not only_gather
+        if is_due and self.run(*words, environment=lake.environment):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_file(file, (lake.root / MODELS / FOREST_FOLDER / FOREST_SCORES).read_bytes())
+        return file if file.exists() else None
 
     def train(self, job: Job, own: Learner) -> bool:
         """Train a run if there is none yet; returns whether there is one."""

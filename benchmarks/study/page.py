@@ -13,6 +13,7 @@ from study.results import FEW, Results, find_dataset, grid, judge
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
+from tracklake.training.onboard.as_published import CONSTANT, DIFFERENCE, OURS, PUBLISHED
 
 FIGURES = {
     "rmse_m": "RMSE, m",
@@ -43,7 +44,7 @@ def render_pages(results: Results) -> dict[str, str]:
     """Render both pages, by name; UnprovenError where a text claims what no interval shows."""
     loader = FileSystemLoader(Path(__file__).parent)
     templates = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    has = set(results.tables["seeds"]["arm"])
+    has = {arm for name in ("seeds", "forests") for arm in results.tables[name]["arm"]}
     given = {
         "results": results,
         "pieces": [piece for piece in PIECES if any(arm.name in has for arm in piece.arms)],
@@ -218,6 +219,32 @@ def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
     return grid(["model", *(f"{at:g} s" for at in seconds)], body)
 
 
+def lay_out_forests(results: Results, arm: Arm) -> str:
+    """Lay out shares of right maneuvers and cells by both forests, in per cent, with intervals over vehicles."""
+    rows = results.of_arm("forests", arm.name)
+    key = ["figure", "model", "grid", "seconds"]
+    body = []
+    for (figure, model, grid_name, seconds), own in rows.group_by(key, maintain_order=True):
+        by_forest = {row["forest"]: row for row in own.to_dicts()}
+        shares = [_format_bounds(by_forest.get(name), ".1f") for name in (CONSTANT, OURS, PUBLISHED)]
+        at = "" if seconds is None else f"{seconds:g} s, {model}, {grid_name}"
+        counts = [_format(own["n"][0]), _format(own["vehicles"][0])]
+        body.append([figure.replace("_", " "), at, *counts, *shares, _format_bounds(by_forest[DIFFERENCE], "+.2f")])
+    heads = ["right", "cells", "n", "vehicles", CONSTANT, OURS, PUBLISHED, "as published - ours"]
+    return grid(heads, body) if body else ""
+
+
+def _format_bounds(row: dict[str, float] | None, form: str) -> str:
+    """Format a share in per cent with its interval; a difference in bold where the interval excludes zero."""
+    if row is None:
+        return "-"
+    value, low, high = (None if row[name] is None else 100 * row[name] for name in ("value", "low", "high"))
+    if low is None or high is None:
+        return f"{value:{form}}"
+    text = f"{value:{form}} ({low:{form}} to {high:{form}})"
+    return f"**{text}**" if form.startswith("+") and (low > 0 or high < 0) else text
+
+
 def _pool(name: str, *, root: bool = False) -> pl.Expr:
     """Average a column by the number of samples, its squares where `root`; null where a fold lacks it."""
     figure = pl.col(name) ** 2 if root else pl.col(name)
@@ -237,6 +264,7 @@ TABLES_OF_ARM = (
     lay_out_feasibility,
     lay_out_prices,
     lay_out_leakage,
+    lay_out_forests,
 )
 """Functions that the templates call with an arm."""
 

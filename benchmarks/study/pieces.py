@@ -133,6 +133,16 @@ DAMAGED = tuple(
     for title, settings in (("", {}), (", reconstructed", REPAIRED))
 )
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
+FOREST = Arm("forest", IDM, (), (), protocol="grid-2021", settings={"TRACKLAKE_RECONSTRUCT": "false"})
+FOREST_TEXT = (
+    "The forest of Choi et al. (2021), by information gain, votes on the maneuver from twelve features, and the "
+    "maneuver is the column at every horizon; ours predicts the lane at each horizon from 21 features "
+    "([training.md](training.md#lane-change-forest)). Both learn from the same 70 % of all vehicles and are scored on "
+    "the others, whatever the split of the tensors; another division and another seed were not tried. Drivers change "
+    "lanes in a time of their own; labels take 4 s. Rows of cells are those of a model's places. A true place outside "
+    "the nine cells is never right; clipped: outer columns and rows have no end; one against rest: the mean over nine "
+    "yes-or-no answers, in which a wrong cell costs two ninths."
+)
 
 PIECES = (
     Piece(
@@ -311,5 +321,20 @@ PIECES = (
                 pairs=pair_with(LEARNER, DAMAGED),
             ),
         ),
+    ),
+    Piece(
+        "forest",
+        3,
+        "Lane changes by a forest, as published and ours",
+        FOREST_TEXT,
+        (replace(FOREST, forest=("--as-published",)),),
+    ),
+    Piece(
+        "decoder",
+        6,
+        "Lane changes by a forest, with the decoder as published",
+        "The same, with 1,000 examples, and with the decoder that is fed with its own output: it is trained until "
+        "three epochs bring no smaller loss on an eighth of the training vehicles, or for 20 epochs.",
+        (replace(FOREST, name="decoder", forest=("--as-published", "--examples", "1000", "--epochs", "20")),),
     ),
 )

@@ -1,6 +1,6 @@
 """Recordings, models, arms and pieces of a study, and an estimate of the time that each takes."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from tracklake.schemas.evaluations import EVERYTHING
@@ -69,6 +69,7 @@ class Arm:
         plain: models without networks; the best of them at a horizon is the baseline there.
         pairs: models that are compared with each other, besides with the baselines.
         dataset: the part of the data that tables show, where some of the models are scored on it alone.
+        forest: options of `tracklake lane-forest`, where the arm is one of forests that predict lane changes.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Arm:
     folds: tuple[int, ...] = ()
     pairs: tuple[tuple[str, str], ...] = ()
     dataset: str = EVERYTHING
+    forest: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,25 @@ SPEEDS = {
 """Samples (of attention: scenes) that a training takes in a second on one thread, measured on two idle cores."""
 OVERHEAD_S, LAKE_S = 12.0, 40.0
 """Seconds of a run besides its training (starts, scores), and of making a lake."""
+QUICK_MODELS = 4
+"""Models of an arm of the quick study."""
+QUICK_FOREST = {"--examples": "200", "--epochs": "1"}
+"""Values of options of forests in the quick study."""
+FOREST_S = 45.0
+"""Seconds of fitting and scoring the forests of an arm, without a decoder."""
 
 
 def estimate_run(learner: Learner) -> float:
     """Estimate the seconds of one training and its scores, on one of two idle cores."""
     return OVERHEAD_S + learner.samples * learner.epochs / SPEEDS[learner.model]
+
+
+def estimate_decoder(options: Sequence[str]) -> float:
+    """Estimate the seconds of training the decoder beside a forest: on three copies of the examples, for all epochs."""
+    examples, epochs = (
+        int(options[options.index(name) + 1]) if name in options else 0 for name in ("--examples", "--epochs")
+    )
+    return 3 * examples * epochs / SPEEDS["lstm-encoder-decoder"]
 
 
 def estimate_pieces(pieces: Iterable[Piece]) -> dict[str, tuple[int, float]]:
@@ -129,6 +145,8 @@ def list_work(arm: Arm) -> Iterator[tuple[tuple[object, ...], float]]:
         lake = repr((arm.source, arm.protocol, arm.settings, fold))
         yield (lake,), LAKE_S
         yield from (((lake, model), OVERHEAD_S / 4) for model in arm.plain)
+        if arm.forest:
+            yield (lake, repr(arm.forest)), FOREST_S + estimate_decoder(arm.forest)
         for own in arm.learners:
             home = repr((own.source or arm.source, arm.protocol, {**arm.settings, **own.settings}, fold))
             yield (home,), LAKE_S
@@ -142,22 +160,28 @@ def shorten(source: Source) -> Source:
 
 
 def make_quick(piece: Piece) -> Piece:
-    """Make a piece so small that it shows only that everything runs: two folds, one seed, two short epochs.
+    """Make a piece so small that it shows only that everything runs: one short block, one seed, two short epochs.
 
-    Of the models that are trained on other recordings, it has one.
+    Of the models that are trained on other recordings, it has one, of those that are trained in the arm's own lake the
+    first few of each arm.
     """
-    left_out = [own.name for arm in piece.arms for own in arm.learners if own.source][1:]
+    elsewhere = [own.name for arm in piece.arms for own in arm.learners if own.source]
+    at_home = [[own.name for own in arm.learners if not (own.source or own.settings)] for arm in piece.arms]
+    left_out = {*elsewhere[1:], *(name for names in at_home for name in names[QUICK_MODELS:])}
     arms = tuple(
         replace(
             arm,
-            folds=arm.folds[:2],
+            folds=arm.folds[1:2],
             learners=tuple(
                 replace(own, seeds=1, samples=600, epochs=2, source=own.source and shorten(own.source))
                 for own in arm.learners
                 if own.name not in left_out
             ),
             source=shorten(arm.source),
-            settings={**arm.settings, **({"TRACKLAKE_SPLIT_BLOCK_S": "10"} if arm.source.sample else {})},
+            settings={**arm.settings, "TRACKLAKE_SPLIT_BLOCK_S": "10" if arm.source.sample else "60"},
+            forest=tuple(
+                QUICK_FOREST.get(before, word) for before, word in zip(("", *arm.forest), arm.forest, strict=False)
+            ),
         )
         for arm in piece.arms
     )

@@ -36,6 +36,11 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
         **dict.fromkeys(("seconds", "samples_per_s", "best_epoch", "validation_loss"), NUMBER),
     },
     "curves": {**KEY, "lake": TEXT, "epoch": WHOLE, "phase": TEXT, "loss": NUMBER, "validation_loss": NUMBER},
+    "forests": {
+        **dict.fromkeys(("arm", "figure", "model", "grid"), TEXT),
+        **{"seconds": NUMBER, "forest": TEXT, "n": WHOLE, "vehicles": WHOLE},
+        **dict.fromkeys(("value", "low", "high"), NUMBER),
+    },
     "lakes": {
         **dict.fromkeys(("arm", "lake", "protocol", "protocol_digest", "split", "split_digest", "tensors"), TEXT),
         **dict.fromkeys(("train", "val", "eval"), WHOLE),
@@ -80,6 +85,19 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
         "lakes": pl.DataFrame([describe_lake(lake) for lake in lakes], schema=TABLES["lakes"]),
     }
     found |= {name: read_evidence(done, name) for name in EVIDENCE_TABLES}
+    replace_rows(docs, arm, found)
+
+
+def update_forests(docs: Path, lake: Lake, file: Path) -> None:
+    """Replace the rows of an arm of forests by the scores of its lake."""
+    record = json.loads(file.read_text(encoding="utf-8"))["as_published"]
+    rows = [{"arm": lake.arm.name, **row} for row in record["shares"]]
+    found = {"forests": pl.DataFrame(rows, schema=TABLES["forests"])}
+    replace_rows(docs, lake.arm, found | {"lakes": pl.DataFrame([describe_lake(lake)], schema=TABLES["lakes"])})
+
+
+def replace_rows(docs: Path, arm: Arm, found: Mapping[str, pl.DataFrame]) -> None:
+    """Replace an arm's rows of committed tables."""
     for name, table in found.items():
         kept = read_table(docs, name).filter(pl.col("arm") != arm.name)
         whole = pl.concat([kept, table.select(*TABLES[name])]).with_columns(pl.selectors.float().round(DIGITS))

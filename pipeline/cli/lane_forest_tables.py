@@ -129,6 +129,12 @@ def show_published(terminal: Terminal, scores: PublishedScores, *, published: bo
         by_model.setdefault(error.model, []).append(error.mae_m)
     rows = [[model, *(format_number(own, 2) for own in mae_m)] for model, mae_m in by_model.items()]
     _show_table(terminal, "MAE, m", [f"{ahead:g} s" for ahead in V2V.scored_s], rows)
+    if scores.decoder:
+        epochs, best = len(scores.decoder.losses), scores.decoder.best + 1
+        ended = "converged" if scores.decoder.converged else "not converged: give more --epochs"
+        terminal.print_line(
+            f"decoder: {epochs} epochs, the smallest loss on vehicles held back after {best}; {ended}", style="dim"
+        )
     if scores.learning_curve:
         rows = [
             [f"{own.drawn:,}", _format_percent(own.train_accuracy), _format_percent(own.eval_accuracy)]

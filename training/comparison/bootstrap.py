@@ -225,17 +225,33 @@ def bound_shares(hits: Floats, n: Floats) -> tuple[Floats, Floats]:
     drawn together (Cochran 1977, Sampling Techniques, section 6.4). Of none or all, the outer bound is exact where
     every vehicle counts once and by itself (Clopper and Pearson 1934, Biometrika 26).
     """
-    total = n.sum(axis=0)
-    share = hits.sum(axis=0) / np.maximum(total, 1)
+    share, half = find_mean_half_widths(hits, n)
     vehicles = (n > 0).sum(axis=0)
-    first = np.arange(0, len(n), limit_group(len(n)))
-    groups = (np.add.reduceat(n, first) > 0).sum(axis=0)
-    squares = (np.add.reduceat(hits - share * n, first) ** 2).sum(axis=0) * groups / np.maximum(groups - 1, 1)
-    quantile = [find_quantile(max(int(count) - 1, 1)) for count in groups]
-    half = np.where(vehicles > 1, quantile * np.sqrt(squares) / np.maximum(total, 1), np.nan)
     alike = np.where(vehicles > 1, 0.025 ** (1 / np.maximum(vehicles, 1)), np.nan)
     low = np.where(share == 1, alike, np.maximum(share - half, 0.0))
     return low, np.where(share == 0, 1 - alike, np.minimum(share + half, 1.0))
+
+
+def find_mean_half_widths(sums: Floats, n: Floats) -> tuple[Floats, Floats]:
+    """Find means (K,) from sums and counts (V, K) of vehicles, and half the widths of their intervals, as above."""
+    total = n.sum(axis=0)
+    mean = sums.sum(axis=0) / np.maximum(total, 1)
+    first = np.arange(0, len(n), limit_group(len(n)))
+    groups = (np.add.reduceat(n, first) > 0).sum(axis=0)
+    squares = (np.add.reduceat(sums - mean * n, first) ** 2).sum(axis=0) * groups / np.maximum(groups - 1, 1)
+    quantile = [find_quantile(max(int(count) - 1, 1)) for count in groups]
+    half = np.where((n > 0).sum(axis=0) > 1, quantile * np.sqrt(squares) / np.maximum(total, 1), np.nan)
+    return mean, half
+
+
+def estimate_differences(differences: Floats, vehicle: Integers) -> tuple[Floats, Floats, Floats]:
+    """Find the means of differences (B, K) of vehicles (B,), and their intervals: (K,) each."""
+    number = np.unique(vehicle, return_inverse=True)[1]
+    sums = np.zeros((int(number.max()) + 1, differences.shape[1]))
+    np.add.at(sums, number, differences)
+    n = np.broadcast_to(np.bincount(number).astype(np.float64)[:, None], sums.shape)
+    mean, half = find_mean_half_widths(sums, n)
+    return mean, mean - half, mean + half
 
 
 def estimate_shares(inside: Flags, vehicle: Integers) -> tuple[Floats, Floats, Floats, int, int]:

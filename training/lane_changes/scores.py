@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tracklake.schemas.arrays import Bytes, Flags, Integers, Singles
+from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.observed import FutureInputError, ObservedScene
@@ -213,7 +213,7 @@ def score_cells(
 ) -> Iterator[CellScore]:
     """Score predicted columns and rows (S, T, 2): one score for each horizon and stratum."""
     true_cell, own_cell = (number_cells(codes[..., 0], codes[..., 1]) for codes in (true, own))
-    confused = (own_cell != true_cell) * ((own_cell >= 0) + (true_cell >= 0).astype(np.float64))  # of nine cells
+    against_rest = compare_with_rest(own_cell, true_cell)
     right = (own == true) & (np.abs(true) < OUTSIDE)
     clipped = (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1)
     for horizon, seconds in enumerate(horizons_s):
@@ -227,11 +227,17 @@ def score_cells(
                 row=_mean(right[of, horizon, 1]),
                 lane=_mean(right[of, horizon, 0]),
                 cell_clipped=_mean(clipped[of, horizon]),
-                one_against_rest=1 - float(confused[of, horizon].mean()) / 9 if len(cells) else None,
+                one_against_rest=float(against_rest[of, horizon].mean()) if len(cells) else None,
                 majority=int(inside.max()) / len(cells) if len(cells) else None,
                 own_lane=_mean(true[of, horizon, 0] == 0),
                 outside=_mean(cells < 0),
             )
+
+
+def compare_with_rest(own: Codes, true: Codes) -> Floats:
+    """Return of each sample the share of the nine cells that it is rightly said to be in or not: 1 less two ninths."""
+    wrong: Floats = (own != true) * ((own >= 0) + (true >= 0).astype(np.float64))
+    return 1 - wrong / 9
 
 
 def _mean(flags: Flags) -> float | None:

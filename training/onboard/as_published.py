@@ -5,14 +5,21 @@ decoder that is fed with its own output and predicts places; twelve features, st
 the vehicles train. Our forest predicts the lane at each horizon, from 21 features of its own.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from tracklake.schemas.arrays import Bytes, Singles
+from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
+from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.protocols import V2V
+from tracklake.training.comparison.bootstrap import estimate_differences, estimate_shares
 from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.lane_changes.cells import OUTSIDE, number_cells
 from tracklake.training.lane_changes.examples import (
     LabelledSamples,
     LaneForestSettings,
@@ -22,13 +29,20 @@ from tracklake.training.lane_changes.examples import (
     read_targets,
 )
 from tracklake.training.lane_changes.forest import decide_classes, fit_examples
-from tracklake.training.lane_changes.scores import COLUMNS, CellScore, ManeuverScore, score_cells, score_maneuvers
+from tracklake.training.lane_changes.scores import (
+    COLUMNS,
+    CellScore,
+    ManeuverScore,
+    compare_with_rest,
+    score_cells,
+    score_maneuvers,
+)
 from tracklake.training.onboard.maneuvers import AT, fit_forest
 from tracklake.training.onboard.models import CTRV, predict_turns
 from tracklake.training.onboard.overhead import OverheadSamples, build_overhead, find_road_cells
-from tracklake.training.onboard.samples import Samples, split_samples
+from tracklake.training.onboard.samples import Parts, Samples, split_samples
 from tracklake.training.onboard.scores import OnboardLearningPoint, group_samples, learn_curve
-from tracklake.training.onboard.training import run_network, train_network
+from tracklake.training.onboard.training import Watch, run_network, train_network
 from tracklake.training.runs.config import TrainConfig
 
 MOST = 50_000
@@ -37,8 +51,14 @@ GRIDS = {"around the place now": True, "around constant velocity": False}
 """Grids by what their rows lie around, and whether that is the place now, relative to the vehicle behind."""
 DECODER = "lstm-encoder-decoder"
 """Network of the publication, by its name in `models.NETWORKS`."""
-PUBLISHED, OURS = "as published", "ours"
-"""Names of the two forests."""
+HELD_BACK, PATIENCE = 1 / 8, 3
+"""Share of the training vehicles that end the decoder's training, and epochs without a smaller loss on them."""
+PUBLISHED, OURS, DIFFERENCE = "as published", "ours", "difference"
+"""Names of the two forests, and of the first minus the second."""
+CONSTANT = "always the commonest"
+"""Name of the answer that is the same for all samples: the commonest maneuver or cell."""
+SHARES = ("maneuver", *LATERAL_MANEUVERS, "cell", "cell_clipped", "one_against_rest")
+"""Shares with intervals: right maneuvers, of all samples and of each true maneuver; of cells as in `CellScore`."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +72,45 @@ class PlaceError:
 
 
 @dataclass(frozen=True)
+class ShareScore:
+    """A share of n samples of some vehicles, or the difference of both forests, with its 95 % interval over vehicles.
+
+    `figure` is one of SHARES, `grid` one of GRIDS, `forest` PUBLISHED, OURS, DIFFERENCE or CONSTANT. Rows of cells
+    are those of a model's places, columns the forest's. Of maneuvers, `model`, `grid` and `seconds` are null.
+    """
+
+    figure: str
+    model: str | None
+    grid: str | None
+    seconds: float | None
+    forest: str
+    n: int
+    vehicles: int
+    value: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class DecoderCourse:
+    """Course of the decoder's training: losses by epoch, and the epoch, from 0, whose weights were kept.
+
+    `converged` tells whether PATIENCE epochs brought no smaller loss on the vehicles that were held back.
+    """
+
+    best: int
+    converged: bool
+    losses: list[float]
+    validation_losses: list[float]
+
+
+@dataclass(frozen=True)
 class PublishedScores:
     """Scores of the arm as published and of our forest, on the vehicles that do not train.
 
     `samples` and `vehicles` are counts by part, `train` and `eval`. `cells` are by grid, see GRIDS, `maneuvers` by
-    forest, PUBLISHED and OURS. `left_out` counts samples without a vehicle behind.
+    forest, PUBLISHED and OURS; `shares` are the same with intervals. `left_out` counts samples without a vehicle
+    behind. `decoder` is null where it was not trained.
     """
 
     samples: dict[str, int]
@@ -65,6 +119,8 @@ class PublishedScores:
     features: list[str]
     cells: dict[str, list[CellScore]]
     maneuvers: dict[str, list[ManeuverScore]]
+    shares: list[ShareScore]
+    decoder: DecoderCourse | None
     errors: list[PlaceError]
     learning_curve: list[OnboardLearningPoint]
 
@@ -81,8 +137,8 @@ def score_published(
     """Fit the forest as published and ours on 70 % of all vehicles, and score both on the others.
 
     The parts of the folder's split are put together and divided again, by vehicle: vehicles of both parts drive beside
-    each other, as in the publication. With `epochs`, the decoder is trained, too, on the samples that the forest drew
-    from.
+    each other, as in the publication. With `epochs`, the decoder is trained, too, until it converges
+    (`DecoderCourse`), or for so many epochs.
 
     Raises:
         TracklakeError: the folder's ticks are not those of the publication; there are too few vehicles, or all keep
@@ -95,14 +151,10 @@ def score_published(
     held_out = everything.select(np.flatnonzero(~is_train))
     columns = {PUBLISHED: forest.decide(parts.eval)}
     columns[OURS] = _decide_ours(folder, everything.select(np.flatnonzero(is_train)), held_out, settings, seed)
-    predicted = {CTRV: predict_turns(parts.eval)}
+    predicted, course = {CTRV: predict_turns(parts.eval)}, None
     if epochs:
-        drawn = draw_balanced(parts.train.stratum, settings.examples, np.random.default_rng(seed))
-        config = TrainConfig(epochs=epochs, seed=seed)
-        network = train_network(
-            DECODER, parts._replace(train=parts.train.select(drawn)), config, progress, anchored=False
-        )
-        predicted[DECODER] = run_network(network, parts.eval)
+        places, course = _train_decoder(parts, settings.examples, TrainConfig(epochs=epochs, seed=seed), progress)
+        predicted[DECODER] = places
     return PublishedScores(
         samples={"train": len(parts.train), "eval": len(parts.eval)},
         vehicles={name: len(np.unique(own.vehicle)) for name, own in (("train", parts.train), ("eval", parts.eval))},
@@ -110,9 +162,29 @@ def score_published(
         features=[row.feature for row in forest.coefficients if row.chosen],
         cells={name: list(_score_grid(held_out, predicted, columns, around_now=now)) for name, now in GRIDS.items()},
         maneuvers={name: _score_maneuvers(parts.eval, decided[:, 0]) for name, decided in columns.items()},
+        shares=list(compare_forests(held_out, predicted, columns)),
+        decoder=course,
         errors=list(_measure_errors(parts.eval, predicted)),
         learning_curve=learn_curve(parts, seed, maneuver_alone=True) if with_curve else [],
     )
+
+
+def _train_decoder(
+    parts: Parts, examples: int, config: TrainConfig, progress: Callable[[float, float], None] | None
+) -> tuple[Singles, DecoderCourse]:
+    """Train the decoder until the loss on HELD_BACK of the training vehicles stops falling; places (B, F, 2) of `eval`.
+
+    It learns from as many examples of the other training vehicles as the forest does.
+    """
+    random = np.random.default_rng(config.seed)
+    vehicles = np.unique(parts.train.vehicle)
+    held_back = np.isin(parts.train.vehicle, random.permutation(vehicles)[: math.ceil(HELD_BACK * (len(vehicles) - 1))])
+    rest = parts.train.select(np.flatnonzero(~held_back))
+    learned = rest.select(draw_balanced(rest.stratum, examples, random))
+    watch = Watch(parts.train.select(np.flatnonzero(held_back)), PATIENCE)
+    network = train_network(DECODER, parts._replace(train=learned), config, progress, anchored=False, watch=watch)
+    losses, validation_losses = map(list, zip(*watch.losses, strict=True))
+    return run_network(network, parts.eval), DecoderCourse(watch.best, watch.is_over, losses, validation_losses)
 
 
 def _decide_ours(
@@ -141,6 +213,73 @@ def _score_grid(
         for name, column in columns.items():
             joined = np.stack([np.broadcast_to(column, cells.shape[:2]), cells[..., 1]], axis=-1)
             yield from score_cells(model, f"forest {name}", joined, true, V2V.scored_s, groups)
+
+
+def compare_forests(
+    held_out: OverheadSamples, predicted: Mapping[str, Singles], decided: Mapping[str, Bytes]
+) -> Iterator[ShareScore]:
+    """Compare both forests with intervals: maneuvers, and cells whose rows are those of places (B, F, 2) by model."""
+    samples = held_out.samples
+    number = number_vehicles(samples)
+    maneuver = samples.maneuver[:, None]
+    right = {name: own[:, :1] == maneuver for name, own in decided.items()}
+    common = {CONSTANT: maneuver == _pick(maneuver)}
+    yield from _compare_values(("maneuver", None, None), [None], right | common, number)
+    for code, name in enumerate(LATERAL_MANEUVERS):
+        of = np.flatnonzero(samples.maneuver == code)
+        if len(of):
+            flags = {own: values[of] for own, values in right.items()}
+            yield from _compare_values((name, None, None), [None], flags, number[of])
+    columns = {name: COLUMNS[own[:, 1:] if own.shape[1] > 1 else own] for name, own in decided.items()}
+    for (grid, around_now), (model, place_m) in product(GRIDS.items(), predicted.items()):
+        true, rows = (find_road_cells(held_out, own, around_now=around_now) for own in (samples.place_m, place_m))
+        cells = {
+            name: np.stack([np.broadcast_to(column, true.shape[:2]), rows[..., 1]], axis=-1)
+            for name, column in columns.items()
+        }
+        inside = (np.abs(true) < OUTSIDE).all(axis=-1)
+        nine = {name: (own == true).all(axis=-1) & inside for name, own in cells.items()}
+        endless = {name: (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1) for name, own in cells.items()}
+        cell, clipped = (number_cells(own[..., 0], own[..., 1]) for own in (true, true.clip(-1, 1)))
+        said = {name: number_cells(own[..., 0], own[..., 1]) for name, own in cells.items()} | {CONSTANT: _pick(cell)}
+        rest = {name: compare_with_rest(own, cell) for name, own in said.items()}
+        nine[CONSTANT], endless[CONSTANT] = cell == _pick(cell), clipped == _pick(clipped)
+        for figure, values in (("cell", nine), ("cell_clipped", endless), ("one_against_rest", rest)):
+            yield from _compare_values((figure, model, grid), list(V2V.scored_s), values, number)
+
+
+def _pick(codes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Pick the commonest of codes (B, T) at each horizon: (T,); those below 0 do not count."""
+    most = [np.bincount(own[own >= 0], minlength=1).argmax() for own in codes.T]
+    return np.array(most, dtype=codes.dtype)
+
+
+def number_vehicles(samples: Samples) -> Integers:
+    """Number the vehicles of samples (B,) by subset and id, so that those of successive ids stand together."""
+    subset = np.unique(samples.subset, return_inverse=True)[1].astype(np.int64)
+    return subset * (int(samples.vehicle_id.max()) + 1) + samples.vehicle_id
+
+
+def _compare_values(
+    key: tuple[str, str | None, str | None],
+    seconds: Sequence[float | None],
+    values: Mapping[str, Flags | Floats],
+    vehicle: Integers,
+) -> Iterator[ShareScore]:
+    """Find the means of values (B, T), 0 to 1, by forest, and the difference of both, at each horizon."""
+    means = {
+        name: estimate_shares(own.astype(np.bool_), vehicle)[:3]
+        if own.dtype == np.bool_
+        else estimate_differences(own.astype(np.float64), vehicle)
+        for name, own in values.items()
+    }
+    ours, published = (values[name].astype(np.float64) for name in (OURS, PUBLISHED))
+    means[DIFFERENCE] = estimate_differences(published - ours, vehicle)
+    vehicles = len(np.unique(vehicle))
+    for name, figures in means.items():
+        for at, (value, low, high) in zip(seconds, np.stack(figures, axis=-1).tolist(), strict=True):
+            bounds = (None, None) if math.isnan(low) else (low, high)
+            yield ShareScore(*key, at, name, len(vehicle), vehicles, value, *bounds)
 
 
 def _score_maneuvers(samples: Samples, decided: Bytes) -> list[ManeuverScore]:

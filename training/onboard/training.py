@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,8 @@ from tracklake.training.runs.config import TrainConfig, find_device
 from tracklake.training.runs.run_folder import AGAIN, RUN_VERSION, StaleRunError, load_weights, read_config, save_run
 
 if TYPE_CHECKING:
+    import torch
+
     from tracklake.training.onboard.networks import FeatureNetwork
 
 BATCH = 2048
@@ -35,12 +37,42 @@ Progress = Callable[[float, float], None]
 """Called after every epoch with the share that is done, 0 to 1, and the epoch's loss."""
 
 
+@dataclass
+class Watch:
+    """Samples (of vehicles that do not train) by which a training is ended, and its losses so far.
+
+    It ends after `patience` epochs without a smaller loss on them, and the weights of the smallest one are kept.
+    `losses` are those of each epoch, on the training part and on these samples; `best` is the position of the smallest.
+    """
+
+    samples: Samples
+    patience: int
+    losses: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def best(self) -> int:
+        """Position of the epoch with the smallest loss on the samples."""
+        return min(range(len(self.losses)), key=lambda epoch: self.losses[epoch][1])
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the training has ended."""
+        return len(self.losses) - 1 - self.best >= self.patience
+
+
 def train_network(
-    name: str, parts: Parts, config: TrainConfig, progress: Progress | None = None, *, anchored: bool = True
+    name: str,
+    parts: Parts,
+    config: TrainConfig,
+    progress: Progress | None = None,
+    *,
+    anchored: bool = True,
+    watch: Watch | None = None,
 ) -> "FeatureNetwork":
     """Train a network on the training part, with its mirrored and shifted copies; on a CPU the seed decides all.
 
-    Anchored, it predicts deviations from straight places, else places.
+    Anchored, it predicts deviations from straight places, else places. With `watch`, it ends by the loss on samples of
+    that; `watch` then holds the losses.
     """
     import torch
 
@@ -63,6 +95,7 @@ def train_network(
             network.standardise(feature, output)
             network.to(device).train()
             optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate or recipe.learning_rate)
+            weights = network.state_dict()
             for epoch in range(epochs):
                 losses = []
                 order = torch.from_numpy(random.permutation(len(train)))
@@ -77,9 +110,32 @@ def train_network(
                     losses.append(_require_finite(loss.item(), recipe))
                 if progress is not None:
                     progress((epoch + 1) / epochs, sum(losses) / len(losses))
+                if watch is not None:
+                    watch.losses.append((sum(losses) / len(losses), _measure_loss(network, watch.samples, device)))
+                    if watch.best == epoch:
+                        weights = {key: weight.detach().clone() for key, weight in network.state_dict().items()}
+                    if watch.is_over:
+                        break
+            network.load_state_dict(weights)
     finally:
         torch.set_num_threads(threads)
     return network.cpu().eval()
+
+
+def _measure_loss(network: "FeatureNetwork", samples: Samples, device: "torch.device") -> float:
+    """Measure the loss on all known positions of samples, in pieces of BATCH."""
+    import torch
+
+    straight_m = predict_straight(samples, V2V.horizon_ticks) if network.anchored else np.float32(0)
+    feature, output = torch.from_numpy(samples.feature), torch.from_numpy(samples.place_m - straight_m)
+    total = 0.0
+    network.eval()
+    with torch.no_grad():
+        for first in range(0, len(samples), BATCH):
+            given, true = (own[first : first + BATCH].to(device) for own in (feature, output))
+            total += float(((network(given) - true) / network.scale_m).square().mean()) * len(given)
+    network.train()
+    return total / max(1, len(samples))
 
 
 def _require_finite(loss: float, recipe: Recipe) -> float:

@@ -13,7 +13,13 @@ from scipy import stats
 from tracklake.schemas.comparisons import COMPARED_FIGURES, VEHICLE_ERRORS
 from tracklake.schemas.errors import UsageError
 from tracklake.training.comparison import bootstrap
-from tracklake.training.comparison.bootstrap import SamplesDifferError, compare_errors, draw_counts, find_quantile
+from tracklake.training.comparison.bootstrap import (
+    SamplesDifferError,
+    compare_errors,
+    draw_counts,
+    estimate_differences,
+    find_quantile,
+)
 
 
 def table(sums, *, n=None, seeds=None, run="mine", seconds=(1.0, 2.0)):
@@ -245,3 +251,16 @@ def test_intervals_of_shares_count_vehicles_of_one_jam_together():
     low, high = bootstrap.bound_shares(hits, np.ones((200, 1)))
     half = stats.t.ppf(0.975, 9) * np.std(hits[::20], ddof=1) / 10**0.5
     assert (low[0], high[0]) == pytest.approx((0.4 - half, 0.4 + half), rel=1e-3)
+
+
+def test_the_mean_of_differences_has_the_interval_of_sums_over_groups():
+    """Three vehicles with 2, 1 and 3 samples, by the formula of a ratio of sums, one vehicle after the other."""
+    vehicle = np.array([5, 5, 9, 7, 7, 7])
+    difference = np.array([1.0, 0.0, -1.0, 1.0, 1.0, 0.0])
+    mean, low, high = estimate_differences(difference[:, None], vehicle)
+    assert mean[0] == pytest.approx(2 / 6)
+    squares = sum(
+        (difference[vehicle == own].sum() - 2 / 6 * (vehicle == own).sum()) ** 2 for own in np.unique(vehicle)
+    )
+    half = stats.t.ppf(0.975, 2) * math.sqrt(squares * 3 / 2) / 6
+    assert (low[0], high[0]) == pytest.approx((2 / 6 - half, 2 / 6 + half), rel=1e-3)

@@ -15,13 +15,22 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.training.lane_changes.cells import OUTSIDE
 from tracklake.training.lane_changes.examples import LaneForestSettings, label_samples
 from tracklake.training.lane_changes.scores import score_cells
-from tracklake.training.onboard.as_published import DECODER, GRIDS, OURS, PUBLISHED, score_published
+from tracklake.training.onboard.as_published import (
+    CONSTANT,
+    DECODER,
+    DIFFERENCE,
+    GRIDS,
+    OURS,
+    PUBLISHED,
+    number_vehicles,
+    score_published,
+)
 from tracklake.training.onboard.maneuvers import fit_forest
 from tracklake.training.onboard.models import predict_straight, predict_turns
 from tracklake.training.onboard.networks import RecursiveDecoder
 from tracklake.training.onboard.overhead import build_overhead, find_road_cells
 from tracklake.training.onboard.samples import FEATURE_NUMBER, FEATURES, split_samples
-from tracklake.training.onboard.training import run_network, train_network
+from tracklake.training.onboard.training import Watch, run_network, train_network
 from tracklake.training.runs.config import TrainConfig
 
 SETTINGS = LaneForestSettings(start_s=1.0, examples=200, trees=5, leaf=3)
@@ -196,6 +205,8 @@ def test_both_forests_are_scored_on_the_same_vehicles(scores, road):
     assert errors["ctrv", 2.0] == pytest.approx(np.hypot(*error.T.astype(float)).mean(), rel=1e-5)
     assert [own.drawn for own in scores.learning_curve][:1] == [250]
     assert all(own.train_accuracy >= own.eval_accuracy - 0.05 for own in scores.learning_curve)
+    assert (len(scores.decoder.losses), len(scores.decoder.validation_losses), scores.decoder.best) == (1, 1, 0)
+    assert not scores.decoder.converged
     json.dumps(asdict(scores), allow_nan=False)
 
 
@@ -212,6 +223,56 @@ def test_as_published_the_maneuver_is_the_column_at_every_horizon(scores, road):
             if (own.model, own.column, own.seconds, own.stratum) == ("ctrv", f"forest {PUBLISHED}", seconds, "all")
         ]
         assert score.lane == pytest.approx((true[:, at, 0] == decided).mean())
+
+
+def test_shares_have_intervals_over_vehicles_and_those_of_cells_are_the_scores(scores):
+    shares = {(own.figure, own.model, own.grid, own.seconds, own.forest): own for own in scores.shares}
+    everyone = {name: shares["maneuver", None, None, None, name] for name in (PUBLISHED, OURS, DIFFERENCE, CONSTANT)}
+    for name in (PUBLISHED, OURS):
+        assert everyone[name].value == pytest.approx(scores.maneuvers[name][0].accuracy)
+        assert shares["left", None, None, None, name].value == pytest.approx(scores.maneuvers[name][0].recall["left"])
+    assert everyone[CONSTANT].value == pytest.approx(scores.maneuvers[OURS][0].majority)
+    assert everyone[DIFFERENCE].value == pytest.approx(everyone[PUBLISHED].value - everyone[OURS].value)
+    assert everyone[OURS].vehicles == scores.vehicles["eval"]
+    assert sum(shares[name, None, None, None, OURS].n for name in ("keep", "left", "right")) == scores.samples["eval"]
+    for grid, cells in scores.cells.items():
+        for own in cells:
+            if own.stratum == "all" and own.column != "place":
+                key = (own.model, grid, own.seconds, own.column.removeprefix("forest "))
+                assert shares["cell", *key].value == pytest.approx(own.cell)
+                assert shares["cell_clipped", *key].value == pytest.approx(own.cell_clipped)
+                assert shares["one_against_rest", *key].value == pytest.approx(own.one_against_rest)
+                assert shares["cell", *key[:-1], CONSTANT].value == pytest.approx(own.majority)
+    for own in scores.shares:
+        assert own.low is None or own.low <= own.value <= own.high
+
+
+def test_vehicles_of_successive_numbers_stand_together(road):
+    number = number_vehicles(road.samples)
+    assert len(np.unique(number)) == len(np.unique(road.samples.vehicle))
+    order = np.argsort(number, kind="stable")
+    for subset in np.unique(road.samples.subset):
+        of = order[road.samples.subset[order] == subset]
+        assert (np.diff(road.samples.vehicle_id[of]) >= 0).all()
+
+
+def test_the_decoder_trains_until_the_loss_on_vehicles_held_back_falls_no_more(road, monkeypatch):
+    """Losses of 3, 1, 2 and 2: two epochs without a smaller one end it, and the weights of the second are kept."""
+    parts = split_samples(road.samples.select(np.arange(0, len(road.samples), 16)), seed=0)
+    said = iter((3.0, 1.0, 2.0, 2.0))
+    with monkeypatch.context() as patch:
+        patch.setattr("tracklake.training.onboard.training._measure_loss", lambda *_: next(said))
+        watch = Watch(parts.eval, patience=2)
+        network = train_network("stacked-lstm", parts, TrainConfig(epochs=9), anchored=False, watch=watch)
+    assert ([own for _, own in watch.losses], watch.best, watch.is_over) == ([3.0, 1.0, 2.0, 2.0], 1, True)
+    second = train_network("stacked-lstm", parts, TrainConfig(epochs=2), anchored=False)
+    for one, other in zip(network.parameters(), second.parameters(), strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    watch = Watch(parts.eval, patience=2)
+    network = train_network("stacked-lstm", parts, TrainConfig(epochs=1), anchored=False, watch=watch)
+    error = (run_network(network, parts.eval) - parts.eval.place_m) / network.scale_m.numpy()
+    assert watch.losses[0][1] == pytest.approx(float(np.square(error).mean()), rel=1e-4)
+    assert not watch.is_over
 
 
 def ask(folder, monkeypatch, tmp_path, *options):
