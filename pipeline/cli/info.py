@@ -16,6 +16,7 @@ from tracklake.pipeline.ingest.staleness import StageState, describe_stages
 from tracklake.pipeline.lake import Manifest, connect, load
 from tracklake.pipeline.lake.catalog import CATALOG
 from tracklake.pipeline.lake.files import MODELS, REPORTS, STORE, TABLE_BY_NAME, TENSORS
+from tracklake.pipeline.lake.history import list_generations
 from tracklake.quality_reports.gates.metrics import collect_metrics
 from tracklake.schemas.origin import describe_synthetic
 
@@ -39,7 +40,7 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
         recordings = _list_recordings([row for row in rows if row["scope"] == "recording"], manifest)
         drives = list_drives(root, manifest)
         stages = describe_stages(root, manifest, settings)
-        sizes = measure_sizes(root, manifest)
+        sizes, generations = measure_sizes(root, manifest), list_generations(root)
         terminal.print_line(f"{root.resolve()}", style="bold")
         terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in rows if row["subset"]}))
         if recordings or not drives:
@@ -47,6 +48,13 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
         print_drives(terminal, drives)
         _show_stages(terminal, stages)
         print_table(terminal, ("on disk", "MB"), [[name, f"{size / 1e6:,.1f}"] for name, size in sizes.items()])
+        print_table(
+            terminal,
+            ("generation", "last change", "commits"),
+            [[str(each.number), each.show_time(), f"{each.commits:,}"] for each in generations],
+            title="States of the lake (tracklake sql --as-of GENERATION)",
+            right=(True, False, True),
+        )
         terminal.print_json(
             {
                 "lake": root.resolve(),
@@ -56,6 +64,7 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
                 "drives": drives,
                 "stages": [asdict(state) for state in stages],
                 "bytes": sizes,
+                "generations": [asdict(each) for each in generations],
             }
         )
 

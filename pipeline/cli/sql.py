@@ -15,10 +15,11 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import LakeOption, require_choice
 from tracklake.pipeline.cli.tables import GAP, cut_text, print_table
-from tracklake.pipeline.lake import LakeResult, connect, load, refuse_lake
+from tracklake.pipeline.lake import LakeResult, connect, refuse_lake
 from tracklake.pipeline.lake import query as run_query
 from tracklake.pipeline.lake.catalog import build_catalog, list_columns, sql_type
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
+from tracklake.pipeline.lake.history import load_as_of
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.schemas import TABLES
 from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
@@ -74,6 +75,12 @@ def sql(
         Path | None,
         typer.Option("--out", help="Write the result to this file; without QUERY and as .duckdb: the catalog."),
     ] = None,
+    as_of: Annotated[
+        str | None,
+        typer.Option(
+            "--as-of", metavar="GENERATION|TIME", help="Show an earlier state of the lake; `tracklake info` lists them."
+        ),
+    ] = None,
     names: Annotated[
         bool, typer.Option("--list", help="List the tables and macros; with the name of one, its columns.")
     ] = False,
@@ -87,12 +94,12 @@ def sql(
         refuse_lake(out)
         if query is None and out is not None and out.suffix == DATABASE:
             root = read_settings(lake=lake).lake
-            write_output(out, build_catalog(root, load(root)))
+            write_output(out, build_catalog(root, load_as_of(root, as_of)))
             return
         if query is None:
             raise typer.BadParameter("give one SELECT, `-` to read it from standard input, or --list")
         form = choose_format(format, out, json=json)
-        with connect(read_settings(lake=lake).lake) as connection:
+        with connect(read_settings(lake=lake).lake, as_of) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
             write_result(relation, form, out, terminal)
 

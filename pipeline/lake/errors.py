@@ -41,3 +41,7 @@ class MissingObjectError(StoreError):
 
 class SwapConflictError(StoreError):
     """An object was changed by another writer since it was read."""
+
+
+class DamagedShardError(LakeError):
+    """A part of the manifest is missing or damaged."""

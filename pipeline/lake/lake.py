@@ -7,7 +7,8 @@ import polars as pl
 
 from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME, TENSORS, scan
-from tracklake.pipeline.lake.manifest import MANIFEST, load
+from tracklake.pipeline.lake.history import load_as_of
+from tracklake.pipeline.lake.manifest import MANIFEST
 from tracklake.pipeline.lake.query import LakeConnection, Parameters, connect
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.pipeline.lake.writer import follow_move
@@ -22,17 +23,19 @@ class Lake:
 
     Args:
         path: folder of the lake.
+        as_of: earlier generation or time at which it is shown, as `tracklake sql --as-of` takes it; None: as it is.
 
     Raises:
         LakeMissingError: no lake in this folder.
-        LakeError: the lake is damaged or of another version.
+        LakeError: the lake is damaged or of another version, or nothing is kept of `as_of`.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, as_of: str | None = None) -> None:
         self.path = Path(path).resolve()
+        self._as_of = as_of
         self._connection: LakeConnection | None = None
         self._state: tuple[int, int] | None = None
-        load(self.path)
+        load_as_of(self.path, as_of)
         follow_move(self.path)
 
     def sql(
@@ -58,7 +61,7 @@ class Lake:
         state = (status.st_mtime_ns, status.st_ino)
         if self._connection is None or state != self._state:
             # Not closed: results of the connection before may not be fetched yet.
-            self._connection, self._state = connect(self.path), state
+            self._connection, self._state = connect(self.path, self._as_of), state
         return self._connection.sql(query, parameters, **frames)
 
     def table(self, name: str) -> pl.LazyFrame:
@@ -72,7 +75,7 @@ class Lake:
         """
         if name not in TABLE_BY_NAME:
             raise LakeError(f"no table {name!r} (docs/tables.md lists all); {suggest_name(name, TABLE_BY_NAME)}")
-        return scan(self.path, load(self.path), TABLE_BY_NAME[name])
+        return scan(self.path, load_as_of(self.path, self._as_of), TABLE_BY_NAME[name])
 
     def subsets(self) -> pl.DataFrame:
         """Return one row per subset, with size, flow and whether it is excluded."""
@@ -87,7 +90,8 @@ class Lake:
         """
         from tracklake.training.data.tensor_folder import TensorFolder
 
-        paths = [made.info["path"] for made in load(self.path).of_stage(TENSORS) if made.info["path"] is not None]
+        commits = load_as_of(self.path, self._as_of).of_stage(TENSORS)
+        paths = [made.info["path"] for made in commits if made.info["path"] is not None]
         if not paths:
             raise LakeError(
                 f"{self.path}: the lake has no tensors. Run `tracklake tensors`; it needs freeway recordings with "
@@ -114,11 +118,15 @@ class Lake:
         return f"Lake({str(self.path)!r})"
 
 
-def open_lake(path: str | Path) -> Lake:
+def open_lake(path: str | Path, as_of: str | None = None) -> Lake:
     """Open the lake in a folder for reading.
+
+    Args:
+        path: folder of the lake.
+        as_of: earlier generation or time at which it is shown, as `tracklake sql --as-of` takes it; None: as it is.
 
     Raises:
         LakeMissingError: no lake in this folder.
-        LakeError: the lake is damaged or of another version.
+        LakeError: the lake is damaged or of another version, or nothing is kept of `as_of`.
     """
-    return Lake(path)
+    return Lake(path, as_of)

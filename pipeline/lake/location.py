@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tracklake.pipeline.lake.catalog import CATALOG
 from tracklake.pipeline.lake.errors import LakeError, LakeMissingError
-from tracklake.pipeline.lake.manifest import read_document
+from tracklake.pipeline.lake.manifest import read_root
 
 
 def find_lake(path: Path) -> Path | None:
@@ -35,7 +35,7 @@ def refuse_lake(out: Path | None, option: str = "--out") -> None:
 def _is_lake(folder: Path) -> bool:
     """Return whether a folder holds our manifest, or one that is damaged beside our catalog."""
     try:
-        return "lake_id" in read_document(folder)
+        return "lake_id" in read_root(folder)
     except LakeMissingError:
         return False
     except LakeError:

@@ -1,16 +1,16 @@
 """The manifest: the live files of every table, and what each was built from."""
 
-import json
 import uuid
-from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake.errors import LakeError, LakeMissingError, LakeVersionError
+from tracklake.pipeline.lake.errors import DamagedShardError, LakeError, LakeMissingError, LakeVersionError
+from tracklake.pipeline.lake.shards import parse_shards, read_shards
+from tracklake.pipeline.lake.store import LocalStore
 from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.documents import parse_json
-from tracklake.schemas.files import write_file
 from tracklake.schemas.text import quote_shell
 
 MANIFEST = "manifest.json"
@@ -133,7 +133,7 @@ class Manifest:
     def add_commit(self, commit: Commit, generation: int) -> "Manifest":
         """Return the manifest with a commit added or replaced; the replaced files are retired."""
         replaced = [self.commits[commit.key]] if commit.key in self.commits else []
-        return self._replace_commits({**self.commits, commit.key: commit}, replaced, generation)
+        return self._replace_commits({**self.commits, commit.key: commit}, replaced, [commit], generation)
 
     def mark_damaged(self, keys: Collection[str]) -> "Manifest":
         """Return the manifest with some commits without fingerprints, so that they are made again; files stay live."""
@@ -143,17 +143,24 @@ class Manifest:
     def remove_commits(self, keys: Collection[str], generation: int) -> "Manifest":
         """Return the manifest without some commits; their files are retired."""
         removed = [commit for key, commit in self.commits.items() if key in keys]
-        return self._replace_commits(
-            {key: commit for key, commit in self.commits.items() if key not in keys}, removed, generation
-        )
+        kept = {key: commit for key, commit in self.commits.items() if key not in keys}
+        return self._replace_commits(kept, removed, [], generation)
 
-    def _replace_commits(self, commits: dict[str, Commit], replaced: Iterable[Commit], generation: int) -> "Manifest":
-        changed = replace(self, commits=commits, generation=generation)
-        live = changed.live_paths()
-        dropped = {file.path: file.sha256 for commit in replaced for file in commit.all_files if file.path not in live}
-        kept = tuple(item for item in self.retired if item.path not in live)
-        added = tuple(Retired(path, generation, sha256=sha256) for path, sha256 in sorted(dropped.items()))
-        return replace(changed, retired=kept + added)
+    def _replace_commits(
+        self, commits: dict[str, Commit], replaced: Iterable[Commit], added: Iterable[Commit], generation: int
+    ) -> "Manifest":
+        """Return the manifest with other commits; all files are looked at only where some are no longer needed."""
+        new = {file.path for commit in added for file in commit.all_files}
+        dropped = {f.path: f.sha256 for commit in replaced for f in commit.all_files if f.path not in new}
+        if dropped:
+            groups = (group for commit in commits.values() for group in commit.files.values())
+            for path in {file.path for group in groups for file in group if file.path in dropped}:
+                del dropped[path]
+        retired = self.retired
+        if any(item.path in new for item in retired):
+            retired = tuple(item for item in retired if item.path not in new)
+        retired += tuple(Retired(path, generation, sha256=sha256) for path, sha256 in sorted(dropped.items()))
+        return replace(self, commits=commits, generation=generation, retired=retired)
 
 
 def load(root: Path) -> Manifest:
@@ -162,9 +169,14 @@ def load(root: Path) -> Manifest:
     Raises:
         LakeMissingError: no manifest there.
         LakeVersionError: tables of another schema version.
+        DamagedShardError: a part of the manifest is missing or damaged.
         LakeError: not a manifest of ours.
     """
-    document = read_document(root)
+    return parse_manifest(root, read_document(root))
+
+
+def parse_manifest(root: Path, document: Mapping[str, Any]) -> Manifest:
+    """Return the manifest that a document of a lake describes; raises what `load` does."""
     version = document["schema_version"]
     if version != SCHEMA_VERSION:
         raise LakeVersionError(
@@ -182,8 +194,21 @@ def read_document(root: Path) -> dict[str, Any]:
 
     Raises:
         LakeMissingError: no manifest there.
+        DamagedShardError: a part of the manifest is missing or damaged.
         LakeError: not a manifest of ours.
     """
+    document = read_root(root)
+    while True:
+        try:
+            return collect_document(root, document)
+        except DamagedShardError:
+            before, document = document, read_root(root)
+            if document == before:  # else a writer has merged and swept shards since the root was read
+                raise
+
+
+def read_root(root: Path) -> dict[str, Any]:
+    """Return the content of manifest.json, without what its shards hold; raises what `read_document` does."""
     path = root / MANIFEST
     try:
         text = path.read_text(encoding="utf-8")
@@ -206,13 +231,36 @@ def read_document(root: Path) -> dict[str, Any]:
     return document
 
 
-def read_sources(document: dict[str, Any]) -> tuple[str, ...]:
+def collect_document(root: Path, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a root with what its shards hold; one of an earlier layout, which holds everything itself, as it is.
+
+    Raises:
+        DamagedShardError: a part of the manifest is missing or damaged.
+        LakeError: the root is not one of ours.
+    """
+    if "shards" not in document:
+        return dict(document)
+    try:
+        found = read_shards(LocalStore(root), parse_shards(document))
+    except (ValueError, TypeError, AttributeError) as broken:
+        raise make_foreign_error(root / MANIFEST, broken) from broken
+    except DamagedShardError as damaged:
+        raise DamagedShardError(
+            f"{damaged}; {MANIFEST} names it as a part of the manifest. Restore it from a backup, or rebuild the lake "
+            f"from the raw files: {_write_rebuild_commands(root, document)}."
+        ) from damaged
+    held = {name: {key: item for key, item in items.items() if item is not None} for name, items in found.items()}
+    retired = [{"path": path, **item} for path, item in sorted(held["retired"].items())]
+    return {**document, "entries": held["commits"], "sources": held["sources"], "retired": retired}
+
+
+def read_sources(document: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the SOURCEs that a manifest of any version remembers, as far as it does."""
     found = document.get("ingested_from")
     return tuple(item for item in found if isinstance(item, str)) if isinstance(found, list) else ()
 
 
-def _write_rebuild_commands(root: Path, document: dict[str, Any]) -> str:
+def _write_rebuild_commands(root: Path, document: Mapping[str, Any]) -> str:
     """Return the commands that rebuild a lake from the SOURCEs it was made from, the last one first."""
     there = [Path(name) for name in reversed(read_sources(document)) if Path(name).exists()]
     outer = [path for path in there if not any(path != other and path.is_relative_to(other) for other in there)]
@@ -229,7 +277,7 @@ def make_foreign_error(path: Path, broken: Exception) -> LakeError:
     )
 
 
-def _parse_document(document: dict[str, Any]) -> Manifest:
+def _parse_document(document: Mapping[str, Any]) -> Manifest:
     commits = {
         key: Commit(
             key=key,
@@ -248,10 +296,3 @@ def _parse_document(document: dict[str, Any]) -> Manifest:
         retired=tuple(Retired(**item) for item in document["retired"]),
         ingested_from=read_sources(document),
     )
-
-
-def store_manifest(root: Path, manifest: Manifest) -> None:
-    """Replace a lake's manifest, which is the moment at which a commit happens."""
-    document = {"schema_version": SCHEMA_VERSION, **asdict(manifest)}
-    document["entries"] = document.pop("commits")
-    write_file(root / MANIFEST, json.dumps(document, indent=1, sort_keys=True).encode())

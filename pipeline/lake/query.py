@@ -9,7 +9,8 @@ from tracklake.pipeline.lake.admission import admit_select, query_errors
 from tracklake.pipeline.lake.catalog import create_views, describe_views, escape_pattern, quote
 from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
-from tracklake.pipeline.lake.manifest import Manifest, load
+from tracklake.pipeline.lake.history import load_as_of
+from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.schemas import TABLES
 
@@ -91,7 +92,7 @@ def _lend_frames(cursor: "duckdb.DuckDBPyConnection", frames: Mapping[str, Any])
             ) from refused
 
 
-def connect(lake: Path | str) -> LakeConnection:
+def connect(lake: Path | str, as_of: str | None = None) -> LakeConnection:
     """Open a lake for SQL: an in-memory DuckDB with the views, read-only in fact.
 
     Nothing but the lake's live files can be reached, no statement but a SELECT is admitted, no extension loaded, no
@@ -99,15 +100,16 @@ def connect(lake: Path | str) -> LakeConnection:
 
     Args:
         lake: the lake's folder, wherever it stands now.
+        as_of: generation or time of which it is shown, see `load_as_of`; None: as it is.
 
     Raises:
         LakeMissingError: no lake there.
-        LakeError: a live file is missing or unreadable.
+        LakeError: a live file is missing or unreadable, or nothing is kept of `as_of`.
     """
     import duckdb
 
     root = Path(lake).resolve()
-    manifest = load(root)
+    manifest = load_as_of(root, as_of)
     connection = duckdb.connect(
         ":memory:",
         config={

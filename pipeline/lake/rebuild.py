@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake.catalog import CATALOG
+from tracklake.pipeline.lake.errors import DamagedShardError
 from tracklake.pipeline.lake.files import STAGING, STORE, TABLE_BY_NAME, TENSORS
 from tracklake.pipeline.lake.manifest import (
     MANIFEST,
     Manifest,
     Retired,
-    load,
     make_foreign_error,
+    parse_manifest,
     read_document,
+    read_root,
     read_sources,
 )
 from tracklake.schemas import SCHEMA_VERSION
@@ -24,9 +26,12 @@ def start_rebuild(root: Path) -> Manifest:
     Readers of the old tables find their files for two more generations, like those of any replaced file. Nothing of
     them is used again, and none is overwritten: see `files.find_free_path`. Raises what `read_document` does.
     """
-    document = read_document(root)
-    if document["schema_version"] == SCHEMA_VERSION:
-        load(root)
+    try:
+        document = read_document(root)
+    except DamagedShardError:  # the files that it named are found in their folders
+        document = read_root(root)
+    if document["schema_version"] == SCHEMA_VERSION and "entries" in document:
+        parse_manifest(root, document)
     elif not isinstance(document.get("lake_id"), str) and not (root / CATALOG).exists():
         # Other programs number the schemas of their manifest.json, too; theirs must not be replaced.
         raise make_foreign_error(root / MANIFEST, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))

@@ -6,8 +6,10 @@ from pathlib import Path
 from tracklake.pipeline.lake.catalog import CATALOG
 from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.files import REPORTS, STAGING, find_orphans
+from tracklake.pipeline.lake.history import ROOTS, find_superseded
 from tracklake.pipeline.lake.live_folders import is_shown
 from tracklake.pipeline.lake.manifest import MANIFEST, Manifest
+from tracklake.pipeline.lake.shards import SHARDS
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import list_unfinished, write_file
 
@@ -15,6 +17,8 @@ SESSION = ".session"
 """File of the lake with its place and the checksums of manifest and catalog at the end of the last session."""
 LOCATION = "location"
 """Key of the lake's folder in that file."""
+WRITTEN_FOLDERS = (".", REPORTS, SHARDS, ROOTS)
+"""Folders of the lake in which files are written beside those that they replace."""
 WRITER = ".writer"
 """File of the lake that names the process that writes; it stays where a session is broken off."""
 
@@ -40,7 +44,7 @@ def has_ended(root: Path, manifest: Manifest) -> bool:
     except (OSError, ValueError):
         return False
     left = any((root / name).exists() for name in (STAGING, f"{CATALOG}.wal"))
-    leftovers = left or list_unfinished(root) or list_unfinished(root / REPORTS)
+    leftovers = left or any(list_unfinished(root / folder) for folder in WRITTEN_FOLDERS) or find_superseded(root)
     return not leftovers and not find_orphans(root, manifest) and is_shown(root, manifest)
 
 

@@ -9,17 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import catalog, files, live_folders, session_end
+from tracklake.pipeline.lake import catalog, files, history, live_folders, session_end
 from tracklake.pipeline.lake.checksums import forget_checksums
+from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load, store_manifest
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load
 from tracklake.pipeline.lake.rebuild import start_rebuild
 from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
 
-KEPT_GENERATIONS = 2
-"""Generations for which a replaced file is kept, in writing sessions."""
 LOCK = ".lock"
 """Name of the empty file in the lake that the writer holds locked."""
 
@@ -27,16 +26,17 @@ LOCK = ".lock"
 class Writer:
     """The only process that changes a lake; made by `open_for_writing`."""
 
-    def __init__(self, root: Path, manifest: Manifest, *, has_catalog: bool) -> None:
+    def __init__(self, root: Path, log: CommitLog, *, has_catalog: bool) -> None:
         self.root = root
-        self.manifest = manifest
+        self._log = log
+        self.manifest = manifest = log.manifest
         self._cataloged = manifest if has_catalog else None
         self._generation = manifest.generation + 1
         self._guard = threading.Lock()
         self._process = os.getpid()
 
     def commit(self, commit: Commit) -> None:
-        """Make a commit's files live and those it replaces retired, by replacing manifest.json."""
+        """Make a commit's files live and those it replaces retired."""
         with self._guard:
             if not files.is_intact(self.root, commit.all_files):
                 raise LakeError(f"{self.root}: files of {commit.key} vanished before they were committed. Run again.")
@@ -85,13 +85,14 @@ class Writer:
             if self._cataloged != self.manifest:
                 catalog.rebuild_catalog(self.root, self.manifest)
             live_folders.show_manifest(self.root, self.manifest)
-            limit = self.manifest.generation - KEPT_GENERATIONS
+            limit = self.manifest.generation - history.KEPT_GENERATIONS
             old = [item for item in self.manifest.retired if item.generation <= limit]
             live = self.manifest.live_paths()
             files.remove_files(self.root, (self.root / item.path for item in old if item.path not in live))
             if old:
                 self._store(replace(self.manifest, retired=tuple(i for i in self.manifest.retired if i not in old)))
             files.remove_orphans(self.root, self.manifest)
+            files.remove_files(self.root, (self.root / path for path in history.find_superseded(self.root)))
             shutil.rmtree(self.root / files.STAGING, ignore_errors=True)
             session_end.record_end(self.root)
 
@@ -101,8 +102,7 @@ class Writer:
 
     def _store(self, manifest: Manifest) -> None:
         self._refuse_child()
-        store_manifest(self.root, manifest)
-        self.manifest = manifest
+        self.manifest = self._log.replace(manifest)
 
 
 @contextmanager
@@ -170,21 +170,20 @@ def _hold_lock(root: Path) -> Iterator[None]:
 def _open_writer(root: Path, *, rebuild: bool) -> Writer:
     """Load the manifest (or make the first), delete what was half written, and bring the catalog up to date."""
     is_new = rebuild
+    log = CommitLog(root, is_rebuild=rebuild)
     try:
-        manifest = start_rebuild(root) if rebuild else load(root)
-        if rebuild:
-            store_manifest(root, manifest)
+        manifest = start_rebuild(root) if rebuild else log.manifest if log.is_migrated else load(root)
     except LakeMissingError:
         is_new, manifest = True, Manifest()
-        store_manifest(root, manifest)
+    if is_new:
+        log.replace(manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
-    remove_unfinished(root)
-    remove_unfinished(root / files.REPORTS)
+    for folder in session_end.WRITTEN_FOLDERS:
+        remove_unfinished(root / folder)
     forget_checksums()
     adopted = live_folders.adopt_files(root, manifest)
-    if adopted != manifest:
-        manifest = adopted
-        store_manifest(root, manifest)
+    if adopted != manifest or not log.is_migrated:
+        manifest = log.replace(adopted)
     has_catalog = False
     if is_new:
         live_folders.show_manifest(root, manifest)
@@ -194,7 +193,7 @@ def _open_writer(root: Path, *, rebuild: bool) -> Writer:
             catalog.rebuild_catalog(root, manifest)
             has_catalog = True
         live_folders.show_manifest(root, manifest)
-    return Writer(root, manifest, has_catalog=has_catalog)
+    return Writer(root, log, has_catalog=has_catalog)
 
 
 def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:

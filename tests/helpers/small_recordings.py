@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 from highd_files import META_HEADER, TRACKS_HEADER, VEHICLES_HEADER, meta_row, track_row
+from manifests import edit_manifest
 
 from tracklake.pipeline.lake.session_end import record_end
 
@@ -41,7 +42,6 @@ def copy_lake(made: Path, folder: Path, name: str) -> tuple[Path, Path]:
     """Copy raw/ and the lake made of it into another folder, as if the lake had been made there."""
     raw = shutil.copytree(made / "raw", folder / "raw")
     root = shutil.copytree(made / name, folder / name)
-    manifest = root / "manifest.json"
-    manifest.write_text(manifest.read_text().replace(str(made / "raw"), str(raw)))
+    edit_manifest(root, lambda text: text.replace(str(made / "raw"), str(raw)))
     record_end(root)
     return raw, root

@@ -11,9 +11,11 @@ from pathlib import Path
 import duckdb
 import polars as pl
 import pytest
+from manifests import read_unsharded, write_unsharded
 from small_recordings import ENTRIES, write_highd
 
 from tracklake.pipeline.lake import LakeError, connect, load, open_for_writing
+from tracklake.pipeline.lake.manifest import read_document
 from tracklake.schemas import SCHEMA_VERSION
 
 pytestmark = pytest.mark.usefixtures("plain_flows")
@@ -35,7 +37,7 @@ def old(made, tmp_path) -> Path:
     """A copy of the lake as another version left it: its own shape of manifest, a table that is no more."""
     root = tmp_path / "lake"
     shutil.copytree(made / "lake", root)
-    document = json.loads((root / "manifest.json").read_text())
+    document = read_unsharded(root)
     gone = root / "trax" / "dataset=highd" / "part-1.parquet"
     gone.parent.mkdir(parents=True)
     gone.write_bytes(b"PAR1")
@@ -46,7 +48,7 @@ def old(made, tmp_path) -> Path:
     document["entries"]["ingest/highd/09"] = {}
     document["retired"] = "none"
     del document["sources"]
-    (root / "manifest.json").write_text(json.dumps(document))
+    write_unsharded(root, document)
     return root
 
 
@@ -115,7 +117,7 @@ def test_a_rebuild_killed_in_the_middle_goes_on(command, made, old):
     process = command.start(*command_line, "--rebuild", "--quiet", "--workers", "1")
     limit, committed = time.monotonic() + 120, {}
     while not committed and process.poll() is None and time.monotonic() < limit:
-        document = json.loads((old / "manifest.json").read_text())
+        document = read_document(old)
         committed = document["entries"] if document["schema_version"] == SCHEMA_VERSION else {}
         time.sleep(0.002)
     os.kill(process.pid, signal.SIGKILL)

@@ -13,6 +13,7 @@ import polars as pl
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
+from manifests import read_unsharded, write_unsharded
 from small_lake import (
     SUBSETS,
     Nursery,
@@ -196,11 +197,11 @@ def make_old(root: Path) -> None:
             (root / path).replace(root / path.removeprefix(".files/"))
     shutil.rmtree(root / ".files")
     (root / ".session").unlink()
-    document = json.loads((root / "manifest.json").read_text().replace(".files/", ""))
+    document = json.loads(json.dumps(read_unsharded(root)).replace(".files/", ""))
     groups = [group for entry in document["entries"].values() for group in entry["files"].values()]
     for item in (item for group in [*groups, document["retired"]] for item in group):
         del item["sha256"]
-    (root / "manifest.json").write_text(json.dumps(document))
+    write_unsharded(root, document)
 
 
 def test_files_of_several_recordings_in_one_folder_have_their_own_names(tmp_path: Path):

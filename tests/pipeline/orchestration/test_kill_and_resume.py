@@ -14,6 +14,7 @@ import pytest
 from small_recordings import write_highd
 
 from tracklake.pipeline.lake import connect, is_intact, load
+from tracklake.pipeline.lake.manifest import read_document
 from tracklake.schemas import TABLES
 
 pytestmark = pytest.mark.usefixtures("plain_flows", "prefect_server")
@@ -44,8 +45,7 @@ def wait_until(condition, process, seconds=120.0):
 
 
 def entries(root: Path) -> dict:
-    path = root / "manifest.json"
-    return json.loads(path.read_text())["entries"] if path.exists() else {}
+    return read_document(root)["entries"] if (root / "manifest.json").exists() else {}
 
 
 def read_all(root: Path) -> dict[str, pl.DataFrame]:

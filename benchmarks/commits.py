@@ -1,0 +1,109 @@
+"""The cost of a commit: bytes and time in lakes of 10, 100 and 1,000 recordings, and the time to load the manifest.
+
+    python benchmarks/commits.py [--recordings 10 100 1000]
+
+Recordings of two subsets pass twelve stages, one commit per stage and recording, with as many files, facts and bytes as
+those of a real lake. Manifests only: no tables are written. Printed are the mean, the median and the largest number of
+bytes written per commit and the mean time, each over the last twelve commits per ten recordings; and the number of
+shards, the size of the manifest and the best of five times to load it.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load
+from tracklake.pipeline.lake.commit_log import CommitLog
+from tracklake.pipeline.lake.manifest import read_root
+from tracklake.pipeline.lake.store import LocalStore
+from tracklake.schemas.hashing import hash_text
+
+STAGES = {
+    "ingest": ("completeness", "ingest_log", "rejects", "subsets", "tracks", "vehicles"),
+    "validate": ("findings", "subset_scores", "subset_status", "vehicle_scores"),
+    "reconstruct": ("reconstructed",),
+    "repair": ("missing_starts", "vehicle_starts"),
+    "traffic": ("following", "lane_changes", "detectors", "edie"),
+    "samples": ("samples", "sample_drops", "neighbors"),
+    "pages": ("pages",),
+    **{f"other-{number}": ("other",) for number in range(5)},
+}
+"""Tables of each stage; the last five stand for stages to come."""
+MEASURED = 0.1
+"""Share of the commits, the last ones, of which costs are printed."""
+
+
+class CountingStore(LocalStore):
+    """A lake's folder that counts what is written to it."""
+
+    written = 0
+
+    def _write(self, path: str, data: bytes) -> str:
+        self.written += len(data)
+        return super()._write(path, data)
+
+
+def make_commit(stage: str, recording: str) -> Commit:
+    """Make a commit as a run would, of files that are not there."""
+    fingerprint = hash_text(stage + recording, 16)
+    files = {
+        table: [
+            LakeFile(
+                f".files/{table}/dataset=highd/subset={recording}-{side}/part-{fingerprint}.parquet",
+                rows=100_000,
+                bytes=1_000_000,
+                sha256=hash_text(table + recording + side),
+            )
+            for side in ("lower", "upper")
+        ]
+        for table in STAGES[stage]
+    }
+    settings = {f"setting_{number}": number / 7 for number in range(8)}
+    built_from = {"inputs": {"ingest": fingerprint}, "settings": settings, "stage_version": 3, "tracklake": "0.1.0"}
+    return Commit(f"{stage}/highd/{recording}", fingerprint, files, built_from, {"seconds": 1.25, "notes": []})
+
+
+def measure(recordings: int) -> str:
+    """Build the manifest of a lake, and return what the last commits cost as a line of the table."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        log = CommitLog(root)
+        log.store = store = CountingStore(root)
+        log.replace(Manifest())
+        costs = []
+        for stage in STAGES:
+            for number in range(recordings):
+                commit = make_commit(stage, f"{number:04}")
+                before, began = store.written, time.perf_counter()
+                log.replace(log.manifest.add_commit(commit, 1))
+                costs.append((store.written - before, time.perf_counter() - began))
+        measured = costs[-max(round(len(costs) * MEASURED), 1) :]
+        written, seconds = zip(*measured, strict=True)
+        times = []
+        for _ in range(5):
+            began = time.perf_counter()
+            load(root)
+            times.append(time.perf_counter() - began)
+        shards = read_root(root)["shards"]
+        return (
+            f"| {recordings:,} | {len(costs):,} | {statistics.mean(written) / 1e3:.1f} | "
+            f"{statistics.median(written) / 1e3:.1f} | {max(written) / 1e3:,.0f} | "
+            f"{statistics.mean(seconds) * 1e3:.2f} | "
+            f"{len(shards)} | {sum(shard['bytes'] for shard in shards) / 1e3:,.0f} | {min(times) * 1e3:.1f} |"
+        )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", type=int, nargs="+", default=[10, 100, 1000])
+    print("| recordings | commits | mean kB | median kB | largest kB | ms | shards | manifest kB | load ms |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for recordings in parser.parse_args().recordings:
+        print(measure(recordings), flush=True)
+
+
+if __name__ == "__main__":
+    main()

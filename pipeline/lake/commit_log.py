@@ -1,0 +1,186 @@
+"""The manifest as it is stored: a commit adds a shard of changes, and then replaces the root that lists the shards.
+
+Replacing the root is the moment at which a commit happens. The store replaces it only if it is still the one that this
+process has read or written, whether or not a lock or lease keeps other writers away.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from tracklake.pipeline.lake.errors import AlreadyStoredError, LakeError, MissingObjectError, SwapConflictError
+from tracklake.pipeline.lake.history import name_root
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retired, load
+from tracklake.pipeline.lake.shards import Changes, append_changes, parse_shards
+from tracklake.pipeline.lake.store import LocalStore
+from tracklake.schemas import SCHEMA_VERSION
+
+MAX_CONFLICTS = 20
+"""Times that changes are applied again to roots that other processes have put in place meanwhile."""
+NOTHING = Manifest(lake_id="")
+"""Manifest of a lake of which nothing is stored in shards yet."""
+
+
+class CommitLog:
+    """The stored manifest of one lake, as far as this process knows.
+
+    Args:
+        root: the lake's folder.
+        is_rebuild: whether nothing of what is stored is used again, so that it need not be whole.
+    """
+
+    def __init__(self, root: Path, *, is_rebuild: bool = False) -> None:
+        self._place = root
+        self.store = LocalStore(root)
+        self._is_rebuild = is_rebuild
+        self._read()
+
+    @property
+    def is_migrated(self) -> bool:
+        """Whether manifest.json is a root of shards; one of an earlier layout holds everything itself."""
+        return "shards" in self._root
+
+    def replace(self, manifest: Manifest) -> Manifest:
+        """Store a manifest in place of the one before, and return what is stored then.
+
+        That has the changes of other processes, too, where they have changed nothing of the same.
+
+        Raises:
+            LakeError: another process has changed the same, or others do not cease to replace the root.
+        """
+        for _ in range(MAX_CONFLICTS):
+            try:
+                self._swap(manifest)
+            except SwapConflictError:
+                manifest = self._rebase(manifest)
+            else:
+                return manifest
+        raise LakeError(
+            f"{self._place}: other processes replaced {MANIFEST} {MAX_CONFLICTS} times during one commit. "
+            "Wait for them to end, and run again."
+        )
+
+    def _read(self) -> None:
+        """Find out what is stored; the manifest of an earlier layout counts as nothing."""
+        self.manifest, self._shards = NOTHING, []
+        self._root: dict[str, Any] = {}
+        self._tag: str | None = None
+        try:
+            content, self._tag = self.store.get(MANIFEST)
+        except MissingObjectError:
+            return
+        self._root = json.loads(content)
+        if self.is_migrated and not self._is_rebuild:
+            self.manifest, self._shards = load(self._place), parse_shards(self._root)
+
+    def _swap(self, manifest: Manifest) -> None:
+        is_same = manifest.lake_id == self.manifest.lake_id
+        before, shards = (self.manifest, self._shards) if is_same else (NOTHING, [])
+        items = len(manifest.commits) + len(manifest.sources) + len(manifest.retired)
+        shards = append_changes(self.store, shards, find_changes(before, manifest), items)
+        root = {
+            "schema_version": SCHEMA_VERSION,
+            "lake_id": manifest.lake_id,
+            "generation": manifest.generation,
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "commits": len(manifest.commits),
+            "ingested_from": list(manifest.ingested_from),
+            "shards": [asdict(shard) for shard in shards],
+        }
+        if self.is_migrated and any(root[name] != self._root[name] for name in ("generation", "lake_id")):
+            self._keep_root()
+        self._tag = self.store.swap(MANIFEST, _encode(root), self._tag)
+        self.manifest, self._shards, self._root = manifest, shards, root
+
+    def _keep_root(self) -> None:
+        """Keep the root that ends a generation; a lake that was rebuilt in it has two, of which the first is kept."""
+        path, content = name_root(self._root["generation"]), _encode(self._root)
+        try:
+            self.store.put_new(path, content)
+        except AlreadyStoredError:
+            found, tag = self.store.get(path)
+            if found != content and json.loads(found)["lake_id"] == self._root["lake_id"]:
+                self.store.swap(path, content, tag)
+
+    def _rebase(self, manifest: Manifest) -> Manifest:
+        """Return what is stored by now with the changes that a manifest was to bring.
+
+        Raises:
+            LakeError: both change the same, or the lake was made or rebuilt by the other process.
+        """
+        base, ours = self.manifest, find_changes(self.manifest, manifest)
+        self._read()
+        if self.manifest.lake_id != base.lake_id:
+            raise LakeError(f"{self._place}: another process has made or rebuilt this lake meanwhile. Run again.")
+        theirs = find_changes(base, self.manifest)
+        for section, changed in ours.items():
+            for name in changed.keys() & theirs[section].keys():
+                if changed[name] != theirs[section][name]:
+                    raise LakeError(
+                        f"{self._place}: another process has changed {name} ({section}) meanwhile; its version stays. "
+                        "Run again, one process at a time."
+                    )
+        return _apply(self.manifest, manifest, ours)
+
+
+def find_changes(before: Manifest, after: Manifest) -> Changes:
+    """Return what differs between two manifests, by section and name."""
+    changes: Changes = {
+        "commits": _compare(before.commits, after.commits),
+        "sources": _compare(before.sources, after.sources),
+        "retired": {},
+    }
+    if before.retired is not after.retired:
+        changes["retired"] = _compare(*({item.path: item for item in each.retired} for each in (before, after)))
+    return changes
+
+
+def _compare(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, dict[str, Any] | None]:
+    if before is after:
+        return {}
+    changed = (name for name, item in after.items() if before.get(name) is not item and before.get(name) != item)
+    removed = dict.fromkeys(before.keys() - after.keys()) if len(before) + len(after) else {}
+    return {**removed, **{name: _describe(after[name]) for name in changed}}
+
+
+def _describe(item: Commit | Retired | dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of an item as shards hold them, without its name."""
+    if isinstance(item, dict):
+        return item
+    fields = asdict(item)
+    del fields["key" if isinstance(item, Commit) else "path"]
+    return fields
+
+
+def _apply(theirs: Manifest, ours: Manifest, changes: Changes) -> Manifest:
+    """Return another process's manifest with our changes; our files are retired no earlier than in its generation."""
+    generation = max(theirs.generation, ours.generation)
+    commits, sources = dict(theirs.commits), dict(theirs.sources)
+    retired = {item.path: item for item in theirs.retired}
+    mine = {item.path: replace(item, generation=max(item.generation, theirs.generation)) for item in ours.retired}
+    for held, own, section in (
+        (commits, ours.commits, "commits"),
+        (sources, ours.sources, "sources"),
+        (retired, mine, "retired"),
+    ):
+        for name, item in changes[section].items():
+            if item is None:
+                held.pop(name, None)
+            else:
+                held[name] = own[name]
+    merged = replace(
+        theirs,
+        generation=generation,
+        commits=commits,
+        sources=sources,
+        ingested_from=tuple(dict.fromkeys((*theirs.ingested_from, *ours.ingested_from))),
+    )
+    live = merged.live_paths()
+    return replace(merged, retired=tuple(item for item in retired.values() if item.path not in live))
+
+
+def _encode(root: Mapping[str, Any]) -> bytes:
+    return json.dumps(root, indent=1).encode()

@@ -1,0 +1,92 @@
+"""Earlier generations: each can be queried until its files are deleted, and no longer."""
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from small_lake import make_status, put, write_round
+
+import tracklake
+from tracklake.pipeline.lake import LakeError, connect, is_intact, load, open_for_writing
+from tracklake.pipeline.lake.history import find_superseded, list_generations, load_as_of
+
+QUESTION = "SELECT sum(backward_vehicles) FROM subset_status"
+NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
+
+
+def set_time(root: Path, time: datetime) -> None:
+    """Let the present generation have been written at a time."""
+    path = root / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "written": time.isoformat()}))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Five sessions, at noon and on the hours after; the sum of two subsets is twice the session's number."""
+    for number in range(5):
+        write_round(tmp_path, number)
+        set_time(tmp_path, NOON + timedelta(hours=number))
+    return tmp_path
+
+
+def ask(root: Path, as_of: str | None) -> int:
+    with connect(root, as_of) as lake:
+        ((found,),) = lake.sql(QUESTION).fetchall()
+    return found
+
+
+def test_the_last_generations_are_queried_by_number_and_time(root: Path):
+    assert [(each.number, each.commits) for each in list_generations(root)] == [(3, 2), (4, 2), (5, 2)]
+    assert [ask(root, str(number)) for number in (3, 4, 5)] == [4, 6, 8]
+    assert ask(root, None) == 8
+    times = ("2026-03-01T14:00:00Z", "2026-03-01T14:59:59+00:00", "2026-03-01 16:00:00+01:00", "2027-01-01")
+    assert [ask(root, time) for time in times] == [4, 4, 6, 8]
+    with tracklake.open(root, as_of="3") as lake:
+        assert lake.sql(QUESTION).fetchone() == (4,)
+        assert lake.table("subset_status").collect()["backward_vehicles"].to_list() == [2, 2]
+
+
+@pytest.mark.parametrize("asked", ["0", "2", "6", "2026-03-01T13:59:59Z", "1999-12-31"])
+def test_what_is_not_kept_is_answered_with_what_is(root: Path, asked: str):
+    kept = ", ".join(f"{each.number} ({each.show_time()})" for each in list_generations(root))
+    with pytest.raises(LakeError, match=f"nothing is kept of {asked}") as refused:
+        load_as_of(root, asked)
+    assert str(refused.value).endswith(f"by generation and time: {kept}.")
+    with pytest.raises(LakeError, match="nothing is kept"):
+        tracklake.open(root, as_of=asked)
+
+
+@pytest.mark.parametrize("asked", ["", "yesterday", "3.5", "2026-13-01"])
+def test_what_is_neither_a_number_nor_a_time_is_refused(root: Path, asked: str):
+    with pytest.raises(LakeError, match="expected the number of a generation, or a time"):
+        load_as_of(root, asked)
+
+
+def test_files_of_every_generation_that_is_listed_are_there_and_others_are_not(root: Path):
+    for each in list_generations(root):
+        manifest = load_as_of(root, str(each.number))
+        assert is_intact(root, (file for commit in manifest.commits.values() for file in commit.all_files))
+    shards = {path.stem for path in (root / "manifest").glob("*.json")}
+    roots = [root / "manifest.json", *(root / "manifest" / "roots").iterdir()]
+    listed = [{shard["sha256"] for shard in json.loads(path.read_text())["shards"]} for path in roots]
+    assert len(roots) == 3
+    assert shards == set.union(*listed)
+
+
+def test_a_rebuild_leaves_what_was_before_to_be_queried(root: Path):
+    with open_for_writing(root, rebuild=True) as writer:
+        writer.commit(put(root, "validate/highd/01", 9, make_status("a", 9), dataset="highd", subset="a"))
+    assert [(each.number, each.commits) for each in list_generations(root)] == [(4, 2), (5, 2), (6, 1)]
+    assert [ask(root, str(number)) for number in (4, 5, 6)] == [6, 8, 9]
+    assert load_as_of(root, "5").lake_id != load(root).lake_id
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"[]", b'{"shards": [{}]}'])
+def test_an_earlier_root_that_is_damaged_is_no_generation_and_is_swept(root: Path, content: bytes):
+    (root / "manifest" / "roots" / "4.json").write_bytes(content)
+    assert [each.number for each in list_generations(root)] == [3, 5]
+    assert "manifest/roots/4.json" not in find_superseded(root) or content
+    with open_for_writing(root):
+        pass
+    assert ask(root, "5") == 8
