@@ -19,6 +19,7 @@ from tracklake.pipeline.lake.location import refuse_lake as refuse_lake
 from tracklake.pipeline.lake.manifest import Commit as Commit
 from tracklake.pipeline.lake.manifest import LakeFile as LakeFile
 from tracklake.pipeline.lake.manifest import Manifest as Manifest
+from tracklake.pipeline.lake.manifest import Retention as Retention
 from tracklake.pipeline.lake.manifest import load as load
 from tracklake.pipeline.lake.query import connect as connect
 from tracklake.pipeline.lake.query import open_recordings as open_recordings

@@ -8,14 +8,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, LakeError, MissingObjectError, SwapConflictError
 from tracklake.pipeline.lake.history import name_root
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retired, load
+from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import Changes, append_changes, parse_shards
-from tracklake.pipeline.lake.store import LocalStore
 from tracklake.schemas import SCHEMA_VERSION
 
 MAX_CONFLICTS = 20
@@ -28,13 +27,13 @@ class CommitLog:
     """The stored manifest of one lake, as far as this process knows.
 
     Args:
-        root: the lake's folder.
+        place: the lake's folder or address.
         is_rebuild: whether nothing of what is stored is used again, so that it need not be whole.
     """
 
-    def __init__(self, root: Path, *, is_rebuild: bool = False) -> None:
-        self._place = root
-        self.store = LocalStore(root)
+    def __init__(self, place: LakePlace, *, is_rebuild: bool = False) -> None:
+        self._place = place
+        self.store = open_store(place)
         self._is_rebuild = is_rebuild
         self._read()
 
@@ -86,6 +85,8 @@ class CommitLog:
             "lake_id": manifest.lake_id,
             "generation": manifest.generation,
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "kept_generations": manifest.retention.generations,
+            "kept_hours": manifest.retention.hours,
             "commits": len(manifest.commits),
             "ingested_from": list(manifest.ingested_from),
             "shards": [asdict(shard) for shard in shards],

@@ -1,21 +1,27 @@
 """Earlier generations of a lake: the roots that ended them, for queries as of then, and the removal of old ones."""
 
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from tracklake.pipeline.lake.errors import LakeError
-from tracklake.pipeline.lake.manifest import Manifest, collect_document, load, parse_manifest, read_root
+from tracklake.pipeline.lake.errors import LakeError, MissingObjectError
+from tracklake.pipeline.lake.manifest import (
+    Manifest,
+    Retention,
+    collect_document,
+    load,
+    parse_manifest,
+    read_retention,
+    read_root,
+)
+from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import SHARDS, parse_shards
-from tracklake.pipeline.lake.store import LocalStore
+from tracklake.pipeline.lake.store import Store
 from tracklake.schemas import SCHEMA_VERSION
-from tracklake.schemas.documents import read_json
+from tracklake.schemas.documents import parse_json
 
 ROOTS = f"{SHARDS}/roots"
 """Folder of the lake for the roots of earlier generations."""
-KEPT_GENERATIONS = 2
-"""Earlier generations that can be queried, and for which replaced files are kept, in writing sessions."""
 
 
 @dataclass(frozen=True)
@@ -42,28 +48,28 @@ def name_root(number: int) -> str:
     return f"{ROOTS}/{number}.json"
 
 
-def list_generations(root: Path) -> list[Generation]:
+def list_generations(place: LakePlace) -> list[Generation]:
     """Return the generations of a lake that can be queried, the present one last.
 
     Raises:
         LakeError: no lake there, or none of ours.
     """
-    return [_describe(document) for document in _list_roots(root)]
+    return [_describe(document) for document in _list_roots(place)]
 
 
-def load_as_of(root: Path, asked: str | None) -> Manifest:
+def load_as_of(place: LakePlace, asked: str | None) -> Manifest:
     """Read the manifest as it was at the end of a generation, or at a time; None: as it is.
 
     Args:
-        root: the lake's folder.
+        place: the lake's folder or address.
         asked: number of a generation, or an ISO date or time, in this machine's zone unless it names one.
 
     Raises:
         LakeError: neither a number nor a time, or nothing is kept of then; the message says what is.
     """
     if asked is None:
-        return load(root)
-    roots = _list_roots(root)
+        return load(place)
+    roots = _list_roots(place)
     if asked.strip().isdecimal():
         found = [document for document in roots if document["generation"] == int(asked)]
     else:
@@ -71,36 +77,48 @@ def load_as_of(root: Path, asked: str | None) -> Manifest:
         found = [document for document in roots if (written := _describe(document).written) and written <= time]
     if not found:
         kept = ", ".join(f"{each.number} ({each.show_time()})" for each in map(_describe, roots))
-        raise LakeError(
-            f"{root}: nothing is kept of {asked}; --as-of takes a generation or a later time of these: {kept}"
-        )
-    return parse_manifest(root, collect_document(root, found[-1]))
+        raise LakeError(f"{place}: nothing is kept of {asked}. What can be asked for, by generation and time: {kept}.")
+    return parse_manifest(place, collect_document(place, found[-1]))
 
 
-def find_superseded(root: Path) -> list[str]:
+def find_limit(place: LakePlace, manifest: Manifest) -> int:
+    """Return the oldest generation to be kept; files that were replaced in it or before are not needed any more."""
+    return _find_limit(open_store(place), manifest.generation, manifest.retention)
+
+
+def _find_limit(store: Store, number: int, retention: Retention) -> int:
+    limit, since = number - retention.generations, datetime.now(UTC) - timedelta(hours=retention.hours)
+    while (kept := _read_kept(store, name_root(limit))) and datetime.fromisoformat(kept["written"]) > since:
+        limit -= 1
+    return limit
+
+
+def find_superseded(place: LakePlace) -> list[str]:
     """Return the paths of the roots and shards that neither the manifest nor a generation to be kept needs."""
     needed = set()
-    for document in _list_roots(root):
+    for document in _list_roots(place):
         needed.add(name_root(document["generation"]))
         needed |= {shard.path for shard in parse_shards(document)} if "shards" in document else set()
-    return sorted(stored.path for stored in LocalStore(root).list(SHARDS) if stored.path not in needed)
+    return sorted(stored.path for stored in open_store(place).list(SHARDS) if stored.path not in needed)
 
 
-def _list_roots(root: Path) -> list[dict[str, Any]]:
+def _list_roots(place: LakePlace) -> list[dict[str, Any]]:
     """Return the roots of the generations to be kept and of the present, which is the last."""
-    present = read_root(root)
+    present = read_root(place)
     number = present["generation"] if isinstance(present.get("generation"), int) else 0
-    kept = (_read_kept(root / name_root(number - back)) for back in range(KEPT_GENERATIONS, -1, -1))
+    store = open_store(place)
+    limit = _find_limit(store, number, read_retention(present))
+    kept = (_read_kept(store, name_root(each)) for each in range(limit, number + 1))
     return [*(document for document in kept if document is not None), present]
 
 
-def _read_kept(file: Path) -> dict[str, Any] | None:
+def _read_kept(store: Store, path: str) -> dict[str, Any] | None:
     """Return the root of an earlier generation; None: it is not kept, or another version's or damaged."""
     try:
-        document = read_json(file)
+        document: dict[str, Any] = parse_json(store.get(path)[0].decode())
         parse_shards(document)
         datetime.fromisoformat(document["written"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (MissingObjectError, ValueError, KeyError, TypeError):
         return None
     return document if document["schema_version"] == SCHEMA_VERSION else None
 

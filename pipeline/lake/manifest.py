@@ -6,11 +6,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake.errors import DamagedShardError, LakeError, LakeMissingError, LakeVersionError
+from tracklake.pipeline.lake.errors import (
+    DamagedShardError,
+    LakeError,
+    LakeMissingError,
+    LakeVersionError,
+    MissingObjectError,
+)
+from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import parse_shards, read_shards
-from tracklake.pipeline.lake.store import LocalStore
 from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.documents import parse_json
+from tracklake.schemas.errors import FileAccessError
 from tracklake.schemas.text import quote_shell
 
 MANIFEST = "manifest.json"
@@ -85,6 +92,19 @@ class Retired:
 
 
 @dataclass(frozen=True)
+class Retention:
+    """How long replaced files are kept, and with them the earlier states of the lake that can be queried.
+
+    Args:
+        generations: number of earlier generations.
+        hours: time since a file was replaced, however many generations followed, in hours.
+    """
+
+    generations: int = 2
+    hours: float = 0.0
+
+
+@dataclass(frozen=True)
 class Manifest:
     """The state of a lake: replaced as a whole, never edited in place.
 
@@ -93,8 +113,9 @@ class Manifest:
         generation: number of writing sessions that changed something.
         commits: committed work by key; `entries` in the file.
         sources: dataset, dialect and recordings of raw files, by sha256.
-        retired: files to delete two generations after they were replaced.
+        retired: files to delete when they need not be kept any more.
         ingested_from: SOURCEs that it was made from, the last one last.
+        retention: how long they are kept.
     """
 
     lake_id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -103,6 +124,7 @@ class Manifest:
     sources: dict[str, dict[str, Any]] = field(default_factory=dict)
     retired: tuple[Retired, ...] = ()
     ingested_from: tuple[str, ...] = ()
+    retention: Retention = Retention()
 
     def live(self, table: str) -> list[LakeFile]:
         """Return the live files of a table, sorted by path."""
@@ -163,7 +185,7 @@ class Manifest:
         return replace(self, commits=commits, generation=generation, retired=retired)
 
 
-def load(root: Path) -> Manifest:
+def load(place: LakePlace) -> Manifest:
     """Read a lake's manifest.
 
     Raises:
@@ -172,24 +194,24 @@ def load(root: Path) -> Manifest:
         DamagedShardError: a part of the manifest is missing or damaged.
         LakeError: not a manifest of ours.
     """
-    return parse_manifest(root, read_document(root))
+    return parse_manifest(place, read_document(place))
 
 
-def parse_manifest(root: Path, document: Mapping[str, Any]) -> Manifest:
+def parse_manifest(place: LakePlace, document: Mapping[str, Any]) -> Manifest:
     """Return the manifest that a document of a lake describes; raises what `load` does."""
     version = document["schema_version"]
     if version != SCHEMA_VERSION:
         raise LakeVersionError(
-            f"{root}: the lake has tables of schema version {version}, this tracklake writes and reads version "
-            f"{SCHEMA_VERSION}. Rebuild it from the raw files: {_write_rebuild_commands(root, document)}."
+            f"{place}: the lake has tables of schema version {version}, this tracklake writes and reads version "
+            f"{SCHEMA_VERSION}. Rebuild it from the raw files: {_write_rebuild_commands(place, document)}."
         )
     try:
         return _parse_document(document)
     except (ValueError, KeyError, TypeError, AttributeError) as broken:
-        raise make_foreign_error(root / MANIFEST, broken) from broken
+        raise make_foreign_error(place, broken) from broken
 
 
-def read_document(root: Path) -> dict[str, Any]:
+def read_document(place: LakePlace) -> dict[str, Any]:
     """Return a lake's manifest of any schema version; only `schema_version` is sure to be in it.
 
     Raises:
@@ -197,41 +219,36 @@ def read_document(root: Path) -> dict[str, Any]:
         DamagedShardError: a part of the manifest is missing or damaged.
         LakeError: not a manifest of ours.
     """
-    document = read_root(root)
+    document = read_root(place)
     while True:
         try:
-            return collect_document(root, document)
+            return collect_document(place, document)
         except DamagedShardError:
-            before, document = document, read_root(root)
+            before, document = document, read_root(place)
             if document == before:  # else a writer has merged and swept shards since the root was read
                 raise
 
 
-def read_root(root: Path) -> dict[str, Any]:
+def read_root(place: LakePlace) -> dict[str, Any]:
     """Return the content of manifest.json, without what its shards hold; raises what `read_document` does."""
-    path = root / MANIFEST
     try:
-        text = path.read_text(encoding="utf-8")
-    except (FileNotFoundError, NotADirectoryError):
+        content, _ = open_store(place).get(MANIFEST)
+    except MissingObjectError:
         raise LakeMissingError(
-            f"{root}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake {quote_shell(root)}`, "
-            "or name another with --lake or TRACKLAKE_LAKE."
+            f"{place}: no lake here (no {MANIFEST}). Build one with `tracklake run SOURCE --lake "
+            f"{quote_shell(place)}`, or name another with --lake or TRACKLAKE_LAKE."
         ) from None
-    except OSError as failed:
-        raise LakeError(
-            f"{path}: cannot be read ({failed.strerror}). A lake's manifest is a readable file."
-        ) from failed
-    except UnicodeDecodeError as broken:
-        raise make_foreign_error(path, broken) from broken
+    except FileAccessError as failed:
+        raise LakeError(f"{failed} A lake's manifest is a readable file.") from failed
     try:
-        document: dict[str, Any] = parse_json(text)
+        document: dict[str, Any] = parse_json(content.decode())
         document["schema_version"]
     except (ValueError, KeyError, TypeError) as broken:
-        raise make_foreign_error(path, broken) from broken
+        raise make_foreign_error(place, broken) from broken
     return document
 
 
-def collect_document(root: Path, document: Mapping[str, Any]) -> dict[str, Any]:
+def collect_document(place: LakePlace, document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a root with what its shards hold; one of an earlier layout, which holds everything itself, as it is.
 
     Raises:
@@ -241,13 +258,13 @@ def collect_document(root: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     if "shards" not in document:
         return dict(document)
     try:
-        found = read_shards(LocalStore(root), parse_shards(document))
+        found = read_shards(open_store(place), parse_shards(document))
     except (ValueError, TypeError, AttributeError) as broken:
-        raise make_foreign_error(root / MANIFEST, broken) from broken
+        raise make_foreign_error(place, broken) from broken
     except DamagedShardError as damaged:
         raise DamagedShardError(
             f"{damaged}; {MANIFEST} names it as a part of the manifest. Restore it from a backup, or rebuild the lake "
-            f"from the raw files: {_write_rebuild_commands(root, document)}."
+            f"from the raw files: {_write_rebuild_commands(place, document)}."
         ) from damaged
     held = {name: {key: item for key, item in items.items() if item is not None} for name, items in found.items()}
     retired = [{"path": path, **item} for path, item in sorted(held["retired"].items())]
@@ -260,20 +277,31 @@ def read_sources(document: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(item for item in found if isinstance(item, str)) if isinstance(found, list) else ()
 
 
-def _write_rebuild_commands(root: Path, document: Mapping[str, Any]) -> str:
+def read_retention(document: Mapping[str, Any]) -> Retention:
+    """Return how long a lake keeps replaced files; of an earlier layout, or of another version, as by default."""
+    default = Retention()
+    generations, hours = document.get("kept_generations"), document.get("kept_hours")
+    return Retention(
+        generations if isinstance(generations, int) else default.generations,
+        hours if isinstance(hours, float | int) else default.hours,
+    )
+
+
+def _write_rebuild_commands(place: LakePlace, document: Mapping[str, Any]) -> str:
     """Return the commands that rebuild a lake from the SOURCEs it was made from, the last one first."""
     there = [Path(name) for name in reversed(read_sources(document)) if Path(name).exists()]
     outer = [path for path in there if not any(path != other and path.is_relative_to(other) for other in there)]
     first, *others = (quote_shell(path) for path in outer or [Path("SOURCE")])
-    lake = quote_shell(root)
+    lake = quote_shell(place)
     commands = [f"`tracklake run {first} --lake {lake} --rebuild`"]
     return ", then ".join(commands + [f"`tracklake run {source} --lake {lake}`" for source in others])
 
 
-def make_foreign_error(path: Path, broken: Exception) -> LakeError:
+def make_foreign_error(place: LakePlace, broken: Exception) -> LakeError:
     """Return the error of a manifest.json that another program wrote, or that is damaged."""
     return LakeError(
-        f"{path}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and rebuild."
+        f"{place}/{MANIFEST}: not a manifest of tracklake ({broken!r}). Restore the file, or move the folder away and "
+        "rebuild."
     )
 
 
@@ -295,4 +323,5 @@ def _parse_document(document: Mapping[str, Any]) -> Manifest:
         sources=document["sources"],
         retired=tuple(Retired(**item) for item in document["retired"]),
         ingested_from=read_sources(document),
+        retention=read_retention(document),
     )

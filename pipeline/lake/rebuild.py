@@ -14,6 +14,7 @@ from tracklake.pipeline.lake.manifest import (
     make_foreign_error,
     parse_manifest,
     read_document,
+    read_retention,
     read_root,
     read_sources,
 )
@@ -34,7 +35,7 @@ def start_rebuild(root: Path) -> Manifest:
         parse_manifest(root, document)
     elif not isinstance(document.get("lake_id"), str) and not (root / CATALOG).exists():
         # Other programs number the schemas of their manifest.json, too; theirs must not be replaced.
-        raise make_foreign_error(root / MANIFEST, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))
+        raise make_foreign_error(root, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))
     number = document.get("generation")
     generation = max(number, 0) if isinstance(number, int) else 0
     files = {*_list_committed(root, document), *_list_existing(root)}
@@ -42,6 +43,7 @@ def start_rebuild(root: Path) -> Manifest:
         generation=generation,
         retired=tuple(Retired(path, generation + 1, void=True) for path in sorted(files)),
         ingested_from=read_sources(document),
+        retention=read_retention(document),
     )
 
 

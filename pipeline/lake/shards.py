@@ -7,12 +7,13 @@ eight, and any lake has few shards, which matters where each is a request to an 
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, DamagedShardError, MissingObjectError
-from tracklake.pipeline.lake.store import Store
+from tracklake.pipeline.lake.store import LocalStore, Store
 from tracklake.schemas.hashing import hash_chunks
 
 SHARDS = "manifest"
@@ -21,6 +22,8 @@ SECTIONS = ("commits", "sources", "retired")
 """Parts of the manifest that shards hold changes of."""
 FAN_OUT = 8
 """Shards of one size class that are merged; a class is this many times as large as the one before."""
+READERS = 16
+"""Shards that are requested from an object store at once."""
 _NAME = re.compile("[0-9a-f]{64}")
 
 Changes = dict[str, dict[str, dict[str, Any] | None]]
@@ -79,8 +82,13 @@ def read_shard(store: Store, shard: Shard) -> Changes:
 def read_shards(store: Store, shards: Sequence[Shard]) -> Changes:
     """Return what shards hold together, where the later ones replace what the earlier ones say; raises as above."""
     merged: Changes = {section: {} for section in SECTIONS}
-    for shard in shards:
-        for section, changed in read_shard(store, shard).items():
+    if isinstance(store, LocalStore):
+        found: Iterable[Changes] = (read_shard(store, shard) for shard in shards)
+    else:
+        with ThreadPoolExecutor(READERS) as pool:  # a request takes longer than all that follows
+            found = list(pool.map(lambda shard: read_shard(store, shard), shards))
+    for changes in found:
+        for section, changed in changes.items():
             merged.setdefault(section, {}).update(changed)
     return merged
 

@@ -13,7 +13,7 @@ from tracklake.pipeline.lake import catalog, files, history, live_folders, sessi
 from tracklake.pipeline.lake.checksums import forget_checksums
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
-from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, load
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retention, load
 from tracklake.pipeline.lake.rebuild import start_rebuild
 from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.schemas.errors import TracklakeError
@@ -85,7 +85,7 @@ class Writer:
             if self._cataloged != self.manifest:
                 catalog.rebuild_catalog(self.root, self.manifest)
             live_folders.show_manifest(self.root, self.manifest)
-            limit = self.manifest.generation - history.KEPT_GENERATIONS
+            limit = history.find_limit(self.root, self.manifest)
             old = [item for item in self.manifest.retired if item.generation <= limit]
             live = self.manifest.live_paths()
             files.remove_files(self.root, (self.root / item.path for item in old if item.path not in live))
@@ -106,11 +106,15 @@ class Writer:
 
 
 @contextmanager
-def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
+def open_for_writing(root: Path, *, rebuild: bool = False, retention: Retention | None = None) -> Iterator[Writer]:
     """Lock a lake (making it where there is none) and yield its writer; its catalog is brought up to date at the end.
 
-    The lock goes with the process, however that ends, and is not inherited by children. With `rebuild` nothing is live
-    at first, whatever schema version the lake is of.
+    The lock goes with the process, however that ends, and is not inherited by children.
+
+    Args:
+        root: the lake's folder.
+        rebuild: whether nothing is live at first, whatever schema version the lake is of.
+        retention: how long the lake keeps replaced files from now on; None: as it did.
 
     Raises:
         LakeLockedError: another process holds the lock.
@@ -119,7 +123,7 @@ def open_for_writing(root: Path, *, rebuild: bool = False) -> Iterator[Writer]:
     refuse_foreign(root, rebuild=rebuild)
     with _hold_lock(root):
         (root / WRITER).write_text(f"process {os.getpid()}", encoding="utf-8")
-        writer = _open_writer(root, rebuild=rebuild)
+        writer = _open_writer(root, rebuild=rebuild, retention=retention)
         yield writer
         writer.finish()
         (root / WRITER).unlink()
@@ -167,7 +171,7 @@ def _hold_lock(root: Path) -> Iterator[None]:
         yield
 
 
-def _open_writer(root: Path, *, rebuild: bool) -> Writer:
+def _open_writer(root: Path, *, rebuild: bool, retention: Retention | None) -> Writer:
     """Load the manifest (or make the first), delete what was half written, and bring the catalog up to date."""
     is_new = rebuild
     log = CommitLog(root, is_rebuild=rebuild)
@@ -181,7 +185,7 @@ def _open_writer(root: Path, *, rebuild: bool) -> Writer:
     for folder in session_end.WRITTEN_FOLDERS:
         remove_unfinished(root / folder)
     forget_checksums()
-    adopted = live_folders.adopt_files(root, manifest)
+    adopted = replace(live_folders.adopt_files(root, manifest), retention=retention or manifest.retention)
     if adopted != manifest or not log.is_migrated:
         manifest = log.replace(adopted)
     has_catalog = False

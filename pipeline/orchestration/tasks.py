@@ -20,6 +20,7 @@ from tracklake.pipeline.lake import (
     DamagedFileError,
     LakeLockedError,
     Manifest,
+    Retention,
     Writer,
     find_damaged_files,
     list_ingested,
@@ -226,11 +227,13 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
 
 def _await_writer(stack: ExitStack, request: RunRequest, timeout_s: float) -> Writer:
     """Open the lake for writing, as soon as no other process writes to it."""
+    settings = request.get_settings()
+    retention = Retention(settings.kept_generations, settings.kept_hours)
     limit = time.monotonic() + timeout_s
     is_reported = False
     while True:
         try:
-            return stack.enter_context(open_for_writing(request.root, rebuild=request.rebuild))
+            return stack.enter_context(open_for_writing(request.root, rebuild=request.rebuild, retention=retention))
         except LakeLockedError as busy:
             if time.monotonic() >= limit:
                 raise

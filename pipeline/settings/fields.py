@@ -41,6 +41,12 @@ class DeclaredSettings(BaseModel):
     runner: Literal["threads", "dask"] = Field(
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"
     )
+    kept_generations: int = Field(
+        2, ge=1, description="earlier states of the lake that are kept for `tracklake sql --as-of`, with their files"
+    )
+    kept_hours: float = Field(
+        0.0, ge=0, description="replaced files are kept for so many hours at least, however many runs follow"
+    )
     refusals_fail: bool = Field(
         False, description="a Prefect run that refused files ends as Failed, not as CompletedWithRefusals"
     )
