@@ -24,7 +24,7 @@ def write_unsharded(root: Path, document: dict[str, Any]) -> None:
     aside = root / "manifest.new"
     aside.write_text(json.dumps(document))
     aside.replace(root / "manifest.json")
-    shutil.rmtree(root / SHARDS)
+    shutil.rmtree(root / SHARDS, ignore_errors=True)
 
 
 def edit_manifest(root: Path, change: Callable[[str], str]) -> None:

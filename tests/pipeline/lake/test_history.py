@@ -1,9 +1,11 @@
 """Earlier generations: each can be queried until its files are deleted, and no longer."""
 
 import json
+import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import duckdb
 import pytest
 from small_lake import commit_round, make_status, put, write_round
 
@@ -21,13 +23,19 @@ def set_time(root: Path, time: datetime) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), "written": time.isoformat()}))
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five sessions, at noon and on the hours after; the sum of two subsets is twice the session's number."""
+    root = tmp_path_factory.mktemp("made") / "lake"
     for number in range(5):
-        write_round(tmp_path, number)
-        set_time(tmp_path, NOON + timedelta(hours=number))
-    return tmp_path
+        write_round(root, number)
+        set_time(root, NOON + timedelta(hours=number))
+    return root
+
+
+@pytest.fixture
+def root(made: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(made, tmp_path / "lake")
 
 
 def ask(root: Path, as_of: str | None) -> int:
@@ -36,39 +44,39 @@ def ask(root: Path, as_of: str | None) -> int:
     return found
 
 
-def test_the_last_generations_are_queried_by_number_and_time(root: Path):
-    assert [(each.number, each.commits) for each in list_generations(root)] == [(3, 2), (4, 2), (5, 2)]
-    assert [ask(root, str(number)) for number in (3, 4, 5)] == [4, 6, 8]
-    assert ask(root, None) == 8
+def test_the_last_generations_are_queried_by_number_and_time(made: Path):
+    assert [(each.number, each.commits) for each in list_generations(made)] == [(3, 2), (4, 2), (5, 2)]
+    assert [ask(made, str(number)) for number in (3, 4, 5)] == [4, 6, 8]
+    assert ask(made, None) == 8
     times = ("2026-03-01T14:00:00Z", "2026-03-01T14:59:59+00:00", "2026-03-01 16:00:00+01:00", "2027-01-01")
-    assert [ask(root, time) for time in times] == [4, 4, 6, 8]
-    with tracklake.open(root, as_of="3") as lake:
+    assert [ask(made, time) for time in times] == [4, 4, 6, 8]
+    with tracklake.open(made, as_of="3") as lake:
         assert lake.sql(QUESTION).fetchone() == (4,)
         assert lake.table("subset_status").collect()["backward_vehicles"].to_list() == [2, 2]
 
 
 @pytest.mark.parametrize("asked", ["0", "2", "6", "2026-03-01T13:59:59Z", "1999-12-31"])
-def test_what_is_not_kept_is_answered_with_what_is(root: Path, asked: str):
-    kept = ", ".join(f"{each.number} ({each.show_time()})" for each in list_generations(root))
+def test_what_is_not_kept_is_answered_with_what_is(made: Path, asked: str):
+    kept = ", ".join(f"{each.number} ({each.show_time()})" for each in list_generations(made))
     with pytest.raises(LakeError, match=f"nothing is kept of {asked}") as refused:
-        load_as_of(root, asked)
+        load_as_of(made, asked)
     assert str(refused.value).endswith(f"by generation and time: {kept}.")
     with pytest.raises(LakeError, match="nothing is kept"):
-        tracklake.open(root, as_of=asked)
+        tracklake.open(made, as_of=asked)
 
 
 @pytest.mark.parametrize("asked", ["", "yesterday", "3.5", "2026-13-01"])
-def test_what_is_neither_a_number_nor_a_time_is_refused(root: Path, asked: str):
+def test_what_is_neither_a_number_nor_a_time_is_refused(made: Path, asked: str):
     with pytest.raises(LakeError, match="expected the number of a generation, or a time"):
-        load_as_of(root, asked)
+        load_as_of(made, asked)
 
 
-def test_files_of_every_generation_that_is_listed_are_there_and_others_are_not(root: Path):
-    for each in list_generations(root):
-        manifest = load_as_of(root, str(each.number))
-        assert is_intact(root, (file for commit in manifest.commits.values() for file in commit.all_files))
-    shards = {path.stem for path in (root / "manifest").glob("*.json")}
-    roots = [root / "manifest.json", *(root / "manifest" / "roots").iterdir()]
+def test_files_of_every_generation_that_is_listed_are_there_and_others_are_not(made: Path):
+    for each in list_generations(made):
+        manifest = load_as_of(made, str(each.number))
+        assert is_intact(made, (file for commit in manifest.commits.values() for file in commit.all_files))
+    shards = {path.stem for path in (made / "manifest").glob("*.json")}
+    roots = [made / "manifest.json", *(made / "manifest" / "roots").iterdir()]
     listed = [{shard["sha256"] for shard in json.loads(path.read_text())["shards"]} for path in roots]
     assert len(roots) == 3
     assert shards == set.union(*listed)
@@ -83,13 +91,10 @@ def test_a_rebuild_leaves_what_was_before_to_be_queried(root: Path):
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b'{"shards": [{}]}'])
-def test_an_earlier_root_that_is_damaged_is_no_generation_and_is_swept(root: Path, content: bytes):
+def test_an_earlier_root_that_is_damaged_is_no_generation_and_is_to_be_swept(root: Path, content: bytes):
     (root / "manifest" / "roots" / "4.json").write_bytes(content)
     assert [each.number for each in list_generations(root)] == [3, 5]
     assert "manifest/roots/4.json" in find_superseded(root)
-    with open_for_writing(root):
-        pass
-    assert ask(root, "5") == 8
 
 
 def test_a_lake_keeps_as_many_generations_as_it_is_told_to(tmp_path: Path):
@@ -117,3 +122,19 @@ def test_files_are_kept_for_as_many_hours_as_the_lake_is_told_to(tmp_path: Path)
     assert [ask(tmp_path, str(number)) for number in range(2, 7)] == [2, 4, 6, 8, 10]
     assert {item.generation for item in load(tmp_path).retired} == {3, 4, 5, 6}
     assert not find_superseded(tmp_path)
+
+
+def test_the_command_queries_what_info_lists(command, made: Path, tmp_path: Path):
+    said = json.loads(command.here("info", "--lake", made, "--json").out)["generations"]
+    assert [(each["number"], each["commits"]) for each in said] == [(3, 2), (4, 2), (5, 2)]
+    for asked, expected in ((said[0]["written"], "4"), (said[1]["number"], "6")):
+        done = command.here("sql", QUESTION, "--lake", made, "--as-of", asked, "--format", "csv")
+        assert done.out.split()[1] == expected, done.err
+    shown = command.here("info", "--lake", made).out
+    assert list_generations(made)[0].show_time() in shown
+    assert command.here("sql", "--lake", made, "--as-of", "3", "--out", tmp_path / "x.duckdb").code == 0
+    with duckdb.connect(str(tmp_path / "x.duckdb"), read_only=True) as client:
+        assert client.sql(QUESTION).fetchall() == [(4,)]
+    refused = command.here("sql", QUESTION, "--lake", made, "--as-of", "7")
+    assert (refused.code, refused.out) == (1, "")
+    assert "nothing is kept of 7. What can be asked for, by generation and time: 3 (2026-03-01T" in refused.err
