@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, LakeError, MissingObjectError, SwapConflictError
 from tracklake.pipeline.lake.history import name_root
@@ -16,6 +16,8 @@ from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retired
 from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import Changes, append_changes, parse_shards
 from tracklake.schemas import SCHEMA_VERSION
+
+T = TypeVar("T")
 
 MAX_CONFLICTS = 20
 """Times that changes are applied again to roots that other processes have put in place meanwhile."""
@@ -158,29 +160,23 @@ def _describe(item: Commit | Retired | dict[str, Any]) -> dict[str, Any]:
 
 def _apply(theirs: Manifest, ours: Manifest, changes: Changes) -> Manifest:
     """Return another process's manifest with our changes; our files are retired no earlier than in its generation."""
-    generation = max(theirs.generation, ours.generation)
-    commits, sources = dict(theirs.commits), dict(theirs.sources)
-    retired = {item.path: item for item in theirs.retired}
     mine = {item.path: replace(item, generation=max(item.generation, theirs.generation)) for item in ours.retired}
-    for held, own, section in (
-        (commits, ours.commits, "commits"),
-        (sources, ours.sources, "sources"),
-        (retired, mine, "retired"),
-    ):
-        for name, item in changes[section].items():
-            if item is None:
-                held.pop(name, None)
-            else:
-                held[name] = own[name]
+    retired = _merge({item.path: item for item in theirs.retired}, mine, changes["retired"])
     merged = replace(
         theirs,
-        generation=generation,
-        commits=commits,
-        sources=sources,
+        generation=max(theirs.generation, ours.generation),
+        commits=_merge(theirs.commits, ours.commits, changes["commits"]),
+        sources=_merge(theirs.sources, ours.sources, changes["sources"]),
         ingested_from=tuple(dict.fromkeys((*theirs.ingested_from, *ours.ingested_from))),
     )
     live = merged.live_paths()
     return replace(merged, retired=tuple(item for item in retired.values() if item.path not in live))
+
+
+def _merge(theirs: Mapping[str, T], ours: Mapping[str, T], changed: Mapping[str, object]) -> dict[str, T]:
+    """Return their items with those of ours that changed, and without those that we removed."""
+    kept = {name: item for name, item in theirs.items() if name not in changed}
+    return {**kept, **{name: ours[name] for name in changed if name in ours}}
 
 
 def _encode(root: Mapping[str, Any]) -> bytes:
