@@ -156,7 +156,6 @@ def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: 
     Raises:
         LakeError: a live file is missing or unreadable.
     """
-    connection.execute("SET parquet_metadata_cache = true")  # or every statement reads each file's columns again
     connection.begin()
     for name, select in _write_selects(root, manifest).items():
         _create(connection, root, name, f'CREATE VIEW "{name}" AS {select}')
