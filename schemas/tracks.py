@@ -43,13 +43,14 @@ TRACKS = Table(
         "lane": column(
             pl.Int16,
             "1 is the driver's leftmost; as recorded, so that y_m may lie in the next lane just before or after a lane "
-            "change; null where the source has none",
+            "change; I-24: by strips of 12 ft; null where the source has none",
             nullable=True,
             ge=0,
         ),
         "speed_mps": column(
             pl.Float32,
-            "recorded, signed along the direction of travel or the road's axis: negative is backwards",
+            "recorded, signed along the direction of travel or the road's axis: negative is backwards; "
+            "I-24: central difference of the back's position",
             unit="m/s",
             ge=-40,
             le=100,
@@ -93,8 +94,12 @@ TRACKS = Table(
             unit="m/s2",
             nullable=True,
         ),
-        "leader_id": column(pl.Int32, "vehicle ahead in the lane, as recorded; null = none", nullable=True),
-        "follower_id": column(pl.Int32, "vehicle behind in the lane, as recorded; null = none", nullable=True),
+        "leader_id": column(
+            pl.Int32, "vehicle ahead in the lane, as recorded, else derived (TGSIM, I-24); null = none", nullable=True
+        ),
+        "follower_id": column(
+            pl.Int32, "vehicle behind in the lane, as recorded, else derived (TGSIM, I-24); null = none", nullable=True
+        ),
         "gap_m": column(
             pl.Float64,
             "leader's front - leader's length - own front, rounded to 1 mm; exact where the leader points along the "

@@ -10,14 +10,14 @@ from tracklake.pipeline.cli.console import find_command
 from tracklake.pipeline.cli.generated_sample import write_generated
 from tracklake.pipeline.cli.options import JsonOption, MinutesOption, QuietOption, SeedOption
 from tracklake.pipeline.lake import refuse_lake
-from tracklake.pipeline.synthetic import UNIFORM
+from tracklake.pipeline.synthetic import ALL_FORMATS, UNIFORM
 
 
 def sample(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
     format: Annotated[
         list[str] | None,
-        typer.Option("--format", help="highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, i24; repeatable."),
+        typer.Option("--format", help=f"{', '.join(ALL_FORMATS)}; repeatable."),
     ] = None,
     noise: Annotated[
         list[str] | None,

@@ -31,7 +31,7 @@ from tracklake.pipeline.sources.tgsim_files import (
     group,
     read_centrelines,
 )
-from tracklake.pipeline.transforms.tracks.road_axis import RoadAxis, Vector, find_direction
+from tracklake.pipeline.transforms.tracks.lane_axis import Vector, find_direction, fit_lane_axis
 from tracklake.schemas import COMPLETENESS, references
 from tracklake.schemas.raw_tgsim import RAW_TGSIM, RAW_TGSIM_CENTRELINES
 
@@ -192,11 +192,12 @@ def _to_subset(
     lane = pl.when(pl.col("lane_kf") != 0).then(pl.col("lane_kf"))
     entries = entries.with_columns(vehicle_id="id", x="xloc_kf", y="yloc_kf", lane=lane)
     own_lines = centrelines.filter(pl.col("lane").is_in(entries["lane"].unique().to_list()))
-    axis = RoadAxis.fit(entries if own_lines.is_empty() else own_lines, vector, y_points_down=True)
-    along_m, across_m = axis.project(entries["x"].to_numpy(), entries["y"].to_numpy())
+    axis = fit_lane_axis(_raise(entries if own_lines.is_empty() else own_lines), (vector[0], -vector[1]))
+    places = axis.project(entries["x"].to_numpy(), -entries["y"].to_numpy())
     entries = entries.join(sizes.select("vehicle_id", "length_m"), on="vehicle_id", how="left", maintain_order="left")
     entries = entries.with_columns(
-        pl.Series("across", across_m), front=pl.lit(pl.Series(along_m)) + pl.col("length_m").fill_null(0) / 2
+        pl.Series("across", places.right_m),
+        front=pl.lit(pl.Series(places.along_m)) + pl.col("length_m").fill_null(0) / 2,
     )
     lanes = _number_lanes(entries, own_lines)
     notes = _describe_lanes(name, lanes)
@@ -226,6 +227,11 @@ def _to_subset(
         tracks, sizes, dataset="tgsim", name=name, facts=own_facts, use_recorded_headway=False, files=files
     )
     return made, notes
+
+
+def _raise(points: pl.DataFrame) -> pl.DataFrame:
+    """Turn the plane of an image over, whose y points down."""
+    return points.with_columns(y=-pl.col("y"))
 
 
 def _number_lanes(entries: pl.DataFrame, centrelines: pl.DataFrame) -> pl.DataFrame:

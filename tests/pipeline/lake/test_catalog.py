@@ -79,7 +79,7 @@ def test_every_table_has_the_declared_columns_and_types(tmp_path: Path, monkeypa
         }
         comments = plain.execute("SELECT table_name, column_name, comment FROM duckdb_columns() WHERE NOT internal")
         said = {(table, column): comment for table, column, comment in comments.fetchall()}
-        assert said["tracks", "speed_mps"].startswith("[m/s] recorded, signed along the direction of travel: ")
+        assert said["tracks", "speed_mps"].startswith("[m/s] recorded, signed along the direction of travel ")
         assert said["vehicles", "starts_late"] == "eligible and first seen beyond the cut-off"
         assert all(said.values())
 
