@@ -13,7 +13,7 @@ EXTRAS = {
     "reconstruct": ("scipy",),
     "sample": ("sumo",),
     "distributed": ("prefect_dask",),
-    "object-store": ("obstore", "duckdb_extension_httpfs"),
+    "object-store": ("obstore", "duckdb_extension_httpfs", "duckdb_extension_aws"),
     "onboard": ("pyproj", "rosbags", "scipy", "sklearn"),
 }
 """Modules that each extra installs, by the extra's name in pyproject.toml."""

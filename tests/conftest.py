@@ -24,6 +24,7 @@ from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
 from object_stores import bucket as bucket
 from object_stores import object_store_server as object_store_server
+from object_stores import role as role
 from plain_flows import replace_prefect
 from simulated import simulate_once
 

@@ -38,6 +38,8 @@ COMMANDS = {
     "lane-forest": "Fit a forest that predicts lane changes; score it, and the grid cells that models predict.",
     "onboard": "Predict the vehicles around an instrumented vehicle from its own logs; train, evaluate, warn.",
     "export": "Write the lake's data in other projects' formats.",
+    "publish": "Put the lake where others can read it, on an object store.",
+    "fetch": "Copy a lake from an object store to a folder, or bring that copy up to date.",
     "sample": "Generate recordings in the raw formats with SUMO, with known defects and their truth.",
     "instrument": "Write what a car of a recording would have logged: V2V messages, LiDAR, camera, and the truth.",
     "serve": "Serve the flows as Prefect deployments, by hand or on a schedule, until interrupted.",
@@ -45,6 +47,7 @@ COMMANDS = {
 """Short help of each command, in the order of the help page; a command is a function in the module of its name."""
 
 MODULES = dict.fromkeys(("validate", "reconstruct", "traffic", "samples", "tensors", "fuse"), "stage")
+MODULES["fetch"] = "publish"
 """Modules of the commands that have none of their own."""
 DIAGNOSIS = "Diagnosis"
 """Title of the options that every command takes, on its help page."""

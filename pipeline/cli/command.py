@@ -14,8 +14,9 @@ import typer
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.logs import LOG, open_log
 from tracklake.pipeline.lake import follow_move
+from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.settings import DEBUG, Settings, find_unknown_variables, read_sources
-from tracklake.schemas.errors import TracklakeError, describe_bug
+from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
 from tracklake.schemas.text import make_visible
 
 DONE, FAILED, USAGE, REFUSED, GATE_FAILED, INTERRUPTED = 0, 1, 2, 3, 4, 130
@@ -102,11 +103,13 @@ def read_settings(
     protocol: str | None = None,
     columns: Path | None = None,
     recording: str | None = None,
+    in_folder: bool = True,
 ) -> Settings:
     """Read the settings from files and environment, flags on top; a moved lake gets its catalog again.
 
     Raises:
         SettingError: a setting is unknown, out of its bounds or cannot be read.
+        UsageError: the lake is on an object store, and the command needs one in a folder (`in_folder`).
     """
     flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
     # Absolute, so that a worker in another folder finds the same file.
@@ -116,5 +119,11 @@ def read_settings(
     for source in read_sources(given) if LOG.isEnabledFor(logging.DEBUG) else ():
         if source.values:
             LOG.debug("settings from %s: %s", source.name, source.values)
+    address = find_address(settings.lake)
+    if address is not None and in_folder:
+        raise UsageError(
+            f"{address}: this command works on a lake in a folder. Copy the lake to one by `tracklake fetch {address} "
+            "--lake DIR`, name it by --lake DIR here, and send the result back by `tracklake publish store`."
+        )
     follow_move(settings.lake)
     return settings

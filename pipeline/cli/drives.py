@@ -1,6 +1,5 @@
 """Drives of a lake for the terminal: what each holds, and which are synthetic."""
 
-from pathlib import Path
 from typing import Any
 
 import polars as pl
@@ -8,6 +7,7 @@ import polars as pl
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.lake.places import LakePlace
 from tracklake.schemas import DRIVES, STATIONS
 from tracklake.schemas.origin import describe_synthetic
 
@@ -15,15 +15,15 @@ SHOWN = ("subset", "recording", "origin", "seconds", "stations", "messages", "sc
 """Columns of `drives` that are shown of each; stations and messages are those of other vehicles, as in the report."""
 
 
-def list_drives(root: Path, manifest: Manifest) -> list[dict[str, Any]]:
+def list_drives(place: LakePlace, manifest: Manifest) -> list[dict[str, Any]]:
     """Return what a lake's drives hold, sorted by name."""
     others = (
-        scan(root, manifest, STATIONS)
+        scan(place, manifest, STATIONS)
         .filter(~pl.col("own"))
         .group_by("subset")
         .agg(stations=pl.len(), messages=pl.col("messages").sum())
     )
-    drives = scan(root, manifest, DRIVES).drop("stations", "messages").join(others, on="subset", how="left")
+    drives = scan(place, manifest, DRIVES).drop("stations", "messages").join(others, on="subset", how="left")
     counted = drives.with_columns(pl.col("stations", "messages").fill_null(0))
     return counted.select(SHOWN).sort("subset").collect().to_dicts()
 

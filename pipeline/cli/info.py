@@ -10,13 +10,15 @@ from typing import Any
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.drives import list_drives, print_drives
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption
+from tracklake.pipeline.cli.options import AnyLakeOption, JsonOption, ProtocolOption
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.ingest.staleness import StageState, describe_stages
 from tracklake.pipeline.lake import Manifest, connect, load
 from tracklake.pipeline.lake.catalog import CATALOG
 from tracklake.pipeline.lake.files import MODELS, REPORTS, STORE, TABLE_BY_NAME, TENSORS
 from tracklake.pipeline.lake.history import list_generations
+from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.places import LakePlace, find_place, open_store
 from tracklake.quality_reports.gates.metrics import collect_metrics
 from tracklake.schemas.origin import describe_synthetic
 
@@ -26,28 +28,30 @@ MAX_REASONS = 3
 """Most reasons of one stage that are printed; --json has all."""
 
 
-def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOption = False) -> None:
+def info(lake: AnyLakeOption = None, protocol: ProtocolOption = None, json: JsonOption = False) -> None:
     """Show a lake's recordings, stages, what is stale and why, and sizes on disk.
 
     Stages are compared with the settings in force. Raw files are compared by size and time of change.
     """
     with command(json=json) as terminal:
-        settings = read_settings(lake=lake, protocol=protocol)
-        root = settings.lake
-        manifest = load(root)
-        with connect(root) as connection:
+        settings = read_settings(lake=lake, protocol=protocol, in_folder=False)
+        place = find_place(settings.lake)
+        manifest = load(place)
+        with connect(place) as connection:
             rows = collect_metrics(connection, ())
         recordings = _list_recordings([row for row in rows if row["scope"] == "recording"], manifest)
-        drives = list_drives(root, manifest)
-        stages = describe_stages(root, manifest, settings)
-        sizes, generations = measure_sizes(root, manifest), list_generations(root)
-        terminal.print_line(f"{root.resolve()}", style="bold")
+        drives = list_drives(place, manifest)
+        # On an object store no stage runs, and raw files are not compared: the folder it was published from has both.
+        stages = describe_stages(place, manifest, settings) if isinstance(place, Path) else []
+        sizes, generations = measure_sizes(place, manifest), list_generations(place)
+        terminal.print_line(f"{place}", style="bold")
         terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in rows if row["subset"]}))
         if recordings or not drives:
             _show_recordings(terminal, recordings)
         print_drives(terminal, drives)
-        _show_stages(terminal, stages)
-        print_table(terminal, ("on disk", "MB"), [[name, f"{size / 1e6:,.1f}"] for name, size in sizes.items()])
+        if stages:
+            _show_stages(terminal, stages)
+        print_table(terminal, ("stored", "MB"), [[name, f"{size / 1e6:,.1f}"] for name, size in sizes.items()])
         print_table(
             terminal,
             ("generation", "last change", "commits"),
@@ -57,7 +61,7 @@ def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOpt
         )
         terminal.print_json(
             {
-                "lake": root.resolve(),
+                "lake": place,
                 "lake_id": manifest.lake_id,
                 "ingested_from": manifest.ingested_from,
                 "recordings": recordings,
@@ -83,8 +87,8 @@ def _list_recordings(rows: Sequence[dict[str, Any]], manifest: Manifest) -> list
     ]
 
 
-def measure_sizes(root: Path, manifest: Manifest) -> dict[str, int]:
-    """Return the bytes on disk of the parts of a lake; files with several names count once.
+def measure_sizes(place: LakePlace, manifest: Manifest) -> dict[str, int]:
+    """Return the bytes of the parts of a lake; files with several names count once.
 
     Folders of tables hold links to the tables, or `copies` where the file system has none. Files that were `replaced`
     are kept for readers and deleted by a later session.
@@ -92,7 +96,13 @@ def measure_sizes(root: Path, manifest: Manifest) -> dict[str, int]:
     parts = {STORE: "tables", TENSORS: "tensors", REPORTS: "reports", MODELS: "models"}
     parts |= dict.fromkeys(TABLE_BY_NAME, "copies")
     sizes = dict.fromkeys((*parts.values(), "catalog", "replaced", "others"), 0)
-    live, seen = manifest.live_paths(), set()
+    if isinstance(place, str):
+        objects = {name_object(file) for commit in manifest.commits.values() for file in commit.all_files}
+        for item in open_store(place).list():
+            part = parts.get(item.path.partition("/")[0], "others")
+            sizes[part if item.path in objects or part == "others" else "replaced"] += item.bytes
+        return sizes | {"total": sum(sizes.values())}
+    root, live, seen = place, manifest.live_paths(), set()
     for top in (*parts, "."):  # the content of tables before the folders with links to it
         for folder, _, names in os.walk(root / top):
             for path in (Path(folder) / name for name in names):

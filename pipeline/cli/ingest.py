@@ -6,10 +6,10 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import (
+    AnyLakeOption,
     ColumnsOption,
     DatasetOption,
     JsonOption,
-    LakeOption,
     PruneOption,
     QuietOption,
     RebuildOption,
@@ -17,12 +17,12 @@ from tracklake.pipeline.cli.options import (
     ReplaceOption,
     WorkersOption,
 )
-from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 
 
 def ingest(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="A raw file, or a folder of any mix of them.")],
-    lake: LakeOption = None,
+    lake: AnyLakeOption = None,
     dataset: DatasetOption = None,
     columns: ColumnsOption = None,
     recording: RecordingOption = None,
@@ -35,7 +35,8 @@ def ingest(
 ) -> None:
     """Read raw files into tracks, vehicles and subsets (the format is detected)."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers, columns=columns, recording=recording)
+        named = read_settings(lake=lake, workers=workers, columns=columns, recording=recording, in_folder=False)
         flags: dict[str, Any] = {"replace": replace, "prune": prune, "rebuild": rebuild}
-        outcome = run_steps(terminal, settings, ("ingest",), source, dataset, **flags)
-        report_result(terminal, settings, outcome, headline=False)
+        with work_in_folder(terminal, named) as settings:
+            outcome = run_steps(terminal, settings, ("ingest",), source, dataset, **flags)
+            report_result(terminal, settings, outcome, headline=False)

@@ -10,6 +10,14 @@ import typer
 LakeOption = Annotated[
     Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
 ]
+AnyLakeOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lake",
+        metavar="DIR|ADDRESS",
+        help="Folder of the lake, or s3://bucket/lake (or TRACKLAKE_LAKE; default: lake).",
+    ),
+]
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", min=1, help="Recordings worked on at once (or TRACKLAKE_WORKERS).")
 ]

@@ -17,6 +17,8 @@ from tracklake.pipeline.cli.summary import show_assessment, show_headline, show_
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.lake import LakeError, load, refuse_foreign, refuse_if_busy
 from tracklake.pipeline.lake.files import REPORTS
+from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.working_copy import WorkingCopy, name_copy
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
 from tracklake.pipeline.settings import Settings, list_files
@@ -85,6 +87,35 @@ def run_steps(
     with terminal.show_stages(), explain_file_errors(request.root), _explain_interrupt(request.root):
         result: RunResult = import_flows().execute(request, plan)
         return result
+
+
+@contextmanager
+def work_in_folder(terminal: Terminal, settings: Settings) -> Iterator[Settings]:
+    """Yield settings with the lake in a folder; of a lake on an object store its copy, which is published at the end.
+
+    After Ctrl-C or an error nothing is published, and the same command goes on with what the copy holds by then.
+    """
+    address = find_address(settings.lake)
+    if address is None:
+        yield settings
+        return
+    copy = WorkingCopy(address, name_copy(address, settings.cache))
+    terminal.print_line(f"working in {copy.folder}, a copy of {address}", style="dim")
+    received = copy.fetch()
+    if received is not None and received.files:
+        terminal.print_line(f"fetched {received.files:,} files, {received.bytes / 1e6:,.1f} MB", style="dim")
+    try:
+        yield settings.model_copy(update={"lake": copy.folder})
+    except typer.Exit:  # some files were refused, or a stage failed: what is done counts, as in a folder
+        _publish(terminal, copy)
+        raise
+    _publish(terminal, copy)
+
+
+def _publish(terminal: Terminal, copy: WorkingCopy) -> None:
+    sent = copy.publish()
+    if sent is not None:
+        terminal.print_line(f"published {copy.address}: {sent.files:,} files, {sent.bytes / 1e6:,.1f} MB")
 
 
 @contextmanager

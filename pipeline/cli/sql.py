@@ -13,7 +13,7 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import LakeOption, require_choice
+from tracklake.pipeline.cli.options import AnyLakeOption, require_choice
 from tracklake.pipeline.cli.tables import GAP, cut_text, print_table
 from tracklake.pipeline.lake import LakeResult, connect, refuse_lake
 from tracklake.pipeline.lake import query as run_query
@@ -63,7 +63,7 @@ def sql(
     query: Annotated[
         str | None, typer.Argument(help="One SELECT; `-` reads it from standard input. With --list: a name.")
     ] = None,
-    lake: LakeOption = None,
+    lake: AnyLakeOption = None,
     format: Annotated[
         str | None,
         typer.Option(
@@ -99,7 +99,7 @@ def sql(
         if query is None:
             raise typer.BadParameter("give one SELECT, `-` to read it from standard input, or --list")
         form = choose_format(format, out, json=json)
-        with connect(read_settings(lake=lake).lake, as_of) as connection:
+        with connect(read_settings(lake=lake, in_folder=False).lake, as_of) as connection:
             relation = run_query(connection, sys.stdin.read() if query == "-" else query)
             write_result(relation, form, out, terminal)
 

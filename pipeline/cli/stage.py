@@ -5,8 +5,8 @@ from pathlib import Path
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
-from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.cli.options import AnyLakeOption, JsonOption, ProtocolOption, QuietOption, WorkersOption
+from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 from tracklake.pipeline.cli.summary import show_reconstruction
 from tracklake.pipeline.stages.registry import STAGES
 
@@ -18,18 +18,19 @@ def _make_command(name: str, *others: str, show: Callable[[Terminal, Path], None
     """
 
     def run_stage(
-        lake: LakeOption = None,
+        lake: AnyLakeOption = None,
         protocol: ProtocolOption = None,
         workers: WorkersOption = None,
         quiet: QuietOption = False,
         json: JsonOption = False,
     ) -> None:
         with command(quiet=quiet, json=json) as terminal:
-            settings = read_settings(lake=lake, workers=workers, protocol=protocol)
-            result = run_steps(terminal, settings, (name, *others))
-            if show is not None and not result.failed:
-                show(terminal, settings.lake)
-            report_result(terminal, settings, result, headline=False)
+            named = read_settings(lake=lake, workers=workers, protocol=protocol, in_folder=False)
+            with work_in_folder(terminal, named) as settings:
+                result = run_steps(terminal, settings, (name, *others))
+                if show is not None and not result.failed:
+                    show(terminal, settings.lake)
+                report_result(terminal, settings, result, headline=False)
 
     run_stage.__doc__ = next(stage.meaning for stage in STAGES if stage.name == name)
     return run_stage

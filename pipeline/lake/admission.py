@@ -17,10 +17,11 @@ _EXPLAIN = re.compile(r"^(\s|--[^\n]*\n)*EXPLAIN(\s+ANALYZE)?(\s*\([^)]*\))?\s+"
 _WORD = re.compile(r'\w+|"(""|[^"])*"')
 _SWITCHES = {
     *("enable_logging", "disable_logging", "enable_profiling", "disable_profiling"),
-    *("query", "json_execute_serialized_sql"),
+    *("query", "json_execute_serialized_sql", "duckdb_secrets"),
 }
-"""Functions by which a SELECT changes a setting in spite of the locked configuration, or runs a text it made up. What
-they would write is refused by the file system all the same, but DuckDB then ends the whole process."""
+"""Functions that show how an object store is signed in to; by which a SELECT changes a setting in spite of the locked
+configuration; or that run a text it made up. What they would write is refused by the file system all the same, but
+DuckDB then ends the whole process."""
 
 _PIVOT_HINT = (
     " A PIVOT that finds out the values by itself creates a type first; with the values named it is one SELECT: "

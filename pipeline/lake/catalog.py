@@ -18,7 +18,9 @@ from polars.datatypes import DataTypeClass
 from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import STAGING, read_partition
 from tracklake.pipeline.lake.macros import MACROS
-from tracklake.pipeline.lake.manifest import Manifest
+from tracklake.pipeline.lake.manifest import LakeFile, Manifest
+from tracklake.pipeline.lake.object_access import FileLocations, quote
+from tracklake.pipeline.lake.places import LakePlace
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 from tracklake.schemas.columns import Column
 from tracklake.schemas.files import write_file
@@ -71,11 +73,6 @@ def sql_type(dtype: pl.DataType | DataTypeClass) -> str:
     return _SQL_TYPES[instance]
 
 
-def quote(text: str) -> str:
-    """Return a text as a SQL string literal."""
-    return "'" + text.replace("'", "''") + "'"
-
-
 def escape_pattern(path: str) -> str:
     """Return a path in which DuckDB finds no pattern."""
     return re.sub(r"[*?\[]", r"[\g<0>]", path)
@@ -87,8 +84,8 @@ def list_columns(table: Table) -> dict[str, Column]:
     return {**table.columns, **{name: later.columns[name] for name in names}}
 
 
-def _write_select(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
-    rows = _write_read(table, manifest, locate)
+def _write_select(table: Table, manifest: Manifest, locations: FileLocations) -> str:
+    rows = _write_read(table, manifest, locations)
     if table.name not in JOINED:
         return rows
     later, columns = JOINED[table.name]
@@ -96,25 +93,26 @@ def _write_select(table: Table, manifest: Manifest, locate: Callable[[str], str]
     shown = ", ".join(f"later.{name}" for name in columns)
     return (
         f"SELECT ingested.*, {shown} FROM ({rows}) AS ingested "
-        f"LEFT JOIN ({_write_read(later, manifest, locate)}) AS later USING ({key})"
+        f"LEFT JOIN ({_write_read(later, manifest, locations)}) AS later USING ({key})"
     )
 
 
-def _write_read(table: Table, manifest: Manifest, locate: Callable[[str], str]) -> str:
-    paths = [file.path for file in manifest.live(table.name)]
-    files = [quote(locate(path)) for path in paths]
+def _write_read(table: Table, manifest: Manifest, locations: FileLocations) -> str:
+    live = manifest.live(table.name)
     complete = _are_complete(table, manifest)
-    if not files:
+    if not live:
         columns = ", ".join(f'CAST(NULL AS {sql_type(dtype)}) AS "{name}"' for name, dtype in table.dtypes.items())
         return f"SELECT {columns} WHERE false"
     # Qualified, as a macro's parameter takes the place of every other name like it.
     columns = ", ".join(f'file."{name}"' for name in table.dtypes)
+    files = [quote(escape_pattern(locations.find(file))) for file in live]
     if not table.partition:
         read = _read_files(table, files, "hive_partitioning = false", complete=complete)
         return f"SELECT {columns} FROM {read} AS file"
-    if any(f"/{name}=" in locate(path).removesuffix(path).lower() for path in paths[:1] for name in table.partition):
+    above = escape_pattern(locations.root).lower()
+    if any(f"/{name}=" in above for name in table.partition):
         # A folder above the lake looks like a partition, and DuckDB would believe it.
-        return " UNION ALL ".join(_write_read_of_file(table, path, locate, complete=complete) for path in paths)
+        return " UNION ALL ".join(_write_read_of_file(table, file, locations, complete=complete) for file in live)
     types = ", ".join(f"'{name}': {sql_type(table.dtypes[name])}" for name in table.partition)
     options = f"hive_partitioning = true, hive_types = {{{types}}}"
     return f"SELECT {columns} FROM {_read_files(table, files, options, complete=complete)} AS file"
@@ -135,30 +133,31 @@ def _are_complete(table: Table, manifest: Manifest) -> bool:
     return all({*table.added} <= {*commit.info.get(ADDED, ())} for commit in commits if table.name in commit.files)
 
 
-def _write_read_of_file(table: Table, path: str, locate: Callable[[str], str], *, complete: bool) -> str:
-    stated = read_partition(table, path)
+def _write_read_of_file(table: Table, file: LakeFile, locations: FileLocations, *, complete: bool) -> str:
+    stated = read_partition(table, file.path)
     columns = ", ".join(
         f'CAST({quote(stated[name])} AS {sql_type(dtype)}) AS "{name}"' if name in stated else f'file."{name}"'
         for name, dtype in table.dtypes.items()
     )
-    read = _read_files(table, [quote(locate(path))], "hive_partitioning = false", complete=complete)
+    path = quote(escape_pattern(locations.find(file)))
+    read = _read_files(table, [path], "hive_partitioning = false", complete=complete)
     return f"SELECT {columns} FROM {read} AS file"
 
 
-def create_views(connection: "duckdb.DuckDBPyConnection", root: Path, manifest: Manifest) -> None:
+def create_views(connection: "duckdb.DuckDBPyConnection", place: LakePlace, manifest: Manifest) -> None:
     """Create the views and the macros over them, in one transaction: each statement in its own takes a third longer.
 
     Args:
         connection: connection to an empty database.
-        root: the lake's folder.
+        place: the lake's folder, or its address, which the connection was admitted to.
         manifest: live files of the lake.
 
     Raises:
         LakeError: a live file is missing or unreadable.
     """
     connection.begin()
-    for name, select in _write_selects(root, manifest).items():
-        _create(connection, root, name, f'CREATE VIEW "{name}" AS {select}')
+    for name, select in _write_selects(place, manifest).items():
+        _create(connection, place, name, f'CREATE VIEW "{name}" AS {select}')
     for macro in MACROS:
         connection.execute(macro.statement)
     connection.commit()
@@ -173,15 +172,13 @@ def describe_views(connection: "duckdb.DuckDBPyConnection") -> None:
     connection.commit()
 
 
-def _write_selects(root: Path, manifest: Manifest) -> dict[str, str]:
+def _write_selects(place: LakePlace, manifest: Manifest) -> dict[str, str]:
     """Return a SELECT of the live rows of every table, by name."""
-    folder = root.resolve().as_posix()  # with slashes on Windows, too, as `_write_read` looks for folders
-    return {
-        table.name: _write_select(table, manifest, lambda path: escape_pattern(f"{folder}/{path}")) for table in TABLES
-    }
+    locations = FileLocations(place)
+    return {table.name: _write_select(table, manifest, locations) for table in TABLES}
 
 
-def _create(connection: "duckdb.DuckDBPyConnection", root: Path, name: str, statement: str) -> None:
+def _create(connection: "duckdb.DuckDBPyConnection", place: LakePlace, name: str, statement: str) -> None:
     import duckdb
 
     try:
@@ -189,8 +186,8 @@ def _create(connection: "duckdb.DuckDBPyConnection", root: Path, name: str, stat
     except duckdb.Error as failed:
         reason = str(failed).splitlines()[0]
         raise LakeError(
-            f"{root}: the table `{name}` cannot be read: {reason}\nIf its files were removed or damaged, "
-            f"`tracklake run SOURCE --lake {quote_shell(root)}` on the raw files makes them again."
+            f"{place}: the table `{name}` cannot be read: {reason}\nIf its files were removed or damaged, "
+            f"`tracklake run SOURCE --lake {quote_shell(place)}` on the raw files makes them again."
         ) from failed
 
 

@@ -16,6 +16,8 @@ import polars as pl
 from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.errors import DamagedFileError, LakeMissingError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
+from tracklake.pipeline.lake.object_access import FileLocations, get_polars_options
+from tracklake.pipeline.lake.places import LakePlace
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import sync
@@ -256,32 +258,36 @@ def _make_folder(folder: Path) -> list[Path]:
     return made
 
 
-def scan(root: Path, manifest: Manifest, table: Table, **values: str) -> pl.LazyFrame:
+def scan(place: LakePlace, manifest: Manifest, table: Table, **values: str) -> pl.LazyFrame:
     """Return the live rows of a table lazily, with its partition columns; `values` of these select the files to read.
 
     Raises:
         ValueError: the table is not partitioned by a column of `values`.
-        DamagedFileError: a live file is missing.
+        DamagedFileError: a live file is missing in the lake's folder; of an object, Polars finds out on collecting.
     """
     others = values.keys() - set(table.partition)
     if others:
         raise ValueError(f"{table.name} has no partition {', '.join(sorted(others))}; filter its rows instead")
     # Not by the reader's hive option: that takes `name=value` folders above the lake for partitions, too.
-    by_values: dict[tuple[tuple[str, str], ...], list[Path]] = {}
+    locations = FileLocations(place)
+    by_values: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for file in manifest.live(table.name):
         stated = read_partition(table, file.path)
         if values.items() <= stated.items():
-            if not (root / file.path).is_file():
+            content = locations.find(file)
+            if isinstance(place, Path) and not Path(content).is_file():
                 raise DamagedFileError(
-                    f"{root / file.path}: a live file of the lake is missing; `tracklake run SOURCE --lake "
-                    f"{quote_shell(root)}` on "
+                    f"{content}: a live file of the lake is missing; `tracklake run SOURCE --lake "
+                    f"{quote_shell(place)}` on "
                     "the raw files makes it again"
                 )
-            by_values.setdefault(tuple(stated.items()), []).append(root / file.path)
+            by_values.setdefault(tuple(stated.items()), []).append(content)
     if not by_values:
         return table.empty().lazy()
     stored = {name: dtype for name, dtype in table.dtypes.items() if name not in table.partition}
     options: dict[str, Any] = {"schema": stored, "missing_columns": "insert"} if table.added else {}
+    if isinstance(place, str):
+        options |= {"storage_options": get_polars_options(place), "credential_provider": None}
     return pl.concat(
         pl.scan_parquet(paths, hive_partitioning=False, glob=False, **options)
         .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in stated)

@@ -54,7 +54,7 @@ def list_generations(place: LakePlace) -> list[Generation]:
     Raises:
         LakeError: no lake there, or none of ours.
     """
-    return [_describe(document) for document in _list_roots(place)]
+    return [_describe(document) for document in list_roots(place)]
 
 
 def load_as_of(place: LakePlace, asked: str | None) -> Manifest:
@@ -69,7 +69,7 @@ def load_as_of(place: LakePlace, asked: str | None) -> Manifest:
     """
     if asked is None:
         return load(place)
-    roots = _list_roots(place)
+    roots = list_roots(place)
     if asked.strip().isdecimal():
         found = [document for document in roots if document["generation"] == int(asked)]
     else:
@@ -88,7 +88,7 @@ def find_limit(place: LakePlace, manifest: Manifest) -> int:
 
 def _find_limit(store: Store, number: int, retention: Retention) -> int:
     limit, since = number - retention.generations, datetime.now(UTC) - timedelta(hours=retention.hours)
-    while (kept := _read_kept(store, name_root(limit))) and datetime.fromisoformat(kept["written"]) > since:
+    while (kept := read_kept_root(store, name_root(limit))) and datetime.fromisoformat(kept["written"]) > since:
         limit -= 1
     return limit
 
@@ -96,23 +96,23 @@ def _find_limit(store: Store, number: int, retention: Retention) -> int:
 def find_superseded(place: LakePlace) -> list[str]:
     """Return the paths of the roots and shards that neither the manifest nor a generation to be kept needs."""
     needed = set()
-    for document in _list_roots(place):
+    for document in list_roots(place):
         needed.add(name_root(document["generation"]))
         needed |= {shard.path for shard in parse_shards(document)} if "shards" in document else set()
     return sorted(stored.path for stored in open_store(place).list(SHARDS) if stored.path not in needed)
 
 
-def _list_roots(place: LakePlace) -> list[dict[str, Any]]:
+def list_roots(place: LakePlace) -> list[dict[str, Any]]:
     """Return the roots of the generations to be kept and of the present, which is the last."""
     present = read_root(place)
     number = present["generation"] if isinstance(present.get("generation"), int) else 0
     store = open_store(place)
     limit = _find_limit(store, number, read_retention(present))
-    kept = (_read_kept(store, name_root(each)) for each in range(limit, number + 1))
+    kept = (read_kept_root(store, name_root(each)) for each in range(limit, number + 1))
     return [*(document for document in kept if document is not None), present]
 
 
-def _read_kept(store: Store, path: str) -> dict[str, Any] | None:
+def read_kept_root(store: Store, path: str) -> dict[str, Any] | None:
     """Return the root of an earlier generation; None: it is not kept, or another version's or damaged."""
     try:
         document: dict[str, Any] = parse_json(store.get(path)[0].decode())

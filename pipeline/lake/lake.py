@@ -9,6 +9,7 @@ from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME, TENSORS, scan
 from tracklake.pipeline.lake.history import load_as_of
 from tracklake.pipeline.lake.manifest import MANIFEST
+from tracklake.pipeline.lake.places import find_place, open_store
 from tracklake.pipeline.lake.query import LakeConnection, Parameters, connect
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.pipeline.lake.writer import follow_move
@@ -22,21 +23,37 @@ class Lake:
     """A lake opened for reading; what a writer commits later is seen by the next call.
 
     Args:
-        path: folder of the lake.
+        path: folder of the lake, or its address on an object store, such as `s3://bucket/lake`.
         as_of: earlier generation or time at which it is shown, as `tracklake sql --as-of` takes it; None: as it is.
 
     Raises:
-        LakeMissingError: no lake in this folder.
+        LakeMissingError: no lake there.
         LakeError: the lake is damaged or of another version, or nothing is kept of `as_of`.
     """
 
     def __init__(self, path: str | Path, as_of: str | None = None) -> None:
-        self.path = Path(path).resolve()
+        self._place = find_place(path)
+        self._store = open_store(self._place)
         self._as_of = as_of
         self._connection: LakeConnection | None = None
-        self._state: tuple[int, int] | None = None
-        load_as_of(self.path, as_of)
-        follow_move(self.path)
+        self._state = ""
+        load_as_of(self._place, as_of)
+        if isinstance(self._place, Path):
+            follow_move(self._place)
+
+    @property
+    def path(self) -> Path:
+        """Folder of the lake.
+
+        Raises:
+            LakeError: it is on an object store.
+        """
+        if isinstance(self._place, str):
+            raise LakeError(
+                f"{self._place}: is on an object store and has no folder. `tracklake fetch {self._place} --lake DIR` "
+                "copies it to one; open that."
+            )
+        return self._place
 
     def sql(
         self,
@@ -57,11 +74,10 @@ class Lake:
         Raises:
             QueryError: the statement is no SELECT, DuckDB refuses it, or a frame is none.
         """
-        status = (self.path / MANIFEST).stat()
-        state = (status.st_mtime_ns, status.st_ino)
+        _, state = self._store.get(MANIFEST)
         if self._connection is None or state != self._state:
             # Not closed: results of the connection before may not be fetched yet.
-            self._connection, self._state = connect(self.path, self._as_of), state
+            self._connection, self._state = connect(self._place, self._as_of), state
         return self._connection.sql(query, parameters, **frames)
 
     def table(self, name: str) -> pl.LazyFrame:
@@ -75,7 +91,7 @@ class Lake:
         """
         if name not in TABLE_BY_NAME:
             raise LakeError(f"no table {name!r} (docs/tables.md lists all); {suggest_name(name, TABLE_BY_NAME)}")
-        return scan(self.path, load_as_of(self.path, self._as_of), TABLE_BY_NAME[name])
+        return scan(self._place, load_as_of(self._place, self._as_of), TABLE_BY_NAME[name])
 
     def subsets(self) -> pl.DataFrame:
         """Return one row per subset, with size, flow and whether it is excluded."""
@@ -114,19 +130,19 @@ class Lake:
         self.close()
 
     def __repr__(self) -> str:
-        """Show the folder of the lake."""
-        return f"Lake({str(self.path)!r})"
+        """Show where the lake is."""
+        return f"Lake({str(self._place)!r})"
 
 
 def open_lake(path: str | Path, as_of: str | None = None) -> Lake:
-    """Open the lake in a folder for reading.
+    """Open a lake for reading.
 
     Args:
-        path: folder of the lake.
+        path: folder of the lake, or its address on an object store, such as `s3://bucket/lake`.
         as_of: earlier generation or time at which it is shown, as `tracklake sql --as-of` takes it; None: as it is.
 
     Raises:
-        LakeMissingError: no lake in this folder.
+        LakeMissingError: no lake there.
         LakeError: the lake is damaged or of another version, or nothing is kept of `as_of`.
     """
     return Lake(path, as_of)

@@ -10,15 +10,17 @@ import re
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import SplitResult, urlsplit
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, MissingObjectError, StoreError, SwapConflictError
 from tracklake.pipeline.lake.store import Store, StoredObject
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_file
+from tracklake.schemas.hashing import hash_values
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutResult, UpdateVersion
@@ -39,6 +41,10 @@ REQUEST_S = 300
 """Longest time of one request, in seconds."""
 MAX_RETRIES = 5
 """Repetitions of a request that failed for no reason of ours, within about five seconds."""
+VARIABLES = ("AWS_", "GOOGLE_", "AZURE_")
+"""Beginnings of the names of environment variables that clients read."""
+REGIONS = ("AWS_REGION", "AWS_DEFAULT_REGION")
+"""Environment variables that name the region of a bucket."""
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", re.DOTALL)
 """Pattern of an address, also of one from which `Path` took a slash."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
@@ -67,6 +73,22 @@ def find_address(lake: Path | str) -> str | None:
     return f"{scheme}://{rest}"
 
 
+class Endpoint(NamedTuple):
+    """The server of an address.
+
+    Args:
+        scheme: kind of store: s3, gs or az.
+        host: host, port and path; empty: the cloud's own.
+        is_plain: whether it is reached without encryption.
+        region: region of the bucket, on S3.
+    """
+
+    scheme: str
+    host: str
+    is_plain: bool
+    region: str
+
+
 class ObjectStore:
     """A lake on an object store; see `Store`. A tag is the ETag, on Google's the generation beside it.
 
@@ -83,20 +105,14 @@ class ObjectStore:
         if checked is None:
             raise UsageError(f"{address}: expected an address such as s3://bucket/lake")
         require_extras(f"a lake at {checked}", "object-store")
-        from obstore.store import from_url
-
         self._place = checked
-        options: ClientConfig = {
-            "allow_http": is_plain(checked),
-            "allow_invalid_certificates": False,
-            "timeout": f"{REQUEST_S}s",
-        }
+        environment = sorted(item for item in os.environ.items() if item[0].upper().startswith(VARIABLES))
         with self._explain_errors():
-            self._client: Client = from_url(checked, client_options=options, retry_config={"max_retries": MAX_RETRIES})
+            self._client = _open_client(checked, find_endpoint(checked).is_plain, hash_values(environment))
 
     @property
     def place(self) -> str:
-        """The lake's address."""
+        """The lake's address, for messages."""
         return self._place
 
     def put_new(self, path: str, data: bytes) -> str:
@@ -122,7 +138,7 @@ class ObjectStore:
                 written = obstore.put(self._client, path, data, mode=_read_tag(tag), use_multipart=False)
             return _write_tag(written)
         except (AlreadyStoredError, PreconditionError, MissingObjectError) as conflict:
-            # Also where a request was repeated after its answer was lost: whoever reads again finds what was written.
+            # Also where a request was repeated as its answer was lost: a caller that reads again finds what it wrote.
             raise SwapConflictError(
                 f"{self._place}/{path}: was changed by another writer while it was being replaced"
             ) from conflict
@@ -188,29 +204,42 @@ class ObjectStore:
             raise StoreError(f"{where}: {_describe_failure(failed)}") from None
 
 
-def is_plain(address: str) -> bool:
-    """Return whether the server of an address is reached without encryption, which only this machine may be.
+@lru_cache(maxsize=8)
+def _open_client(address: str, is_plain: bool, _environment: str) -> "Client":
+    """Return a client, made once for each state of the environment: reading the certificates takes 10 ms."""
+    from obstore.store import from_url
+
+    options: ClientConfig = {
+        "allow_http": is_plain,
+        "allow_invalid_certificates": False,
+        "timeout": f"{REQUEST_S}s",
+    }
+    return from_url(address, client_options=options, retry_config={"max_retries": MAX_RETRIES})
+
+
+def find_endpoint(address: str) -> Endpoint:
+    """Return the server of an address, as the environment names it.
 
     Raises:
-        UsageError: it is reached so, and is another machine.
+        UsageError: it is reached without encryption, which only this machine may be.
     """
     scheme = address.partition("://")[0]
-    plain = False
-    for name, endpoint in os.environ.items():
-        if name.upper() not in ENDPOINTS[scheme] or not endpoint:
-            continue
+    given = {name.upper(): (name, value) for name, value in os.environ.items() if value}
+    found: list[SplitResult] = []
+    for name, endpoint in (given[each] for each in ENDPOINTS[scheme] if each in given):
         parts = urlsplit(endpoint)
         if parts.username or parts.password:
             raise UsageError(f"{name}: expected an address without credentials, which have variables of their own")
-        if parts.scheme == "https":
-            continue
-        if parts.scheme != "http" or not _is_loopback(parts.hostname or ""):
+        is_safe = parts.scheme == "https" or (parts.scheme == "http" and _is_loopback(parts.hostname or ""))
+        if not is_safe:
             raise UsageError(
                 f"{name}: expected an address that begins with https://, or http:// on this machine; got {endpoint}. "
                 "Data and credentials would cross the network readable."
             )
-        plain = True
-    return plain
+        found.append(parts)
+    region = next((given[name][1] for name in REGIONS if name in given), "us-east-1")
+    host = f"{found[0].netloc}{found[0].path}".rstrip("/") if found else ""
+    return Endpoint(scheme, host, any(parts.scheme == "http" for parts in found), region)
 
 
 def _is_loopback(host: str) -> bool:

@@ -2,11 +2,20 @@
 
 from pathlib import Path
 
-from tracklake.pipeline.lake.object_store import ObjectStore
+from tracklake.pipeline.lake.object_store import ObjectStore, find_address
 from tracklake.pipeline.lake.store import LocalStore, Store
 
 LakePlace = Path | str
 """A lake's folder, or its address on an object store."""
+
+
+def find_place(lake: Path | str) -> LakePlace:
+    """Return the place of a lake that a user names: its address, or its folder with links resolved.
+
+    Raises:
+        UsageError: an address of another kind, or one with credentials.
+    """
+    return find_address(lake) or Path(lake).resolve()
 
 
 def open_store(place: LakePlace) -> Store:

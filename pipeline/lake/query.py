@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 from tracklake.pipeline.lake.admission import admit_select, query_errors
-from tracklake.pipeline.lake.catalog import create_views, describe_views, escape_pattern, quote
+from tracklake.pipeline.lake.catalog import create_views, describe_views, escape_pattern
 from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.history import load_as_of
 from tracklake.pipeline.lake.manifest import Manifest
+from tracklake.pipeline.lake.object_access import FileLocations, admit_place, quote
+from tracklake.pipeline.lake.places import find_place
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.schemas import TABLES
 
@@ -99,7 +101,7 @@ def connect(lake: Path | str, as_of: str | None = None) -> LakeConnection:
     setting changed.
 
     Args:
-        lake: the lake's folder, wherever it stands now.
+        lake: the lake's folder, wherever it stands now, or its address on an object store.
         as_of: generation or time of which it is shown, see `load_as_of`; None: as it is.
 
     Raises:
@@ -108,25 +110,27 @@ def connect(lake: Path | str, as_of: str | None = None) -> LakeConnection:
     """
     import duckdb
 
-    root = Path(lake).resolve()
-    manifest = load_as_of(root, as_of)
+    place = find_place(lake)
+    manifest = load_as_of(place, as_of)
     connection = duckdb.connect(
         ":memory:",
         config={
             "autoinstall_known_extensions": False,
             "autoload_known_extensions": False,
             "allow_community_extensions": False,
+            "allow_persistent_secrets": False,
         },
     )
-    create_views(connection, root, manifest)
+    admit_place(connection, place)
+    create_views(connection, place, manifest)
     describe_views(connection)
-    live = [f"{root.as_posix()}/{file.path}" for table in TABLES for file in manifest.live(table.name)]
+    locations = FileLocations(place)
+    live = [locations.find(file) for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
     allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})
     for setting in (
         "temp_directory = ''",
         "python_enable_replacements = false",
-        "allow_persistent_secrets = false",
         f"allowed_paths = [{allowed}]",
         "enable_external_access = false",
         "lock_configuration = true",

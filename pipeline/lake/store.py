@@ -88,7 +88,7 @@ class LocalStore:
 
     @property
     def place(self) -> str:
-        """The lake's folder."""
+        """The lake's folder, for messages."""
         return str(self._root)
 
     def put_new(self, path: str, data: bytes) -> str:

@@ -121,7 +121,7 @@ def open_for_writing(root: Path, *, rebuild: bool = False, retention: Retention 
         LakeError: the folder holds other things than a lake, or cannot be written to.
     """
     refuse_foreign(root, rebuild=rebuild)
-    with _hold_lock(root):
+    with hold_lock(root):
         (root / WRITER).write_text(f"process {os.getpid()}", encoding="utf-8")
         writer = _open_writer(root, rebuild=rebuild, retention=retention)
         yield writer
@@ -134,7 +134,7 @@ def follow_move(root: Path) -> None:
     if os.access(root, os.W_OK) and session_end.has_moved(root):
         with suppress(TracklakeError, OSError):
             refuse_foreign(root)
-            with _hold_lock(root):  # or the end recorded would be that of a session that began meanwhile
+            with hold_lock(root):  # or the end recorded would be that of a session that began meanwhile
                 catalog.rebuild_catalog(root, load(root))
                 session_end.record_end(root)
 
@@ -143,12 +143,12 @@ def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
     """Raise what `open_for_writing` would raise now, before anything expensive is started for it."""
     refuse_foreign(root, rebuild=rebuild)
     if (root / LOCK).exists():
-        with _hold_lock(root):
+        with hold_lock(root):
             pass
 
 
 @contextmanager
-def _hold_lock(root: Path) -> Iterator[None]:
+def hold_lock(root: Path) -> Iterator[None]:
     """Hold the lock of a lake, whose folder is made where there is none."""
     from filelock import FileLock, Timeout  # its import takes 50 ms, for which no query should wait
 

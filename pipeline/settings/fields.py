@@ -30,7 +30,10 @@ class DeclaredSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
-    lake: Path = Field(Path("lake"), description="folder of the lake")
+    lake: Path = Field(Path("lake"), description="folder of the lake, or its address, such as s3://bucket/lake")
+    cache: Path | None = Field(
+        None, description="folder for the copies of lakes on object stores; none: in the user's folder of caches"
+    )
     columns: Path | None = Field(None, description="mapping of the columns of raw files in a format of their own")
     recording: str | None = Field(
         None,

@@ -168,14 +168,14 @@ def find_unknown_variables() -> list[str]:
 
 
 def _read_file(path: Path) -> SettingSource:
-    """Read a file of settings; relative paths in it are relative to its folder."""
+    """Read a file of settings; relative paths in it are relative to its folder, addresses are not."""
     try:
         text = path.read_text(encoding="utf-8")
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise SettingError(f"{path}: {error}") from error
-    for name in ("lake", "columns"):
-        if isinstance(values.get(name), str):
+    for name in ("lake", "columns", "cache"):
+        if isinstance(values.get(name), str) and "://" not in values[name]:
             values[name] = str(path.parent / values[name])
     return SettingSource(str(path), values, _find_lines(text))
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest
-from tracklake.pipeline.lake.catalog import create_views, quote
+from tracklake.pipeline.lake.catalog import create_views
 from tracklake.pipeline.lake.files import STAGING
+from tracklake.pipeline.lake.object_access import quote
 from tracklake.pipeline.stages.stage import StageError
 from tracklake.schemas import SPLIT_CONTEXT, SPLIT_LEAKAGE, SPLIT_SHIFTS, Table
 from tracklake.schemas.columns import PARTS

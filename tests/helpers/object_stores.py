@@ -1,11 +1,14 @@
 """An S3 server on this machine for tests, and buckets in it."""
 
+import json
 import os
 import re
 import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -96,3 +99,38 @@ def bucket(object_store_server: ObjectStoreServer, monkeypatch: pytest.MonkeyPat
     for name, value in object_store_server.environment.items():
         monkeypatch.setenv(name, value)
     return object_store_server.make_bucket()
+
+
+@dataclass(frozen=True)
+class Role:
+    """A server of a machine's role: what a process needs to find it, and the programs that asked it for credentials."""
+
+    environment: dict[str, str]
+    asked: list[str]
+
+
+@pytest.fixture
+def role(tmp_path: Path) -> Iterator[Role]:
+    asked: list[str] = []
+    answer = {"AccessKeyId": KEY_ID, "SecretAccessKey": SECRET, "Token": "token", "Expiration": "2099-01-01T00:00:00Z"}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.headers["User-Agent"])
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(json.dumps(answer).encode())
+
+        def log_message(self, *_message: object) -> None:
+            pass
+
+    (tmp_path / "token").write_text("token")
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    url = f"http://127.0.0.1:{server.server_port}/"
+    names = ("AWS_CONTAINER_CREDENTIALS_FULL_URI", "AWS_CONTAINER_AUTHORIZATION_TOKEN_FILE")
+    yield Role(dict(zip(names, (url, str(tmp_path / "token")), strict=True)), asked)
+    server.shutdown()
+    server.server_close()
+    thread.join()

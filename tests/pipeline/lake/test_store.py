@@ -7,7 +7,7 @@ import pytest
 from object_stores import FORBIDDEN, HEEDLESS, KEY_ID, SECRET
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, MissingObjectError, StoreError, SwapConflictError
-from tracklake.pipeline.lake.object_store import ObjectStore, find_address, is_plain, refuse_unconditional
+from tracklake.pipeline.lake.object_store import ObjectStore, find_address, find_endpoint, refuse_unconditional
 from tracklake.pipeline.lake.store import LocalStore, Store
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.files import name_unfinished
@@ -163,7 +163,7 @@ def test_other_addresses_are_refused(lake):
 )
 def test_servers_are_reached_encrypted_or_on_this_machine(monkeypatch, bucket, endpoint, plain):
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
-    assert is_plain(bucket) == plain
+    assert find_endpoint(bucket).is_plain == plain
 
 
 @pytest.mark.parametrize("name", ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AWS_endpoint"])

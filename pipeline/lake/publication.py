@@ -1,0 +1,336 @@
+"""A lake on an object store as the copy of one in a folder: published there, and fetched from there.
+
+Contents are uploaded first, under names with their checksums. Then the root of the manifest is replaced, on condition
+that no other writer has replaced it: the moment at which readers see the new state. They never see a part of it.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from tracklake.pipeline.lake.checksums import find_damage, hash_file, verify_files
+from tracklake.pipeline.lake.commit_log import CommitLog
+from tracklake.pipeline.lake.errors import (
+    AlreadyStoredError,
+    DamagedFileError,
+    LakeError,
+    LakeMissingError,
+    MissingObjectError,
+    StoreError,
+)
+from tracklake.pipeline.lake.files import STORE, TENSORS
+from tracklake.pipeline.lake.history import ROOTS, list_roots, name_root, read_kept_root
+from tracklake.pipeline.lake.manifest import (
+    MANIFEST,
+    Commit,
+    LakeFile,
+    Manifest,
+    collect_document,
+    load,
+    make_foreign_error,
+    parse_manifest,
+    read_root,
+)
+from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.object_store import refuse_unconditional
+from tracklake.pipeline.lake.places import LakePlace, open_store
+from tracklake.pipeline.lake.shards import parse_shards
+from tracklake.pipeline.lake.store import Store
+from tracklake.pipeline.lake.writer import hold_lock, open_for_writing, refuse_foreign
+from tracklake.schemas.documents import read_json
+from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.files import write_file
+from tracklake.schemas.hashing import hash_chunks
+from tracklake.schemas.text import quote_shell
+
+T = TypeVar("T")
+
+MARKER = ".tracklake"
+"""First object of a lake on an object store, with the lake's id: what else is there was put there by us."""
+SYNCED = ".synced"
+"""File of a lake in a folder: checksums of both manifests when they last agreed, by address."""
+FETCHING = ".fetching"
+"""File of a folder into which a lake is being fetched for the first time: what else is there was put there by us."""
+GRACE = timedelta(days=1)
+"""Time for which objects that are no longer needed are kept, for readers of an earlier state and for other writers."""
+TRANSFERS = 8
+"""Files that are sent or received at once."""
+
+
+class Transfer(NamedTuple):
+    """What was sent or received: files and their bytes, objects that were deleted, and the generation there now."""
+
+    files: int
+    bytes: int
+    deleted: int
+    generation: int
+
+
+def publish_lake(root: Path, address: str, *, replace_other: bool = False) -> Transfer:
+    """Make the lake at an address the same as the one in a folder, in one commit.
+
+    Args:
+        root: the lake's folder.
+        address: place on an object store: empty, or with an earlier state of this lake.
+        replace_other: whether another lake, or a state with work that the folder lacks, is replaced as well.
+
+    Raises:
+        StoreError: the store cannot be used, or does not guard against two writers.
+        DamagedFileError: a file in the folder is not as it was committed.
+        LakeError: something else is there, or another writer changed the same meanwhile.
+    """
+    manifest = load(root)
+    store = open_store(address)
+    claim_place(store, manifest.lake_id, replace_other=replace_other)
+    log = CommitLog(address)
+    before = log.manifest if log.manifest.lake_id == manifest.lake_id else Manifest(manifest.lake_id)
+    sealed = replace(manifest, commits={key: _seal(root, commit) for key, commit in manifest.commits.items()})
+    if not (replace_other or is_synced(root, address, remote=True) or _includes(sealed, before)):
+        raise LakeError(
+            f"{address}: has results that {root} lacks; it was published from elsewhere. Get them by `tracklake fetch "
+            f"{quote_shell(address)} --lake {quote_shell(root)}`, or give --replace to remove them."
+        )
+    after = replace(_mirror(before, sealed), retired=(), ingested_from=())  # paths of this machine stay here
+    live = {name_object(file): file for commit in after.commits.values() for file in commit.all_files}
+    sent = _upload(store, root, live)
+    if (after.commits, after.sources) != (log.manifest.commits, log.manifest.sources):
+        after = log.replace(after)
+    if after.commits == sealed.commits:
+        _record_agreement(root, address)
+    return Transfer(len(sent), sum(file.bytes for file in sent), sweep_objects(address), after.generation)
+
+
+def fetch_lake(address: str, root: Path) -> Transfer:
+    """Make the lake in a folder the same as the one at an address.
+
+    Args:
+        address: place of a lake on an object store.
+        root: folder: empty or missing, or with an earlier state of this lake.
+
+    Raises:
+        LakeMissingError: no lake at the address.
+        LakeError: the folder holds something else, or results that were not published.
+        DamagedFileError: an object is not what was uploaded.
+    """
+    theirs = load(address)
+    store = open_store(address)
+    if not (root / FETCHING).exists():
+        refuse_foreign(root)
+    with hold_lock(root):
+        if not (root / MANIFEST).exists():
+            write_file(root / FETCHING, address.encode())
+        log = CommitLog(root)
+        ours = load(root) if (root / MANIFEST).exists() else Manifest(theirs.lake_id)
+        if ours.lake_id != theirs.lake_id:
+            raise LakeError(f"{root}: holds another lake than {address}. Name another folder with --lake.")
+        if not (_includes(theirs, ours) or is_synced(root, address, remote=False)):
+            raise LakeError(
+                f"{root}: has results that {address} lacks. Publish them by `tracklake publish store "
+                f"{quote_shell(address)} --lake {quote_shell(root)}`, or name another folder with --lake."
+            )
+        received = _download(store, root, [file for commit in theirs.commits.values() for file in commit.all_files])
+        after = _mirror(ours, replace(theirs, commits={key: _unseal(each) for key, each in theirs.commits.items()}))
+        if after is not ours or not (root / MANIFEST).exists():
+            log.replace(after)
+        (root / FETCHING).unlink(missing_ok=True)
+    with open_for_writing(root):
+        pass  # brings the folders of the tables and the catalog up to date
+    _record_agreement(root, address)
+    return Transfer(len(received), sum(file.bytes for file in received), 0, theirs.generation)
+
+
+def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = False) -> None:
+    """Make sure that a place on an object store is a lake's own, before anything else is written there.
+
+    Args:
+        store: the place.
+        lake_id: lake that is to be there; None: any, as where it is not made yet, and nothing is written.
+        replace_other: whether it may take the place of another lake.
+
+    Raises:
+        StoreError: the store ignores the conditions of writes.
+        LakeError: another lake or something else is there.
+    """
+    refuse_unconditional(store)
+    try:
+        owner = read_root(store.place).get("lake_id")
+        if not isinstance(owner, str):
+            raise make_foreign_error(store.place, ValueError("no lake_id in it"))
+    except LakeMissingError:
+        owner = _read_marker(store)
+    if owner is None:
+        other = next(store.list(), None)
+        if other is not None:
+            raise LakeError(
+                f"{store.place}: holds other objects, such as {other.path}, and no lake. Name an empty or new folder "
+                "of the bucket."
+            ) from None
+        if lake_id is not None:
+            try:
+                store.put_new(MARKER, lake_id.encode())
+            except AlreadyStoredError:
+                raise LakeError(f"{store.place}: another process has just put a lake there. Run again.") from None
+    elif lake_id not in (None, owner) and not replace_other:
+        raise LakeError(
+            f"{store.place}: holds another lake ({owner}). Name another folder of the bucket, or give --replace to put "
+            "this one in its place."
+        )
+
+
+def _read_marker(store: Store) -> str | None:
+    """Return the id of the lake whose first publication was broken off, if there was one."""
+    try:
+        return store.get(MARKER)[0].decode(errors="replace")
+    except MissingObjectError:
+        return None
+
+
+def sweep_objects(address: str) -> int:
+    """Delete the objects that no kept state of a lake needs; returns how many.
+
+    States are kept as in a folder, and for a day. What is younger than a day is kept, too: another writer may be about
+    to commit it.
+    """
+    store = open_store(address)
+    objects = [*store.list()]
+    young = {item.path for item in objects if item.modified > datetime.now(UTC) - GRACE}
+    others = (read_kept_root(store, path) for path in young if path.startswith(f"{ROOTS}/"))
+    needed = {MANIFEST, MARKER}
+    for document in (*list_roots(address), *(each for each in others if each is not None)):
+        needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
+        commits = parse_manifest(address, collect_document(address, document)).commits.values()
+        needed |= {name_object(file) for commit in commits for file in commit.all_files}
+    old = [item.path for item in objects if item.path not in needed | young]
+    store.delete(old)
+    return len(old)
+
+
+def _seal(root: Path, commit: Commit) -> Commit:
+    """Return a commit in which every file has a checksum, also those that may change, as they are now."""
+
+    def seal(file: LakeFile) -> LakeFile:
+        if file.sha256 is not None:
+            return file
+        try:
+            return replace(file, bytes=(root / file.path).stat().st_size, sha256=hash_file(root / file.path))
+        except FileNotFoundError:
+            raise DamagedFileError(
+                f"{root / file.path}: is missing. `tracklake run SOURCE --lake {quote_shell(root)}` makes it again."
+            ) from None
+
+    return replace(commit, files={table: [seal(file) for file in files] for table, files in commit.files.items()})
+
+
+def _unseal(commit: Commit) -> Commit:
+    """Return a commit in which files that may change have no checksum, as in a folder."""
+
+    def unseal(file: LakeFile) -> LakeFile:
+        return file if file.path.startswith((f"{STORE}/", f"{TENSORS}/")) else replace(file, sha256=None)
+
+    return replace(commit, files={table: [unseal(file) for file in files] for table, files in commit.files.items()})
+
+
+def _includes(manifest: Manifest, other: Manifest) -> bool:
+    """Return whether a manifest has everything that another one has, as made from the same inputs."""
+    prints = {key: commit.fingerprint for key, commit in manifest.commits.items()}
+    return all(prints.get(key) == commit.fingerprint for key, commit in other.commits.items())
+
+
+def _mirror(before: Manifest, wanted: Manifest) -> Manifest:
+    """Return a manifest with the commits and sources of another, in a new generation where something differs."""
+    changed = [commit for key, commit in wanted.commits.items() if before.commits.get(key) != commit]
+    gone = before.commits.keys() - wanted.commits.keys()
+    if not changed and not gone and before.sources == wanted.sources:
+        return before
+    generation = before.generation + 1
+    after = before.remove_commits(gone, generation)
+    for commit in changed:
+        after = after.add_commit(commit, generation)
+    return replace(after, sources=wanted.sources)
+
+
+def _upload(store: Store, root: Path, live: Mapping[str, LakeFile]) -> list[LakeFile]:
+    """Send the files that are not there yet, by the names of their objects, and make sure that all are there then."""
+
+    def send(name: str) -> None:
+        verify_files(root, [live[name]])
+        store.upload(name, root / live[name].path)
+
+    missing = _find_missing(store, live)
+    _transfer(send, missing)
+    if missing and (lost := _find_missing(store, live)):
+        raise StoreError(f"{store.place}/{lost[0]}: was deleted while the lake was published. Run the command again.")
+    return [live[name] for name in missing]
+
+
+def _find_missing(store: Store, live: Mapping[str, LakeFile]) -> list[str]:
+    there = {item.path: item.bytes for item in store.list()}
+    return [name for name, file in live.items() if there.get(name) != file.bytes]
+
+
+def _download(store: Store, root: Path, live: Iterable[LakeFile]) -> list[LakeFile]:
+    """Receive the files that a folder lacks, or has with other content."""
+
+    def receive(file: LakeFile) -> None:
+        target = root / file.path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        store.download(name_object(file), target)
+        reason = find_damage(root, file, again=True)
+        if reason is not None:
+            target.unlink()
+            raise DamagedFileError(
+                f"{store.place}/{name_object(file)}: damaged ({reason}). Publish the lake again from a folder that has "
+                "it whole."
+            )
+
+    missing = [file for file in live if find_damage(root, file) is not None]
+    _transfer(receive, missing)
+    return missing
+
+
+def _transfer(function: Callable[[T], None], items: Iterable[T]) -> None:
+    """Call a function for several items at once; after an error, those that were not begun are left out."""
+    pool = ThreadPoolExecutor(TRANSFERS)
+    try:
+        for _ in pool.map(function, items):
+            pass
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _record_agreement(root: Path, address: str) -> None:
+    """Record that a folder and an address hold the same; without it, the next transfer compares what both hold."""
+    recorded = {**_read_agreements(root), address: [_hash_root(root), _hash_root(address)]}
+    with suppress(TracklakeError):
+        write_file(root / SYNCED, json.dumps(recorded).encode())
+
+
+def is_synced(root: Path, address: str, *, remote: bool) -> bool:
+    """Return whether the lake at an address, or else in a folder, is as it was when both last agreed."""
+    recorded = _read_agreements(root).get(address)
+    return recorded is not None and recorded[remote] == _hash_root(address if remote else root)
+
+
+def was_synced(root: Path, address: str) -> bool:
+    """Return whether the lake in a folder has ever been the one at an address."""
+    return address in _read_agreements(root)
+
+
+def _read_agreements(root: Path) -> dict[str, Any]:
+    try:
+        return dict(read_json(root / SYNCED))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _hash_root(place: LakePlace) -> str | None:
+    """Return the checksum of the root of a lake's manifest; None: there is no lake."""
+    try:
+        return hash_chunks([open_store(place).get(MANIFEST)[0]])
+    except MissingObjectError:
+        return None
