@@ -265,7 +265,7 @@ def _open_raw(path: Path, source: Path) -> RawFile:
 
 
 def _describe_formats(sources: list[Source]) -> str:
-    return "; ".join(item.signature for item in sources)
+    return "; ".join(dict.fromkeys(item.signature for item in sources))
 
 
 def _explain_unknown(name: str, head: bytes, sources: list[Source], mapping: ColumnMapping | None) -> str:

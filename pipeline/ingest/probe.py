@@ -11,11 +11,15 @@ import polars as pl
 
 from tracklake.pipeline.ingest.discovery import find_raw_files
 from tracklake.pipeline.sources import RawFile, Source, SourceError
-from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, read_chunks, read_head
+from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, open_raw, read_chunks, read_head
+from tracklake.pipeline.sources.i24 import DIALECT as I24_JSON
+from tracklake.pipeline.sources.i24 import split_unusable
+from tracklake.pipeline.sources.i24_documents import read_documents
 from tracklake.pipeline.sources.source import ColumnsOfFile
 from tracklake.pipeline.sources.v2v.logs import READERS
 from tracklake.schemas import BSM
 from tracklake.schemas.arrays import Floats
+from tracklake.schemas.raw_i24 import RAW_I24
 
 READ, LACKING, UNREAD = "read", "missing", "not read"
 """States of a column: in the file and used, known and not in the file, in the file and not used."""
@@ -125,6 +129,8 @@ def _probe_file(source: Source, file: RawFile) -> FileProbe:
             return _probe_messages(source, file)
         if source.describe_columns is not None and (columns := source.describe_columns(file)) is not None:
             return _probe_table(source, file, columns)
+        if file.dialect == I24_JSON:
+            return _probe_documents(source, file)
     except SourceError:
         # The message may quote the file.
         problem = f"cannot be read as {file.dialect}; `tracklake ingest` says why, and may quote a line"
@@ -168,6 +174,28 @@ def _probe_table(source: Source, file: RawFile, described: ColumnsOfFile) -> Fil
         tuple(columns),
         motion,
     )
+
+
+def _probe_documents(source: Source, file: RawFile) -> FileProbe:
+    """Read a list of I-24 MOTION's documents block by block; what is plausible is judged by the first one."""
+    rows, kept = 0, 0
+    reasons: Counter[str] = Counter()
+    empty: Counter[str] = Counter()
+    first = pl.DataFrame()
+    with open_raw(file) as handle:
+        for documents in read_documents(handle, file.name):
+            usable, refused = split_unusable(documents)
+            first = usable if first.is_empty() else first
+            rows, kept = rows + documents.read, kept + usable.height
+            reasons.update(dict(refused.group_by("reason").len().iter_rows()))
+            empty.update(usable.null_count().row(0, named=True))
+    columns = []
+    for name in (name for name in RAW_I24.columns if name in first.columns and name != LINE):
+        values = first.select(pl.col(name).explode() if first[name].dtype == pl.List else name)
+        filled, unit = 1 - empty[name] / kept if kept else 0.0, RAW_I24.columns[name].unit or ""
+        state = READ if filled else LACKING
+        columns.append(ColumnProbe(name, state, unit, filled or None, _judge(values, name, unit, RAW_I24.name)))
+    return FileProbe(file.name, source.name, file.dialect, rows, dict(sorted(reasons.items())), tuple(columns))
 
 
 def _name_unread(name: str, layout: Layout) -> str:

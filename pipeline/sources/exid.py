@@ -17,7 +17,7 @@ from tracklake.pipeline.sources.levelx_plane import (
     summarise_vehicles,
     trace_longest,
 )
-from tracklake.pipeline.sources.levelx_recognition import describe_columns, detect, group
+from tracklake.pipeline.sources.levelx_recognition import SIGNATURE, describe_columns, detect, group
 from tracklake.pipeline.sources.source import Canonical, Part, Source
 from tracklake.pipeline.transforms.tracks.axes import Axis, fit_axis
 from tracklake.pipeline.transforms.tracks.carriageways import (
@@ -38,7 +38,8 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     read, entries = EXID_FORMAT.read_recording(parts[: len(KINDS)], recording)
     entries, dropped = split_motor_vehicles(entries, read.vehicles)
     sizes, notes = summarise_vehicles(entries, read.vehicles)
-    map_points, map_part, about_map = None, None, "no map of its location: road axes and lanes are fitted to the tracks"
+    map_points, map_part = None, None
+    about_map = f"SOURCE has no location{read.meta['locationId']}.osm: road axes and lanes are fitted to the tracks"
     if len(parts) > len(KINDS) and read.meta["lonLocation"] is not None:
         origin = read.meta["xUtmOrigin"], read.meta["yUtmOrigin"]
         lanelets = read_lanelet_map(files[-1], read.meta["lonLocation"], origin)
@@ -153,7 +154,7 @@ EXID = Source(
     title="exiD: trajectories at entries and exits of German highways",
     licence="non-commercial, on request from levelXdata (exid-dataset.com)",
     citation=references.MOERS.full,
-    signature="exiD, inD, rounD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with their columns",
+    signature=SIGNATURE,
     version=1,
     detect=detect,
     group=group,

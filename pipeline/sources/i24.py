@@ -92,7 +92,7 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
     rejects, read, moved = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0
     with open_raw(file) as handle:
         for number, documents in enumerate(read_documents(handle, file.name)):
-            kept, refused = _split_unusable(documents)
+            kept, refused = split_unusable(documents)
             points, between = put_on_frames(kept)
             vanished = kept.join(
                 points.select(pl.col("vehicle").cast(pl.Int64).alias(LINE)).unique(), on=LINE, how="anti"
@@ -110,7 +110,7 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
     return Spilled(dict(recordings), read, refused, tuple(notes))
 
 
-def _split_unusable(documents: Documents) -> tuple[pl.DataFrame, pl.DataFrame]:
+def split_unusable(documents: Documents) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split documents that are trajectories from the others, which are added to the rejects."""
     reason = pl.coalesce(
         *(pl.when(broken.fill_null(value=True)).then(pl.lit(reason)) for reason, broken in REASONS), pl.lit(None)

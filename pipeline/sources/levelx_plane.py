@@ -50,11 +50,11 @@ NO_PLACE = "position is none on the road's axis"
 NO_SPEED = "velocity is no speed along the road's axis"
 
 
-def make_format(title: str, dataset: Dataset, tracks: Table, fields: tuple[str, ...]) -> LevelxFormat:
+def make_format(dataset: Dataset, tracks: Table, fields: tuple[str, ...]) -> LevelxFormat:
     """Make the format of a dataset whose metadata files are as those of exiD, inD and rounD."""
     return LevelxFormat(
         dataset=dataset,
-        title=title,
+        title="levelXdata",
         fields={RECORDING: RAW_LEVELX_RECORDING_FIELDS, VEHICLES: RAW_LEVELX_VEHICLES_FIELDS, TRACKS: fields},
         raw={RECORDING: RAW_LEVELX_RECORDING, VEHICLES: RAW_LEVELX_VEHICLES, TRACKS: tracks},
         recording_id="recordingId",
@@ -63,8 +63,8 @@ def make_format(title: str, dataset: Dataset, tracks: Table, fields: tuple[str, 
     )
 
 
-EXID_FORMAT = make_format("exiD", "exid", RAW_EXID_TRACKS, RAW_EXID_TRACKS_FIELDS)
-URBAN_FORMAT = make_format("inD or rounD", "ind", RAW_URBAN_TRACKS, RAW_URBAN_TRACKS_FIELDS)
+EXID_FORMAT = make_format("exid", RAW_EXID_TRACKS, RAW_EXID_TRACKS_FIELDS)
+URBAN_FORMAT = make_format("ind", RAW_URBAN_TRACKS, RAW_URBAN_TRACKS_FIELDS)
 
 
 def split_motor_vehicles(

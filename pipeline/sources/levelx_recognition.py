@@ -14,6 +14,8 @@ from tracklake.schemas.columns import Dataset
 
 EXID_TRACKS, URBAN_TRACKS, LANELETS = "exid-tracks", "levelx-tracks", "lanelet2"
 """Dialects of tracks with lanes, tracks without, and maps."""
+SIGNATURE = "exiD, inD, rounD: NN_recordingMeta.csv, NN_tracksMeta.csv and NN_tracks.csv with their columns"
+"""Description of the files, for messages about unknown files."""
 DIALECTS = {
     EXID_TRACKS: EXID_FORMAT.raw[TRACKS],
     URBAN_TRACKS: URBAN_FORMAT.raw[TRACKS],

@@ -17,14 +17,14 @@ from tracklake.pipeline.sources.levelx_plane import (
     summarise_vehicles,
     trace_longest,
 )
-from tracklake.pipeline.sources.levelx_recognition import describe_columns, detect, group
+from tracklake.pipeline.sources.levelx_recognition import SIGNATURE, describe_columns, detect, group
 from tracklake.pipeline.sources.source import Canonical, Part, Source
 from tracklake.pipeline.transforms.tracks.carriageways import name_movements
 from tracklake.schemas import references
 from tracklake.schemas.columns import Dataset
 
-PARKED_M = 5.0
-"""Distance between a track's outermost positions below which the vehicle is taken to be parked, in m."""
+PARKED_M, PARKED_MPS = 5.0, 0.5
+"""Distance between a track's outermost positions and median speed below which a vehicle is taken to be parked."""
 PARKED = "vehicle is parked: it stays within 5 m"
 NO_DRIVE = "no vehicle drives this way for long enough to give it an axis"
 MISSING = ("lane", "leader_id", "follower_id", "gap_m", "headway_recorded_m")
@@ -76,7 +76,12 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset) -> Can
 def _split_parked(entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split the rows of vehicles that drive from those of parked ones."""
     span = pl.max_horizontal(pl.col(name).max() - pl.col(name).min() for name in ("xCenter", "yCenter"))
-    parked = entries.group_by("trackId").agg(span=span).filter(pl.col("span") < PARKED_M)
+    speed = (pl.col("xVelocity") ** 2 + pl.col("yVelocity") ** 2).sqrt().median()
+    parked = (
+        entries.group_by("trackId")
+        .agg(span=span, speed=speed)
+        .filter(pl.col("span") < PARKED_M, pl.col("speed") < PARKED_MPS)
+    )
     return (
         entries.join(parked, on="trackId", how="anti", maintain_order="left"),
         entries.join(parked, on="trackId", how="semi", maintain_order="left"),
@@ -100,7 +105,7 @@ IND = Source(
     title="inD: trajectories of road users at German intersections",
     licence="non-commercial, on request from levelXdata (ind-dataset.com)",
     citation=references.BOCK.full,
-    signature="inD: as exiD, without lanes",
+    signature=SIGNATURE,
     version=1,
     detect=detect,
     group=partial(group, only="ind"),
@@ -112,7 +117,7 @@ ROUND = Source(
     title="rounD: trajectories of road users at German roundabouts",
     licence="non-commercial, on request from levelXdata (round-dataset.com)",
     citation=references.KRAJEWSKI_2020.full,
-    signature="rounD: as exiD, without lanes",
+    signature=SIGNATURE,
     version=1,
     detect=detect,
     group=partial(group, only="round"),

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import polars as pl
 
-from tracklake.pipeline.synthetic.build import PLAIN, README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
+from tracklake.pipeline.synthetic.build import README_FILE, TRUE_TRACKS_FILE, TRUTH_FILE, build_sample
 from tracklake.pipeline.synthetic.drivers import TRAFFICS, UNIFORM
 from tracklake.pipeline.synthetic.noise import NOISE_MODELS, SMOOTH
+from tracklake.pipeline.synthetic.plain_formats import PLAIN
 from tracklake.pipeline.synthetic.scenarios import (
     DEFAULT_FORMATS,
     DOSED,

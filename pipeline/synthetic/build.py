@@ -11,18 +11,17 @@ import numpy as np
 import polars as pl
 
 from tracklake.pipeline.synthetic import damaged_lines as damage
-from tracklake.pipeline.synthetic import defects, drives, highd, i24, ngsim, tgsim, true_tracks, truth
+from tracklake.pipeline.synthetic import defects, drives, highd, ngsim, true_tracks, truth
 from tracklake.pipeline.synthetic.drivers import UNIFORM
 from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
+from tracklake.pipeline.synthetic.plain_formats import PLAIN, list_first_frames, write_format
 from tracklake.pipeline.synthetic.scenarios import (
     DRIVES,
     FREEWAY,
     HIGHD,
-    I24,
     NGSIM_CSV,
     NGSIM_SOCRATA,
     NGSIM_TEXT,
-    TGSIM,
     Dose,
     HighdScenario,
     Job,
@@ -36,8 +35,6 @@ AT_ONCE = 2
 STOP_POLL_S = 0.05
 """Time between two attempts to end what is still simulated, in seconds."""
 BOM = b"\xef\xbb\xbf"
-PLAIN = {TGSIM: tgsim, I24: i24}
-"""Writers of formats that are generated without defects."""
 TRUTH_FILE, TRUE_TRACKS_FILE = "truth.parquet", "true_tracks.parquet"
 README_FILE = "README.md"
 README = """# A generated sample
@@ -48,6 +45,7 @@ noise and known defects were added. `tracklake sample` wrote them (seed {seed}, 
 - `NN_recordingMeta.csv`, `NN_tracksMeta.csv`, `NN_tracks.csv`: highD's format. `dhw` is bumper to bumper; the metadata
   describe the rows in the files.
 - `trajectories-*`, `*-export.csv`: NGSIM's formats, at times of the day that were never recorded.
+- `exid/`, `ind/`, `round/`, if asked for: formats of exiD (with a map of location 0), inD and rounD, without defects.
 - files of TGSIM and I-24 MOTION, if asked for, without defects.
 - `drive-1`, `drive-2`: what two cars of recording 02 would have logged as instrumented vehicles, each with `truth.csv`.
 - `truth.parquet`: every injected defect, every vehicle's true first frame, and what each rule has to find.
@@ -111,9 +109,9 @@ def build_sample(
         truth.read_ngsim(folder / file, names, found)
     for name, own in plain.items():
         progress(f"writing {name}")
-        noisy = {job.subset: _add_noise(clean[job.subset], job, seed, noise) for job in own}
-        found.files += PLAIN[name].write_files(folder, noisy)
-        rows += [row for job in own for row in _list_first_frames(clean[job.subset], job)]
+        counts, firsts = write_format(folder, name, own, clean, seed, noise)
+        found.files += counts
+        rows += firsts
     for drive in drives.SCENARIOS if driven else ():
         progress(f"writing {drive.folder}")
         pair = _list_pair(jobs, drives.RECORDING)
@@ -225,20 +223,6 @@ def _stop(simulations: Collection[Future[pl.DataFrame]]) -> None:
         stop_programs()
 
 
-def _list_first_frames(tracks: pl.DataFrame, job: Job) -> list[dict[str, object]]:
-    firsts = tracks.group_by("vehicle", maintain_order=True).agg(
-        pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"), pl.len(), pl.col("x").first()
-    )
-    return [
-        {
-            "kind": "first_frame", "dataset": job.dataset, "recording": job.recording, "subset": job.subset,
-            "file": job.file, "vehicle_id": vehicle, "first_frame": first, "last_frame": last, "entries": entries,
-            "value": x,
-        }
-        for vehicle, first, last, entries, x in firsts.iter_rows()
-    ]  # fmt: skip
-
-
 def _damage_tracks(
     tracks: pl.DataFrame, job: Job, seed: int, noise: tuple[str, ...], next_vehicle: int | None = None
 ) -> tuple[pl.DataFrame, list[dict[str, object]]]:
@@ -263,7 +247,7 @@ def _damage_tracks(
         }
         for each in injected.defects
     ]  # fmt: skip
-    return injected.tracks, _list_first_frames(tracks, job) + _list_lane_changes(tracks, job) + declared
+    return injected.tracks, list_first_frames(tracks, job) + _list_lane_changes(tracks, job) + declared
 
 
 def _list_lane_changes(tracks: pl.DataFrame, job: Job) -> list[dict[str, object]]:
@@ -276,10 +260,6 @@ def _list_lane_changes(tracks: pl.DataFrame, job: Job) -> list[dict[str, object]
         }
         for vehicle, begin, end, side in changes.sort("vehicle", "change_begin").iter_rows()
     ]  # fmt: skip
-
-
-def _add_noise(tracks: pl.DataFrame, job: Job, seed: int, noise: tuple[str, ...]) -> pl.DataFrame:
-    return add_noise(tracks, job.road, MAST, noise, np.random.default_rng([seed, job.index, 1]))
 
 
 def _list_line_defects(

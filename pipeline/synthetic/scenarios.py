@@ -11,7 +11,9 @@ TGSIM = "tgsim"
 """Format of TGSIM's freeway sites."""
 I24 = "i24"
 """Format of I-24 MOTION."""
-FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES, TGSIM, I24)
+LEVELX = ("exid", "ind", "round")
+"""Formats of levelXdata's recordings on roads that are not straight."""
+FORMATS = ("highd", "ngsim-text", "ngsim-csv", "socrata", DRIVES, *LEVELX, TGSIM, I24)
 """Raw formats that the generator writes."""
 DEFAULT_FORMATS = ("highd", "ngsim-text", "socrata", DRIVES)
 """Formats of a sample, unless set."""

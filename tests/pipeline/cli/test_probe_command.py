@@ -98,6 +98,20 @@ def test_ngsim_without_header_and_logs_of_messages(command, tmp_path):
     assert columns_of(file)["speed_mps"]["unit"] == "m/s"
 
 
+def test_a_list_of_documents(command, tmp_path):
+    steps = range(50)
+    sound = {
+        "timestamp": [1_669_118_400 + step / 25 for step in steps],
+        "x_position": [316_800 + step for step in steps],
+    }
+    sound |= {"y_position": [18.0] * 50, "length": 15.0, "width": [6.0, 6.5], "direction": 1, "coarse_vehicle_class": 0}
+    documents = [sound] * 12 + [sound | {"x_position": []}]
+    path = write(tmp_path / "i24.json", json.dumps(documents).encode())
+    ((file,), _) = probe(command, path, code=3)
+    assert (file["dataset"], file["rows"], sum(file["rejected"].values())) == ("i24", 13, 1)
+    assert columns_of(file)["length"] == {"name": "length", "state": "read", "unit": "ft", "filled": 1.0, "fits": True}
+
+
 @pytest.mark.parametrize(
     ("content", "problem", "names"),
     [

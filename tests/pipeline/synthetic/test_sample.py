@@ -7,13 +7,10 @@ from pathlib import Path
 import polars as pl
 import pytest
 from lake_sources import SAMPLE
-from raw_texts import raw_file, read_highd, read_ngsim
+from raw_texts import read_highd, read_ngsim
 from simulated import count_once, simulate_once
 
 from tracklake.pipeline import synthetic
-from tracklake.pipeline.sources.i24 import I24
-from tracklake.pipeline.sources.source import Part
-from tracklake.pipeline.sources.tgsim import TGSIM
 from tracklake.pipeline.synthetic import ALL_FORMATS, SampleSummary, SumoError, build, write_sample
 from tracklake.pipeline.synthetic import sumo as sumo_runs
 from tracklake.schemas.errors import UsageError
@@ -45,12 +42,15 @@ def highd_tracks(out, recording):
 def test_summary_names_every_file(written):
     out, summary = written
     assert sorted(path.name for path in out.iterdir()) == [path.name for path in summary.files]
-    assert summary.recordings == 4 + 1 + 2 + 1 + 2 + 3 + 1  # highD, NGSIM in three formats, drives, TGSIM, I-24
-    lines = sum(path.read_bytes().count(b"\n") for path in summary.files if path.suffix in (".csv", ".txt"))
-    metadata = sum(path.read_bytes().count(b"\n") for path in summary.files if path.name.endswith("Meta.csv"))
-    headers = 4 + 1 + 1 + 3  # the text has none
+    # highD, NGSIM in three formats, drives, exiD, inD, rounD, TGSIM, I-24
+    assert summary.recordings == 4 + 1 + 2 + 1 + 2 + 2 + 1 + 1 + 3 + 1
+    files = [path for path in out.rglob("*") if not path.relative_to(out).parts[0].startswith("drive-")]
+    lines = sum(path.read_bytes().count(b"\n") for path in files if path.suffix in (".csv", ".txt"))
+    metadata = sum(path.read_bytes().count(b"\n") for path in files if path.name.endswith("Meta.csv"))
+    headers = 4 + 1 + 1 + 4 + 3  # the text has none
+    lanelets = (out / "exid/maps/lanelets/0_generated/location0.osm").read_text().count("<relation")
     documents = (out / "i24-inception.json").read_bytes().count(b"\n")
-    assert summary.rows == lines - metadata - headers + documents
+    assert summary.rows == lines - metadata - headers + documents + lanelets
     assert not [path for path in out.parent.iterdir() if path != out]
 
 
@@ -106,46 +106,6 @@ def test_a_generated_ngsim_file_that_another_program_rewrote_is_recognised(writt
     kept.write_csv(tmp_path / "derived.csv")
     found, _ = read_ngsim(tmp_path / "spilled", tmp_path / "derived.csv")
     assert find_origins(found.values()) == {"synthetic"}
-
-
-def test_generated_tgsim_files_are_recognised_as_such_and_hold_what_was_simulated(written, truth, tmp_path):
-    out, _ = written
-    recordings = {}
-    for name in ("I395_final.csv", "TGSIM_I-294_L1_Trajectories.csv"):
-        file = raw_file(out / name, TGSIM)
-        spilled = TGSIM.spill(file, tmp_path / name)
-        assert spilled.rejects.is_empty()
-        for recording in spilled.recordings:
-            parts = [Part(file, pl.scan_ipc(tmp_path / name / recording / "*.arrow"))]
-            recordings[recording] = TGSIM.to_canonical(parts, recording)
-    assert find_origins(recordings.values()) == {"synthetic"}
-    for (subset,) in (made.subsets for made in recordings.values()):
-        simulated = truth.filter(kind="first_frame", subset=subset.name).sort("vehicle_id")
-        assert (
-            subset.vehicles.select("vehicle_id", "entries").rows() == simulated.select("vehicle_id", "entries").rows()
-        )
-        # Positions have noise; they count from the hindmost entry, near the window's entrance.
-        assert (subset.vehicles["start_x_m"] - simulated["value"]).abs().max() < 2.5
-        assert subset.vehicles.filter("automated")["vehicle_id"].to_list() == [
-            vehicle for vehicle in simulated["vehicle_id"] if vehicle % 10 == 0
-        ]
-
-
-def test_the_generated_list_of_i24_is_recognised_as_such_and_holds_what_was_simulated(written, truth, tmp_path):
-    file = raw_file(written[0] / "i24-inception.json", I24)
-    spilled = I24.spill(file, tmp_path)
-    assert spilled.rejects.is_empty()
-    (recording,) = spilled.recordings
-    made = I24.to_canonical([Part(file, pl.scan_ipc(tmp_path / recording / "*.arrow"))], recording)
-    assert find_origins([made]) == {"synthetic"}
-    for subset, miles in zip(made.subsets, (59 - 58, 64 - 62), strict=True):
-        simulated = truth.filter(kind="first_frame", subset=subset.name).sort("vehicle_id")
-        assert subset.vehicles.height == simulated.height
-        # Of four trajectories three lie between frames, so that the first position is up to a frame later.
-        found = subset.vehicles["start_x_m"] - miles * 1609.344
-        assert (found - simulated["value"]).abs().max() < 2
-        assert (subset.vehicles["entries"] - simulated["entries"]).unique().sort().to_list() in ([-1, 0], [0])
-        assert subset.facts["lanes"][0] == 4
 
 
 def test_a_generated_highd_recording_is_recognised_without_its_folder(written, tmp_path):
@@ -329,7 +289,7 @@ def test_traffic_is_lively(written):
     [
         (
             {"formats": ("highD",)},
-            "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, tgsim, i24, got highD",
+            "formats: expected some of highd, ngsim-text, ngsim-csv, socrata, drives, exid, ind, round, tgsim, i24",
         ),
         ({"formats": ()}, "got none"),
         ({"minutes": 0.0}, "minutes: expected 0.1 to 15, got 0.0"),
