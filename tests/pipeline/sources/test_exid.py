@@ -3,7 +3,10 @@
 import numpy as np
 import polars as pl
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from levelx_files import drive, meta_row, read, recognise, track_row, vehicle_row, write_recording, write_urban
+from polars.testing import assert_frame_equal
 from raw_texts import check_accounts, write
 
 from tracklake.pipeline.sources.exid import EXID
@@ -125,6 +128,27 @@ def test_a_header_in_another_order_with_unknown_columns_is_read(tmp_path):
     meta = pl.read_csv(paths[0], infer_schema=False).rename({"weekday": "weekDay"}).drop("speedLimit", "lonLocation")
     meta.write_csv(paths[0])
     assert list(by_name(read(paths)[1])) == ["00-north", "00-south"]
+
+
+@settings(max_examples=5)
+@given(seed=st.integers(0, 1000), skipped=st.integers(1, 300))
+def test_neither_the_order_of_rows_nor_gaps_nor_tracks_of_one_row_matter(tmp_path_factory, seed, skipped):
+    folder = tmp_path_factory.mktemp("rows")
+    lone = track_row(2_147_483_646, 5, (0.0, 60.0), (0, 20), 90.0, laneletId="11;12")
+    rows = [*NORTH[: 800 - skipped], *NORTH[800:], *SOUTH, lone]
+    del rows[100:110]  # a gap of vehicle 0
+    vehicles = [*VEHICLES_ROWS, vehicle_row(2_147_483_646, 1)]
+    shuffled = [rows[i] for i in np.random.default_rng(seed).permutation(len(rows))]
+    one, other = (
+        by_name(read(write_recording(folder / name, vehicles, each))[1])
+        for name, each in (("sorted", rows), ("shuffled", shuffled))
+    )
+    assert list(one) == list(other) == ["00-north", "00-south"]
+    for name in one:
+        assert_frame_equal(one[name].tracks, other[name].tracks)
+    tracks = one["00-north"].tracks
+    assert tracks.height == 2_400 - skipped - 10 + 1
+    assert tracks.filter(vehicle_id=2_147_483_646).select("lane", "speed_mps", "speed_cd_mps").rows() == [(1, 20, None)]
 
 
 def test_without_lanelets_there_are_no_lanes(tmp_path):
