@@ -11,7 +11,7 @@ import polars as pl
 
 from tracklake.pipeline.ingest.discovery import find_raw_files
 from tracklake.pipeline.sources import RawFile, Source, SourceError
-from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, open_raw, read_chunks, read_head
+from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, read_chunks, read_head
 from tracklake.pipeline.sources.i24 import DIALECT as I24_JSON
 from tracklake.pipeline.sources.i24 import split_unusable
 from tracklake.pipeline.sources.i24_documents import read_documents
@@ -182,13 +182,12 @@ def _probe_documents(source: Source, file: RawFile) -> FileProbe:
     reasons: Counter[str] = Counter()
     empty: Counter[str] = Counter()
     first = pl.DataFrame()
-    with open_raw(file) as handle:
-        for documents in read_documents(handle, file.name):
-            usable, refused = split_unusable(documents)
-            first = usable if first.is_empty() else first
-            rows, kept = rows + documents.read, kept + usable.height
-            reasons.update(dict(refused.group_by("reason").len().iter_rows()))
-            empty.update(usable.null_count().row(0, named=True))
+    for documents in read_documents(file):
+        usable, refused = split_unusable(documents)
+        first = usable if first.is_empty() else first
+        rows, kept = rows + documents.read, kept + usable.height
+        reasons.update(dict(refused.group_by("reason").len().iter_rows()))
+        empty.update(usable.null_count().row(0, named=True))
     columns = []
     for name in (name for name in RAW_I24.columns if name in first.columns and name != LINE):
         values = first.select(pl.col(name).explode() if first[name].dtype == pl.List else name)

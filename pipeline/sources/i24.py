@@ -12,7 +12,7 @@ import polars as pl
 
 from tracklake.pipeline.sources.accounting import FILE, account_rows
 from tracklake.pipeline.sources.assembly import assemble_subset
-from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA, open_raw
+from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA
 from tracklake.pipeline.sources.i24_documents import Documents, read_documents
 from tracklake.pipeline.sources.ngsim import group
 from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, Spilled, Subset
@@ -90,19 +90,16 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
     """Read a file document by document into a folder for each period of its time."""
     recordings: Counter[str] = Counter()
     rejects, read, moved = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0
-    with open_raw(file) as handle:
-        for number, documents in enumerate(read_documents(handle, file.name)):
-            kept, refused = split_unusable(documents)
-            points, between = put_on_frames(kept)
-            vanished = kept.join(
-                points.select(pl.col("vehicle").cast(pl.Int64).alias(LINE)).unique(), on=LINE, how="anti"
-            )
-            rejects += [refused, _describe_rejects(vanished.with_columns(reason=pl.lit(NO_FRAMES)))]
-            read += documents.read
-            moved += between
-            periods = points.partition_by("period", as_dict=True, include_key=False)
-            shares = ((_name_period(file, period), rows) for (period,), rows in sorted(periods.items()))
-            recordings += spill_rows(folder, number, shares)
+    for number, documents in enumerate(read_documents(file)):
+        kept, refused = split_unusable(documents)
+        points, between = put_on_frames(kept)
+        vanished = kept.join(points.select(pl.col("vehicle").cast(pl.Int64).alias(LINE)).unique(), on=LINE, how="anti")
+        rejects += [refused, _describe_rejects(vanished.with_columns(reason=pl.lit(NO_FRAMES)))]
+        read += documents.read
+        moved += between
+        periods = points.partition_by("period", as_dict=True, include_key=False)
+        shares = ((_name_period(file, period), rows) for (period,), rows in sorted(periods.items()))
+        recordings += spill_rows(folder, number, shares)
     notes = [f"{file.name}: positions of {moved:,} trajectories lie between frames and are interpolated"] * bool(moved)
     refused = pl.concat(rejects).sort(LINE)
     if refused.height and refused["line"][-1] == read and refused["reason"][-1] == "cut short":
@@ -300,7 +297,7 @@ I24 = Source(
     title="I-24 MOTION trajectories, INCEPTION release",
     licence="that of the I-24 MOTION project (i24motion.org): free, with citation, no re-identification",
     citation=references.GLOUDEMANS.full,
-    signature="I-24 MOTION: a JSON list of documents with timestamp, x_position, y_position, direction",
+    signature="I-24 MOTION: a JSON list of trajectories",
     version=1,
     detect=detect,
     group=group,

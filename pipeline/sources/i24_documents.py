@@ -6,15 +6,15 @@ and a file of any size is read in the memory that some blocks take.
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
-from typing import BinaryIO
 
 import polars as pl
 
-from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA
-from tracklake.pipeline.sources.source import SourceError
+from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA, open_raw, read_block
+from tracklake.pipeline.sources.source import RawFile, SourceError
 
 BLOCK_BYTES = 16 << 20
 """Size of the blocks of a file that are read at once, in bytes."""
@@ -49,29 +49,30 @@ class Documents:
     read: int
 
 
-def read_documents(handle: BinaryIO, where: str) -> Iterator[Documents]:
-    """Read the documents of a list; `where` names the file.
+def read_documents(file: RawFile) -> Iterator[Documents]:
+    """Read the documents of a list.
 
     Raises:
-        SourceError: no list of documents, or a document of more than MAX_DOCUMENT_BYTES.
+        SourceError: no list of documents, a document of more than MAX_DOCUMENT_BYTES, or a damaged compressed file.
     """
     number = 1
-    for texts in _split(handle, where):
-        frame, rejects = _parse(texts, number)
-        yield Documents(frame, pl.DataFrame(rejects, schema=REJECT_SCHEMA, orient="row"), len(texts))
-        number += len(texts)
+    with open_raw(file) as handle:
+        for texts in _split(partial(read_block, handle, file=file), file.name):
+            frame, rejects = _parse(texts, number)
+            yield Documents(frame, pl.DataFrame(rejects, schema=REJECT_SCHEMA, orient="row"), len(texts))
+            number += len(texts)
 
 
-def _split(handle: BinaryIO, where: str) -> Iterator[list[bytes]]:
-    """Yield the texts of the documents that end in each block."""
-    waiting = handle.read(BLOCK_BYTES).removeprefix(BOM)
+def _split(read: Callable[[int], bytes], where: str) -> Iterator[list[bytes]]:
+    """Yield the texts of the documents that end in each block; `read` returns bytes, `where` names the file."""
+    waiting = read(BLOCK_BYTES).removeprefix(BOM)
     found = FIRST_KEY.match(waiting)
     if found is None:
         raise SourceError(f'{where}: no list of documents. Expected `[{{"_id": ...`, got {waiting[:40]!r}.')
     begin = re.compile(rb"\{\s*\"" + re.escape(found[1]) + rb"\"\s*:")
     ended = False
     while not ended:
-        block = handle.read(BLOCK_BYTES)
+        block = read(BLOCK_BYTES)
         ended = not block
         waiting += block
         # The last document may go on in the next block.

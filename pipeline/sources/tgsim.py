@@ -289,8 +289,7 @@ TGSIM = Source(
     title="Third Generation Simulation (TGSIM) trajectories among automated vehicles",
     licence="public domain (U.S. Department of Transportation)",
     citation=references.TGSIM.full,
-    signature="TGSIM: a header with id, time, xloc_kf, yloc_kf, speed_kf (or xloc-kf and so on), beside it lane "
-    "centrelines with x1, y1, ramp1",
+    signature="TGSIM: a header with id, time, xloc_kf (or xloc-kf)",
     version=1,
     detect=detect,
     group=group,

@@ -14,6 +14,7 @@ from tracklake.pipeline.sources.csv.raw_files import fetch_lines as fetch_lines
 from tracklake.pipeline.sources.csv.raw_files import hash_raw as hash_raw
 from tracklake.pipeline.sources.csv.raw_files import measure_unpacked as measure_unpacked
 from tracklake.pipeline.sources.csv.raw_files import open_raw as open_raw
+from tracklake.pipeline.sources.csv.raw_files import read_block as read_block
 from tracklake.pipeline.sources.csv.raw_files import read_head as read_head
 from tracklake.pipeline.sources.csv.reader import DIGITS_LOST as DIGITS_LOST
 from tracklake.pipeline.sources.csv.reader import NULL_WORDS as NULL_WORDS

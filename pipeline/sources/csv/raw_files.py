@@ -72,7 +72,7 @@ def open_raw(file: RawFile) -> Iterator[BinaryIO]:
 def hash_raw(file: RawFile) -> str:
     """Hash a file's bytes with sha256: a gzip file as it is, an archive's member unpacked."""
     with _open_packed(file) as handle:
-        return hash_chunks(iter(lambda: _read_block(handle, HASH_BYTES, file), b""))
+        return hash_chunks(iter(lambda: read_block(handle, HASH_BYTES, file), b""))
 
 
 def measure_unpacked(file: RawFile) -> int:
@@ -101,7 +101,12 @@ def _explain_damage(file: RawFile) -> Iterator[None]:
         ) from None
 
 
-def _read_block(handle: BinaryIO, size: int, file: RawFile) -> bytes:
+def read_block(handle: BinaryIO, size: int, file: RawFile) -> bytes:
+    """Read some bytes of an open file.
+
+    Raises:
+        SourceError: a compressed file is damaged or cut short.
+    """
     with _explain_damage(file):
         return handle.read(size)
 
@@ -154,7 +159,7 @@ def read_head(file: RawFile, size: int = 65_536) -> bytes:
     head = b""
     with open_raw(file) as handle:
         try:
-            while len(head) < size and (block := _read_block(handle, 1024, file)):
+            while len(head) < size and (block := read_block(handle, 1024, file)):
                 head += block
         except SourceError:
             if not head:

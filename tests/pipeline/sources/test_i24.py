@@ -1,8 +1,9 @@
 """I-24 MOTION by hand: documents in blocks, frames, lanes, both directions, and lists that are damaged."""
 
-import io
+import gzip
 import json
 from itertools import pairwise
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import polars as pl
@@ -13,7 +14,7 @@ from raw_texts import raw_file, write
 
 from tracklake.pipeline.sources import i24_documents
 from tracklake.pipeline.sources.i24 import I24, PERIOD_S, detect, find_lanes, put_on_frames
-from tracklake.pipeline.sources.source import Part, SourceError
+from tracklake.pipeline.sources.source import Part, RawFile, SourceError
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
 FILE = "637c399add50d54aa5af0cf4__post2.json"
@@ -54,6 +55,12 @@ def read(folder, text, name=FILE):
             VEHICLES.validate(subset.vehicles, where=subset.name)
             SUBSETS.validate(subset.facts, where=subset.name)
     return made, spilled
+
+
+def read_blocks(text):
+    """Documents of a list, by block."""
+    with TemporaryDirectory() as folder:
+        return list(i24_documents.read_documents(RawFile(write(f"{folder}/list.json", text.encode()), "list.json")))
 
 
 def as_list(documents):
@@ -153,7 +160,7 @@ def test_documents_are_the_same_however_the_file_is_cut_into_blocks(size, shape,
     text = shape % ",\n".join(json.dumps(each, indent=2 if indented else None) for each in made)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(i24_documents, "BLOCK_BYTES", max(size, 30))
-        blocks = list(i24_documents.read_documents(io.BytesIO(text.encode()), "list.json"))
+        blocks = read_blocks(text)
     frame = pl.concat([block.frame for block in blocks])
     assert frame["line"].to_list() == [1, 2, 3]
     assert frame["timestamp"].to_list() == [each["timestamp"] for each in made]
@@ -198,6 +205,13 @@ def test_broken_documents_are_rejected_with_their_number_and_spoil_no_other(tmp_
     assert (row["rows_kept"], row["rows_dropped"], row["rows_read"]) == (250, 11, 261)
 
 
+def test_a_compressed_list_is_read_and_one_that_is_cut_short_is_refused(tmp_path):
+    packed = gzip.compress(as_list([document(number=number) for number in range(1, 60)]).encode())
+    assert read(tmp_path / "whole", packed, f"{FILE}.gz")[1].rows_read == 59
+    with pytest.raises(SourceError, match=r"the compressed file is damaged or cut short.*Download it again"):
+        read(tmp_path / "cut", packed[:-400], f"{FILE}.gz")
+
+
 def test_lists_are_recognised_by_their_beginning_and_other_json_is_not():
     text = as_list([document()]).encode()
     assert detect(text[:70], FILE) == "i24-json"
@@ -210,10 +224,10 @@ def test_lists_are_recognised_by_their_beginning_and_other_json_is_not():
 def test_a_document_without_end_and_no_list_are_refused(monkeypatch):
     monkeypatch.setattr(i24_documents, "BLOCK_BYTES", 50)
     monkeypatch.setattr(i24_documents, "MAX_DOCUMENT_BYTES", 100)
-    with pytest.raises(SourceError, match=r"big\.json: a document of more than 0 MiB"):
-        list(i24_documents.read_documents(io.BytesIO(as_list([document()]).encode()), "big.json"))
-    with pytest.raises(SourceError, match=r"no\.json: no list of documents"):
-        list(i24_documents.read_documents(io.BytesIO(b"{}"), "no.json"))
+    with pytest.raises(SourceError, match=r"list\.json: a document of more than 0 MiB"):
+        read_blocks(as_list([document()]))
+    with pytest.raises(SourceError, match=r"list\.json: no list of documents"):
+        read_blocks("{}")
 
 
 @pytest.mark.parametrize(
