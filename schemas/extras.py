@@ -14,6 +14,7 @@ EXTRAS = {
     "sample": ("sumo",),
     "distributed": ("prefect_dask",),
     "object-store": ("obstore", "duckdb_extension_httpfs", "duckdb_extension_aws"),
+    "ducklake": ("duckdb_extension_ducklake",),
     "onboard": ("pyproj", "rosbags", "scipy", "sklearn"),
 }
 """Modules that each extra installs, by the extra's name in pyproject.toml."""

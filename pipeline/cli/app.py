@@ -38,7 +38,7 @@ COMMANDS = {
     "lane-forest": "Fit a forest that predicts lane changes; score it, and the grid cells that models predict.",
     "onboard": "Predict the vehicles around an instrumented vehicle from its own logs; train, evaluate, warn.",
     "export": "Write the lake's data in other projects' formats.",
-    "publish": "Put the lake where others can read it, on an object store.",
+    "publish": "Put the lake where others can read it: on an object store, or as a DuckLake catalog.",
     "fetch": "Copy a lake from an object store to a folder, or bring that copy up to date.",
     "sample": "Generate recordings in the raw formats with SUMO, with known defects and their truth.",
     "instrument": "Write what a car of a recording would have logged: V2V messages, LiDAR, camera, and the truth.",

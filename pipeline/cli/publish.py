@@ -8,18 +8,21 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
+from tracklake.pipeline.lake.ducklake import publish_ducklake
 from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.lake.publication import Transfer, fetch_lake, publish_lake
 from tracklake.schemas.errors import UsageError
 
 publish = typer.Typer(
-    help="Put the lake where others can read it, on an object store.", no_args_is_help=True, add_completion=False
+    help="Put the lake where others can read it: on an object store, or as a DuckLake catalog.",
+    no_args_is_help=True,
+    add_completion=False,
 )
 
 
 @publish.callback()
 def _publish() -> None:
-    """Put the lake where others can read it, on an object store."""
+    """Put the lake where others can read it: on an object store, or as a DuckLake catalog."""
 
 
 AddressArgument = Annotated[str, typer.Argument(metavar="ADDRESS", help="For instance s3://bucket/lake.")]
@@ -44,6 +47,21 @@ def store(
         root = read_settings(lake=lake).lake
         done = publish_lake(root, place, replace_other=replace)
         _show_transfer(terminal, "published", done, root, place)
+
+
+@publish.command()
+def ducklake(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOption = False) -> None:
+    """Write catalog.ducklake beside the lake's files: a frozen DuckLake catalog of the tables as they are now.
+
+    Any DuckDB reads it by ATTACH 'ducklake:LAKE/catalog.ducklake' (READ_ONLY), as long as the lake keeps the generation
+    that it shows (setting kept_generations). It names files by their full path: write it again after moving the lake.
+    """
+    with command(quiet=quiet, json=json) as terminal:
+        done = publish_ducklake(read_settings(lake=lake).lake)
+        terminal.print_line(
+            f"{done.path}: generation {done.generation}, {done.tables} tables with rows in {done.files:,} files"
+        )
+        terminal.print_json(done._asdict())
 
 
 def fetch(

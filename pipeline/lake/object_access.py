@@ -68,6 +68,28 @@ def get_polars_options(address: str) -> dict[str, str]:
     return {"aws_allow_http": str(find_endpoint(address).is_plain).lower()}
 
 
+def find_extension(name: str, extra: str) -> Path:
+    """Return the file of a DuckDB extension, from its Python package.
+
+    Args:
+        name: name of the extension.
+        extra: extra of the distribution that installs the package.
+
+    Raises:
+        StoreError: the package does not fit the installed DuckDB.
+    """
+    import duckdb
+
+    package = import_module(f"duckdb_extension_{name}")
+    file = Path(str(package.__file__)).parent / "extensions" / f"v{duckdb.__version__}" / f"{name}.duckdb_extension"
+    if not file.exists():
+        raise StoreError(
+            f"the package duckdb-extension-{name} does not fit DuckDB {duckdb.__version__}. Install both as pinned: "
+            f'pip install "tracklake[{extra}]"'
+        )
+    return file
+
+
 def admit_place(connection: "duckdb.DuckDBPyConnection", place: LakePlace) -> None:
     """Let a DuckDB connection read the objects of a lake; for a lake in a folder there is nothing to do.
 
@@ -85,14 +107,7 @@ def admit_place(connection: "duckdb.DuckDBPyConnection", place: LakePlace) -> No
     if endpoint.scheme != "s3":
         raise StoreError(f"{place}: DuckDB reads s3:// only. Copy the lake to a folder first (docs/object-store.md).")
     for name in EXTENSIONS:
-        package = import_module(f"duckdb_extension_{name}")
-        file = Path(str(package.__file__)).parent / "extensions" / f"v{duckdb.__version__}" / f"{name}.duckdb_extension"
-        if not file.exists():
-            raise StoreError(
-                f"{place}: the package duckdb-extension-{name} does not fit DuckDB {duckdb.__version__}. Install both "
-                'as pinned: pip install "tracklake[object-store]"'
-            )
-        connection.execute(f"LOAD {quote(str(file))}")
+        connection.execute(f"LOAD {quote(str(find_extension(name, 'object-store')))}")
     for setting in SECRET_SETTINGS:
         connection.execute(f"SET GLOBAL {setting} = ''")  # also for its cursors
     options = {"REGION": endpoint.region, "SCOPE": place, "ENDPOINT": endpoint.host}
