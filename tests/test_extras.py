@@ -52,6 +52,7 @@ NEEDS = {
     ("predict",): ("report",),
     ("lane-forest",): ("forest",),
     ("export", "csp", "--out", "csp"): ("matlab",),
+    ("publish", "ducklake"): ("ducklake",),
     ("serve",): ("flows",),
     ("sample", "--out", "raw"): ("sample",),
 }
