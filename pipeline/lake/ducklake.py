@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 DUCKLAKE = "catalog.ducklake"
 """Name of the catalog in the lake."""
-NO_DOWNLOADS = {"autoinstall_known_extensions": False, "autoload_known_extensions": False}
-"""Configuration of a DuckDB that loads no extension by itself."""
 
 
 class DuckLake(NamedTuple):
@@ -59,7 +57,10 @@ def build_ducklake(folder: Path, manifest: Manifest) -> bytes:
                 f"{folder}: lies in a folder whose name begins with {name}=, which DuckLake takes for a part of the "
                 "data. Move the lake to another folder first."
             )
-    with tempfile.TemporaryDirectory() as elsewhere, duckdb.connect(":memory:", config=NO_DOWNLOADS) as connection:
+    with (
+        tempfile.TemporaryDirectory() as elsewhere,
+        duckdb.connect(":memory:", config={"autoinstall_known_extensions": False}) as connection,
+    ):
         connection.execute(f"LOAD {quote(str(find_extension('ducklake', 'ducklake')))}")
         made = Path(elsewhere) / DUCKLAKE
         attached = f"ATTACH {quote(f'ducklake:{made}')} AS lake"
