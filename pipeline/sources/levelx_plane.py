@@ -244,6 +244,7 @@ def finish_recording(
     subsets: Sequence[Subset],
     notes: Sequence[str],
     map_part: tuple[Part, int] | None = None,
+    left_out: pl.DataFrame | None = None,
 ) -> Canonical:
     """Account for every row and compare the counts with those that tracksMeta announces of motor vehicles.
 
@@ -255,12 +256,15 @@ def finish_recording(
         subsets: what was made of it.
         notes: messages for the user.
         map_part: the map and the number of its lanelets.
+        left_out: rows of vehicles that are left out on purpose, so that none of their rows is missing.
     """
     parts, rows = [*read.parts], [*read.rows_parsed]
     if map_part is not None:
         parts, rows = [*parts, map_part[0]], [*rows, map_part[1]]
     log, rejects = account_rows(dataset, recording, parts, rows, [*read.dropped, *dropped])
     motor = read.vehicles.filter(~pl.col("class").str.to_lowercase().is_in(NO_MOTOR))
+    if left_out is not None:
+        motor = motor.join(left_out, on="trackId", how="anti", maintain_order="left")
     announced = Announced(
         totals={},
         totals_by=RECORDING_META,

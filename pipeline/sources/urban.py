@@ -70,7 +70,7 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset) -> Can
                 facts=facts,
             )
         )
-    return finish_recording(dataset, recording, read, dropped, subsets, notes)
+    return finish_recording(dataset, recording, read, dropped, subsets, notes, left_out=parked)
 
 
 def _split_parked(entries: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:

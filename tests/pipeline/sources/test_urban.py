@@ -77,6 +77,9 @@ def test_a_subset_is_a_way_over_the_junction_with_its_own_axis(tmp_path):
     reasons = dict(canonical.rejects.group_by("reason").len().iter_rows())
     assert reasons == {"no motor vehicle: pedestrian": 30, "vehicle is parked: it stays within 5 m": 30}
     check_accounts(canonical, entries_from=["07_tracks.csv"])
+    # What is left out on purpose is not missing.
+    assert canonical.completeness["agrees"].all()
+    assert canonical.notes == ()
 
 
 def test_a_recording_of_parked_vehicles_has_no_subset(tmp_path):
