@@ -54,6 +54,8 @@ NEEDS = {
     ("export", "csp", "--out", "csp"): ("matlab",),
     ("publish", "ducklake"): ("ducklake",),
     ("serve",): ("flows",),
+    ("publish", "store", "s3://bucket/lake"): ("object-store",),
+    ("sql", "FROM subsets", "--lake", "s3://bucket/lake"): ("object-store",),
     ("sample", "--out", "raw"): ("sample",),
 }
 """Extras that a command needs, by its arguments."""

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake import LakeError, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.working_copy import WorkingCopy, name_copy
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
@@ -32,7 +34,7 @@ def run(
 
     Args:
         source: a raw file, or a folder of them.
-        lake: folder of the lake; it is created if missing.
+        lake: folder of the lake, which is created if missing, or its address on an object store.
         dataset: read the source as this dataset only (ngsim, highd, custom or v2v); None: detect it.
         replace: whether files of the source may replace other files of the same recording.
         prune: whether to remove recordings whose files once stood in the source and are missing now.
@@ -50,8 +52,26 @@ def run(
     chosen = Settings(lake=Path(lake), **settings)
     for message in find_unknown_variables():
         warnings.warn(message, stacklevel=2)
-    plain = chosen.model_dump(mode="json", exclude_unset=True)
-    place, where = str(Path(lake).absolute()), str(Path(source).absolute())
+    address = find_address(lake)
+    if address is None:
+        result = _run_in_folder(chosen, source, dataset, replace, prune, rebuild)
+    else:
+        copy = WorkingCopy(address, name_copy(address, chosen.cache))
+        copy.fetch()
+        in_copy = chosen.model_copy(update={"lake": copy.folder})
+        result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
+        copy.publish()
+    if result.failed:
+        raise LakeError("\n".join(result.failed))
+    return result
+
+
+def _run_in_folder(
+    settings: Settings, source: str | Path, dataset: str | None, replace: bool, prune: bool, rebuild: bool
+) -> RunResult:
+    """Run the whole pipeline on a lake in a folder."""
+    plain = settings.model_dump(mode="json", exclude_unset=True)
+    place, where = str(settings.lake.absolute()), str(Path(source).absolute())
     request = RunRequest(place, ALL_STEPS, where, dataset, plain, replace, prune, rebuild)
     request.check()
     refuse_foreign(request.root, rebuild=rebuild)
@@ -63,6 +83,4 @@ def run(
         return conclude_idle(request, plan)
     refuse_if_busy(request.root, rebuild=rebuild)
     result: RunResult = import_flows().execute(request, plan)
-    if result.failed:
-        raise LakeError("\n".join(result.failed))
     return result

@@ -18,6 +18,7 @@ from tracklake.pipeline.lake import (
     load,
     open_for_writing,
 )
+from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources.column_mapping import load_mapping
 from tracklake.pipeline.stages.planner import Planner, find_pending
@@ -58,7 +59,17 @@ class RunRequest:
 
     @property
     def root(self) -> Path:
-        """Path of the folder of the lake."""
+        """Path of the folder of the lake.
+
+        Raises:
+            UsageError: it is on an object store, whose copy in a folder only commands and `tracklake.run` work on.
+        """
+        address = find_address(self.lake)
+        if address is not None:
+            raise UsageError(
+                f"{address}: a flow works on a lake in a folder. `tracklake run` and `tracklake.run` work in a copy of "
+                "this one, and publish it."
+            )
         return Path(self.lake)
 
     @property

@@ -9,6 +9,9 @@ from small_recordings import write_highd
 
 import tracklake
 from tracklake.pipeline.lake import LakeMissingError, load
+from tracklake.pipeline.orchestration import api
+from tracklake.pipeline.orchestration.run_plan import RunRequest
+from tracklake.schemas.errors import UsageError
 
 
 @pytest.fixture
@@ -116,6 +119,19 @@ def test_a_run_that_is_interrupted_publishes_nothing_and_is_gone_on_with(machine
     assert done.code == 0, done.err
     assert "nothing to do" in done.out  # the copy has the recording already
     assert list_recordings(bucket) == ["01"]
+
+
+@pytest.mark.usefixtures("plain_flows")
+def test_python_adds_to_a_lake_at_an_address(bucket, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(api, "ALL_STEPS", ("ingest",))
+    write_highd(tmp_path / "raw", "01")
+    result = tracklake.run("raw", lake=bucket, cache=tmp_path / "cache")
+    assert result.built == {"ingest": 1}
+    assert list_recordings(bucket) == ["01"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["cache", "raw"]
+    with pytest.raises(UsageError, match="a flow works on a lake in a folder"):
+        RunRequest(bucket, ("ingest",), "raw").check()
 
 
 @pytest.mark.usefixtures("bucket")
