@@ -19,7 +19,7 @@ from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
 
-from tracklake.pipeline.cli.train import read_model_settings
+from tracklake.pipeline.cli.train import _check_name, read_model_settings
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.onboard.as_published import CONSTANT, DIFFERENCE, OURS, PUBLISHED
 
@@ -33,10 +33,15 @@ TINY = Arm(
     (
         Learner("lstm", 2, 200, epochs=1),
         Learner(
-            "lstm", 1, 200, epochs=1, label="elsewhere", source=Source("Others.", file="others.csv.gz", lane_ft=12.0)
+            "lstm",
+            1,
+            200,
+            epochs=1,
+            label="lstm, elsewhere",
+            source=Source("Others.", file="others.csv.gz", lane_ft=12.0),
         ),
     ),
-    pairs=(("elsewhere", "lstm"),),
+    pairs=(("lstm, elsewhere", "lstm"),),
     settings={
         "TRACKLAKE_SPLIT": "time-blocks",
         "TRACKLAKE_SPLITS": '["time-blocks"]',
@@ -84,8 +89,8 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     seeds = read_table(docs, "seeds").filter(group="all", dataset="all")
     assert seeds.group_by("model").agg(pl.col("seed").n_unique()).sort("model").rows() == [
         ("constant-velocity", 1),
-        ("elsewhere", 1),
         ("lstm", 2),
+        ("lstm, elsewhere", 1),
     ]
     lakes = workshop.find_lakes(TINY)
     stated = [row for row in read_table(docs, "lakes").to_dicts() if "elsewhere" not in row["lake"]]
@@ -107,8 +112,10 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     found = {(row["model"], row["against"]): row for row in compared.to_dicts()}
     alone = {model: row["difference"] for (model, against), row in found.items() if against == NOTHING}
     assert alone == {model: row["a_value"] for (model, against), row in found.items() if against == NOTHING}
-    assert set(alone) == {"constant-velocity", "lstm", "elsewhere"}
-    assert found["elsewhere", "lstm"]["difference"] == pytest.approx(alone["elsewhere"] - alone["lstm"], abs=2e-5)
+    assert set(alone) == {"constant-velocity", "lstm", "lstm, elsewhere"}
+    assert found["lstm, elsewhere", "lstm"]["difference"] == pytest.approx(
+        alone["lstm, elsewhere"] - alone["lstm"], abs=2e-5
+    )
     found = found["lstm", "constant-velocity"]
     assert found["difference"] == pytest.approx(alone["lstm"] - alone["constant-velocity"], abs=2e-5)
     assert found["a_value"] == pytest.approx(seeds.filter(model="lstm", seconds=1.0)["rmse_m"].mean(), abs=1e-4)
@@ -139,7 +146,7 @@ def test_a_run_with_other_defaults_than_now_is_made_again(tiny, tmp_path, monkey
     for changed in ({"parameters": {**lstm.parameters, "hidden": 24}}, {"recipe": replace(lstm.recipe, batch_size=64)}):
         monkeypatch.setitem(MODELS, "lstm", replace(lstm, **changed))
         jobs = list(other.list_jobs(TINY))
-        assert {job.model for job in jobs if not job.is_done} == {"lstm", "elsewhere"}
+        assert {job.model for job in jobs if not job.is_done} == {"lstm", "lstm, elsewhere"}
         assert {job.model for job in select_complete(jobs, 2)} == {"constant-velocity"}
     other.work_on(jobs)
     trained = [words for words in said if words[0] == "train"]
@@ -324,11 +331,13 @@ def test_the_plan_stays_within_four_hours_and_names_every_arm_once():
     assert sum(minutes for _, minutes in estimate_pieces(map(make_quick, PIECES)).values()) < 10
 
 
-def test_every_setting_of_the_plan_is_one_of_its_model():
+def test_every_setting_of_the_plan_is_one_of_its_model_and_every_name_that_of_a_run():
     learners = {own.name: own for piece in PIECES for arm in piece.arms for own in arm.learners}
     for own in learners.values():
         settings = [word for option, word in pairwise(own.options) if option == "--set"]
         assert read_model_settings(find_model(own.model), settings) or not settings, own.name
+        run = Job(Lake(TINY, 0, Path("lakes/a"), "digest", {}), own.name, own, 0).run
+        assert _check_name(run, own.model) == run
 
 
 def test_the_plan_is_printed_and_an_unknown_piece_refused(capsys, tmp_path):

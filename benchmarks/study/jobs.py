@@ -5,6 +5,7 @@ import gzip
 import hashlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -107,8 +108,9 @@ class Job:
 
     @property
     def run(self) -> str:
-        """Name of the run in its lake."""
-        return f"{self.model}-seed{self.seed}-{self.training}" if self.learner else self.model
+        """Name of the run in its lake: that of its model, without what a run's name cannot hold."""
+        name = re.sub(r"[^\w.-]+", "-", self.model)
+        return f"{name}-seed{self.seed}-{self.training}" if self.learner else self.model
 
     @property
     def run_folder(self) -> Path:
