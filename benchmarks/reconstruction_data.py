@@ -15,7 +15,7 @@ from reconstruction_scores import Scene
 
 from tracklake.pipeline import synthetic
 from tracklake.pipeline.lake import load, scan
-from tracklake.pipeline.synthetic import build
+from tracklake.pipeline.synthetic import simulation
 from tracklake.pipeline.transforms.reconstruction.config import BOUNDS, DEFAULT_CLASS, ReconstructionConfig
 from tracklake.pipeline.transforms.reconstruction.reconstruction import reconstruct
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
@@ -41,7 +41,7 @@ class Recording:
 def write_samples(folder: Path, models: Mapping[str, tuple[str, ...]], minutes: float, seed: int) -> None:
     """Write and ingest a sample and a lake by noise model; all have the same traffic, which is simulated once."""
     simulated: dict[str, pl.DataFrame] = {}
-    simulate = build.simulate
+    simulate = simulation.simulate
 
     def look_up(home: Path, inside: Path, road: object, traffic: object, *, frames: int, seed: int) -> pl.DataFrame:
         key = repr((road, traffic, frames, seed))
@@ -49,7 +49,7 @@ def write_samples(folder: Path, models: Mapping[str, tuple[str, ...]], minutes: 
             simulated[key] = simulate(home, inside, road, traffic, frames=frames, seed=seed)
         return simulated[key]
 
-    with mock.patch.object(build, "simulate", look_up):
+    with mock.patch.object(simulation, "simulate", look_up):
         for name, noise in models.items():
             source = folder / f"{name}-{seed}"
             if not source.exists():

@@ -1,11 +1,9 @@
 """Steps of making a sample: simulate, add noise, inject defects, write files, read them back, list the truth."""
 
 import math
-from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import polars as pl
@@ -17,23 +15,16 @@ from tracklake.pipeline.synthetic.noise import DRONE, MAST, add_noise
 from tracklake.pipeline.synthetic.plain_formats import PLAIN, list_first_frames, write_format
 from tracklake.pipeline.synthetic.scenarios import (
     DRIVES,
-    FREEWAY,
     HIGHD,
-    NGSIM_CSV,
-    NGSIM_SOCRATA,
-    NGSIM_TEXT,
     Dose,
     HighdScenario,
     Job,
     NgsimScenario,
     plan_dose,
 )
-from tracklake.pipeline.synthetic.sumo import find_sumo, simulate, stop_programs
+from tracklake.pipeline.synthetic.simulation import NGSIM_FILES, find_driven, list_jobs, list_pair, simulate_all
+from tracklake.pipeline.synthetic.sumo import find_sumo
 
-AT_ONCE = 2
-"""Simulations that run at the same time; each is a process with one thread."""
-STOP_POLL_S = 0.05
-"""Time between two attempts to end what is still simulated, in seconds."""
 BOM = b"\xef\xbb\xbf"
 TRUTH_FILE, TRUE_TRACKS_FILE = "truth.parquet", "true_tracks.parquet"
 README_FILE = "README.md"
@@ -69,71 +60,92 @@ def build_sample(
     """
     home = find_sumo()
     recordings: tuple[HighdScenario, ...] = HIGHD if "highd" in formats else ()
-    groups: list[tuple[str, str, tuple[NgsimScenario, ...]]] = [
-        (kind, file, scenarios)
-        for kind, file, scenarios in (
-            ("ngsim-text", "trajectories-us-101-0930.txt", NGSIM_TEXT),
-            ("socrata", "us-101-export.csv", NGSIM_SOCRATA),
-            ("ngsim-csv", "trajectories-us-101-1015.csv", NGSIM_CSV),
-        )
-        if kind in formats
-    ]
+    groups = [own for own in NGSIM_FILES if own[0] in formats]
     driven = DRIVES in formats
     plain = {name: PLAIN[name].list_jobs(minutes) for name in formats if name in PLAIN}
-    listed = _list_jobs(recordings if not driven or recordings else _find_driven(), groups, minutes)
+    listed = list_jobs(recordings if not driven or recordings else find_driven(), groups, minutes)
     listed += [job for own in plain.values() for job in own]
     jobs = [replace(job, traffic=replace(job.traffic, drivers=traffic)) for job in listed]
     progress(f"simulating {len(jobs)} carriageways")
-    clean = _simulate_all(home, jobs, seed, progress)
+    clean = simulate_all(home, jobs, seed, progress)
     if dose is not None:
         recordings = tuple(replace(scenario, damaged=False) for scenario in recordings)
         plans = (plan_dose(dose, clean[job.subset]["vehicle"].n_unique()) for job in jobs)
         jobs = [replace(job, traffic=replace(job.traffic, plan=plan)) for job, plan in zip(jobs, plans, strict=True)]
-    found = truth.Found()
-    rows: list[dict[str, object]] = []
-    true: list[pl.DataFrame] = []
+    sample = _Sample(folder, seed, noise, jobs, clean)
     for scenario in recordings:
         progress(f"writing highD recording {scenario.recording}")
-        pair = _list_pair(jobs, scenario.recording)
-        tracks = _number_vehicles(pair, clean)
-        rows += _write_highd(folder, scenario, pair, tracks, seed, noise)
-        truth.read_highd(folder, scenario.recording, found)
-        true += [_find_true_tracks(job, tracks[job.subset], found) for job in pair]
+        sample.add_highd(scenario)
     for kind, file, scenarios in groups:
         progress(f"writing {file}")
-        of_file = [job for job in jobs if job.file == file]
-        numbered = _shift_vehicles(scenarios, of_file, clean)
-        rows += _write_ngsim(folder, kind, file, scenarios, of_file, numbered, seed, noise, damaged=dose is None)
-        true += [_find_true_tracks(job, numbered[job.subset], found) for job in of_file]
-        names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
-        truth.read_ngsim(folder / file, names, found)
+        sample.add_ngsim(kind, file, scenarios, damaged=dose is None)
     for name, own in plain.items():
         progress(f"writing {name}")
         counts, firsts = write_format(folder, name, own, clean, seed, noise)
-        found.files += counts
-        rows += firsts
+        sample.found.files += counts
+        sample.rows += firsts
     for drive in drives.SCENARIOS if driven else ():
         progress(f"writing {drive.folder}")
-        pair = _list_pair(jobs, drives.RECORDING)
-        tracks = _number_vehicles(pair, clean)
-        rows += drives.write_drive(folder, drive, tracks[drive.subset], pair[0].road.rate_hz, seed)
+        sample.add_drive(drive)
     progress("writing the truth")
+    rows = sample.rows + ([] if dose is None else _measure_dose(dose, jobs, sample.rows))
     # What each rule has to find is counted where today's tests compare it; the loops take as long as all the rest.
-    counted = found if traffic == UNIFORM and dose is None else replace(found, entries={})
-    rows += [] if dose is None else _measure_dose(dose, jobs, rows)
-    truth.build_truth(rows + truth.list_counts(counted)).write_parquet(folder / TRUTH_FILE)
-    pl.concat([pl.DataFrame(schema=true_tracks.TRUE_TRACKS_SCHEMA), *true]).sort(
-        "dataset", "subset", "vehicle_id", "frame"
-    ).write_parquet(folder / TRUE_TRACKS_FILE)
+    sample.write_truth(rows, with_rules=traffic == UNIFORM and dose is None)
     named = " and ".join(noise) or "no"
     named += " noise" if traffic == UNIFORM else f" noise, {traffic} traffic"
     named += "" if dose is None else f", of the defects only {dose.defect}, of {dose.share:g} of the vehicles"
     text = README.format(seed=seed, minutes=minutes, noise=named)
     (folder / README_FILE).write_text(text, encoding="utf-8")
-    lines = sum(count.read for count in found.files if not count.file.endswith("Meta.csv"))
+    lines = sum(count.read for count in sample.found.files if not count.file.endswith("Meta.csv"))
     count = len(recordings) + sum(len(scenarios) for _, _, scenarios in groups)
     count += len({job.recording for own in plain.values() for job in own})
     return lines, count + driven * len(drives.SCENARIOS), _find_share(rows) if dose is not None else None
+
+
+@dataclass
+class _Sample:
+    """A sample as far as it is written: rows of its truth, its true tracks, and the contents read back."""
+
+    folder: Path
+    seed: int
+    noise: tuple[str, ...]
+    jobs: list[Job]
+    clean: dict[str, pl.DataFrame]
+    rows: list[dict[str, object]] = field(default_factory=list)
+    true: list[pl.DataFrame] = field(default_factory=list)
+    found: truth.Found = field(default_factory=truth.Found)
+
+    def add_highd(self, scenario: HighdScenario) -> None:
+        """Write a recording in highD's format."""
+        pair = list_pair(self.jobs, scenario.recording)
+        tracks = _number_vehicles(pair, self.clean)
+        self.rows += _write_highd(self.folder, scenario, pair, tracks, self.seed, self.noise)
+        truth.read_highd(self.folder, scenario.recording, self.found)
+        self.true += [_find_true_tracks(job, tracks[job.subset], self.found) for job in pair]
+
+    def add_ngsim(self, kind: str, file: str, scenarios: tuple[NgsimScenario, ...], *, damaged: bool) -> None:
+        """Write an NGSIM file; `damaged` also inserts duplicates and malformed lines."""
+        jobs = [job for job in self.jobs if job.file == file]
+        tracks = _shift_vehicles(scenarios, jobs, self.clean)
+        written = (self.folder, kind, file, scenarios, jobs, tracks, self.seed, self.noise)
+        self.rows += _write_ngsim(*written, damaged=damaged)
+        self.true += [_find_true_tracks(job, tracks[job.subset], self.found) for job in jobs]
+        names = {ngsim.compute_time_key(each.start_time): ngsim.name_recording(each.start_time) for each in scenarios}
+        truth.read_ngsim(self.folder / file, names, self.found)
+
+    def add_drive(self, drive: drives.DriveScenario) -> None:
+        """Write the drive of an instrumented vehicle."""
+        pair = list_pair(self.jobs, drives.RECORDING)
+        tracks = _number_vehicles(pair, self.clean)[drive.subset]
+        self.rows += drives.write_drive(self.folder, drive, tracks, pair[0].road.rate_hz, self.seed)
+
+    def write_truth(self, rows: list[dict[str, object]], *, with_rules: bool) -> None:
+        """Write the truth and the true tracks; `with_rules` also counts what each rule has to find."""
+        counted = self.found if with_rules else replace(self.found, entries={})
+        truth.build_truth(rows + truth.list_counts(counted)).write_parquet(self.folder / TRUTH_FILE)
+        pl.concat([pl.DataFrame(schema=true_tracks.TRUE_TRACKS_SCHEMA), *self.true]).sort(
+            "dataset", "subset", "vehicle_id", "frame"
+        ).write_parquet(self.folder / TRUE_TRACKS_FILE)
 
 
 def _measure_dose(dose: Dose, jobs: list[Job], rows: list[dict[str, object]]) -> list[dict[str, object]]:
@@ -160,67 +172,6 @@ def _find_share(rows: list[dict[str, object]]) -> float:
     """Find the share of all vehicles that have the defect."""
     table = truth.build_truth(rows)
     return float(table.filter(kind="dose")["vehicles"].sum() / max(1, table.filter(kind="first_frame").height))
-
-
-def _find_driven() -> tuple[HighdScenario, ...]:
-    """Return the recording whose vehicles are instrumented."""
-    return tuple(scenario for scenario in HIGHD if scenario.recording == drives.RECORDING)
-
-
-def _list_pair(jobs: list[Job], recording: str) -> list[Job]:
-    """Return both carriageways of a recording in highD's format."""
-    return [job for job in jobs if job.dataset == "highd" and job.recording == recording]
-
-
-def _list_jobs(
-    recordings: tuple[HighdScenario, ...], groups: list[tuple[str, str, tuple[NgsimScenario, ...]]], minutes: float
-) -> list[Job]:
-    jobs = []
-    for place, scenario in enumerate(HIGHD):
-        if scenario not in recordings:
-            continue
-        frames = max(1, round(scenario.share * minutes * 60 * scenario.road.rate_hz))
-        for side, traffic in (("upper", scenario.upper), ("lower", scenario.lower)):
-            name, index = scenario.recording, 2 * place + (side == "lower")
-            file = f"{name}_tracks.csv"
-            jobs.append(Job("highd", name, f"{name}-{side}", file, index, scenario.road, traffic, frames))
-    order = {each.start_time: 100 + i for i, each in enumerate(NGSIM_TEXT + NGSIM_SOCRATA + NGSIM_CSV)}
-    for _, file, scenarios in groups:
-        for each in scenarios:
-            frames = max(1, round(each.share * minutes * 60 * FREEWAY.rate_hz))
-            name = ngsim.name_recording(each.start_time)
-            jobs.append(Job("ngsim", name, name, file, order[each.start_time], FREEWAY, each.traffic, frames))
-    return jobs
-
-
-def _simulate_all(home: Path, jobs: list[Job], seed: int, progress: Callable[[str], None]) -> dict[str, pl.DataFrame]:
-    def simulate_job(job: Job, folder: Path) -> pl.DataFrame:
-        own_folder = folder / job.subset
-        own_folder.mkdir()
-        # SUMO's seed is a non-negative 32-bit number.
-        own_seed = int(np.random.default_rng([seed, job.index, 0]).integers(2**31))
-        return simulate(home, own_folder, job.road, job.traffic, frames=job.frames, seed=own_seed)
-
-    with TemporaryDirectory(prefix="tracklake-sample-") as folder, ThreadPoolExecutor(AT_ONCE) as pool:
-        # Congested traffic takes longest and starts first.
-        slowest = sorted(jobs, key=lambda job: job.traffic.bottleneck_mps is None)
-        waiting = {pool.submit(simulate_job, job, Path(folder)): job.subset for job in slowest}
-        try:
-            for done, future in enumerate(as_completed(waiting), start=1):
-                future.result()
-                progress(f"simulated {waiting[future]} ({done}/{len(waiting)})")
-        except BaseException:
-            _stop(waiting)
-            raise
-    return {subset: future.result() for future, subset in waiting.items()}
-
-
-def _stop(simulations: Collection[Future[pl.DataFrame]]) -> None:
-    """End simulations at once, or an interrupt would wait for the longest of them."""
-    for simulation in simulations:
-        simulation.cancel()
-    while wait(simulations, timeout=STOP_POLL_S).not_done:
-        stop_programs()
 
 
 def _damage_tracks(

@@ -7,10 +7,10 @@ from unittest import mock
 
 import polars as pl
 
-from tracklake.pipeline.synthetic import build, truth
+from tracklake.pipeline.synthetic import simulation, truth
 from tracklake.pipeline.synthetic.scenery import Entry, Key, Surface
 
-simulate = build.simulate
+simulate = simulation.simulate
 simulated: dict[str, pl.DataFrame] = {}
 """Tracks by the arguments of the simulation that made them."""
 count_rules = truth.count_rules
@@ -44,5 +44,5 @@ def count_once() -> Iterator[None]:
 @contextmanager
 def simulate_once() -> Iterator[None]:
     """Let samples made in this block share their simulations and counts."""
-    with count_once(), mock.patch.object(build, "simulate", look_up):
+    with count_once(), mock.patch.object(simulation, "simulate", look_up):
         yield
