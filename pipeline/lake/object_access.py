@@ -5,6 +5,7 @@ cloud's own chain: none passes through here.
 """
 
 import os
+import ssl
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -110,6 +111,12 @@ def admit_place(connection: "duckdb.DuckDBPyConnection", place: LakePlace) -> No
         connection.execute(f"LOAD {quote(str(find_extension(name, 'object-store')))}")
     for setting in SECRET_SETTINGS:
         connection.execute(f"SET GLOBAL {setting} = ''")  # also for its cursors
+    for setting, value in {
+        "enable_http_metadata_cache": "true",  # objects are never replaced, and need be looked at once only
+        "enable_server_cert_verification": "true",  # off by default
+        "ca_cert_file": quote(os.environ.get("SSL_CERT_FILE") or ssl.get_default_verify_paths().cafile or ""),
+    }.items():
+        connection.execute(f"SET GLOBAL {setting} = {value}")
     options = {"REGION": endpoint.region, "SCOPE": place, "ENDPOINT": endpoint.host}
     if endpoint.host:
         options |= {"URL_STYLE": "path", "USE_SSL": str(not endpoint.is_plain).lower()}

@@ -275,6 +275,7 @@ def test_credentials_are_written_and_shown_nowhere(folder, bucket, tmp_path, mon
         settings += repr(there.sql("SELECT current_setting('s3_secret_access_key')").fetchall())
         assert KEY_ID not in settings
         assert SECRET not in settings
+        assert there.sql("SELECT current_setting('enable_server_cert_verification')").fetchone() == (True,)
         with pytest.raises(QueryError, match="not available here"):
             there.sql("FROM duckdb_secrets()")
         with pytest.raises(QueryError, match="disabled by configuration"):
