@@ -101,15 +101,16 @@ def work_in_folder(terminal: Terminal, settings: Settings) -> Iterator[Settings]
         return
     copy = WorkingCopy(address, name_copy(address, settings.cache))
     terminal.print_line(f"working in {copy.folder}, a copy of {address}", style="dim")
-    received = copy.fetch()
-    if received is not None and received.files:
-        terminal.print_line(f"fetched {received.files:,} files, {received.bytes / 1e6:,.1f} MB", style="dim")
-    try:
-        yield settings.model_copy(update={"lake": copy.folder})
-    except typer.Exit:  # some files were refused, or a stage failed: what is done counts, as in a folder
+    with copy.hold():
+        received = copy.fetch()
+        if received is not None and received.files:
+            terminal.print_line(f"fetched {received.files:,} files, {received.bytes / 1e6:,.1f} MB", style="dim")
+        try:
+            yield settings.model_copy(update={"lake": copy.folder})
+        except typer.Exit:  # some files were refused, or a stage failed: what is done counts, as in a folder
+            _publish(terminal, copy)
+            raise
         _publish(terminal, copy)
-        raise
-    _publish(terminal, copy)
 
 
 def _publish(terminal: Terminal, copy: WorkingCopy) -> None:

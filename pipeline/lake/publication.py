@@ -25,6 +25,7 @@ from tracklake.pipeline.lake.errors import (
 )
 from tracklake.pipeline.lake.files import STORE, TENSORS
 from tracklake.pipeline.lake.history import ROOTS, list_roots, name_root, read_kept_root
+from tracklake.pipeline.lake.lease import LEASE
 from tracklake.pipeline.lake.manifest import (
     MANIFEST,
     Commit,
@@ -164,7 +165,7 @@ def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = Fals
     except LakeMissingError:
         owner = _read_marker(store)
     if owner is None:
-        other = next(store.list(), None)
+        other = next((item for item in store.list() if item.path != LEASE), None)
         if other is not None:
             raise LakeError(
                 f"{store.place}: holds other objects, such as {other.path}, and no lake. Name an empty or new folder "
@@ -200,7 +201,7 @@ def sweep_objects(address: str) -> int:
     objects = [*store.list()]
     young = {item.path for item in objects if item.modified > datetime.now(UTC) - GRACE}
     others = (read_kept_root(store, path) for path in young if path.startswith(f"{ROOTS}/"))
-    needed = {MANIFEST, MARKER}
+    needed = {MANIFEST, MARKER, LEASE}
     for document in (*list_roots(address), *(each for each in others if each is not None)):
         needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
         commits = parse_manifest(address, collect_document(address, document)).commits.values()

@@ -1,10 +1,14 @@
 """The copy of a lake on an object store in a folder of this machine, on which stages work."""
 
 import os
+import platform
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tracklake.pipeline.lake.errors import LakeError, LakeMissingError
+from tracklake.pipeline.lake.lease import hold_lease
 from tracklake.pipeline.lake.manifest import MANIFEST
 from tracklake.pipeline.lake.places import open_store
 from tracklake.pipeline.lake.publication import Transfer, claim_place, fetch_lake, is_synced, publish_lake, was_synced
@@ -27,14 +31,25 @@ class WorkingCopy:
         self.address = address
         self.folder = folder
 
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Keep other processes from working on this lake meanwhile, as their work could be refused at its end.
+
+        Raises:
+            LakeLockedError: another process works on it.
+            LakeError: the place holds something else.
+        """
+        store = open_store(self.address)
+        claim_place(store, None)
+        with hold_lease(store, f"process {os.getpid()} on {platform.node()}"):
+            yield
+
     def fetch(self) -> Transfer | None:
         """Bring the copy up to date; None: it is, or what was broken off in it is to be gone on with.
 
         Raises:
-            LakeError: the place holds something else; or it has changed, and the copy has results of its own.
+            LakeError: it has changed, and the copy has results of its own.
         """
-        store = open_store(self.address)
-        claim_place(store, None)
         try:
             if is_synced(self.folder, self.address, remote=True):
                 return None

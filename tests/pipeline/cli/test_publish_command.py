@@ -9,6 +9,8 @@ from small_recordings import write_highd
 
 import tracklake
 from tracklake.pipeline.lake import LakeMissingError, load
+from tracklake.pipeline.lake.lease import hold_lease
+from tracklake.pipeline.lake.places import open_store
 from tracklake.pipeline.orchestration import api
 from tracklake.pipeline.orchestration.run_plan import RunRequest
 from tracklake.schemas.errors import UsageError
@@ -100,6 +102,14 @@ def test_two_machines_add_recordings_to_one_lake(machine, bucket, tmp_path):
     assert "nothing to do" in idle.out
     (copy,) = (tmp_path / "one").glob("tracklake/*/lake")
     assert list_recordings(copy) == ["01", "02"]
+
+
+def test_a_second_machine_is_told_at_once_who_works_on_the_lake(machine, bucket, tmp_path):
+    write_highd(tmp_path / "raw", "01")
+    with hold_lease(open_store(bucket), "process 7 on north"):
+        done = machine("two", "ingest", tmp_path / "raw", "--lake", bucket)
+    assert (done.code, "process 7 on north is writing to this lake" in done.err) == (1, True)
+    assert [*open_store(bucket).list()] == [], "nothing was left there"
 
 
 @pytest.mark.usefixtures("plain_flows")
