@@ -32,20 +32,22 @@ class WorkingCopy:
         self.folder = folder
 
     @contextmanager
-    def hold(self) -> Iterator[None]:
-        """Keep other processes from working on this lake meanwhile, as their work could be refused at its end.
+    def hold(self) -> Iterator[Transfer | None]:
+        """Keep other processes from working on this lake meanwhile, and bring the copy up to date first.
+
+        Yields what was received; None: the copy is up to date, or what was broken off in it is to be gone on with.
 
         Raises:
-            LakeLockedError: another process works on it.
-            LakeError: the place holds something else.
+            LakeLockedError: another process works on the lake.
+            LakeError: the place holds something else; or it has changed, and the copy has results of its own.
         """
         store = open_store(self.address)
         claim_place(store, None)
         with hold_lease(store, f"process {os.getpid()} on {platform.node()}"):
-            yield
+            yield self._fetch()
 
-    def fetch(self) -> Transfer | None:
-        """Bring the copy up to date; None: it is, or what was broken off in it is to be gone on with.
+    def _fetch(self) -> Transfer | None:
+        """Bring the copy up to date; see `hold`.
 
         Raises:
             LakeError: it has changed, and the copy has results of its own.

@@ -57,10 +57,10 @@ def run(
         result = _run_in_folder(chosen, source, dataset, replace, prune, rebuild)
     else:
         copy = WorkingCopy(address, name_copy(address, chosen.cache))
-        copy.fetch()
-        in_copy = chosen.model_copy(update={"lake": copy.folder})
-        result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
-        copy.publish()
+        with copy.hold():
+            in_copy = chosen.model_copy(update={"lake": copy.folder})
+            result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
+            copy.publish()
     if result.failed:
         raise LakeError("\n".join(result.failed))
     return result
