@@ -15,6 +15,7 @@ from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.ingest.staleness import StageState, describe_stages
 from tracklake.pipeline.lake import Manifest, connect, load
 from tracklake.pipeline.lake.catalog import CATALOG
+from tracklake.pipeline.lake.ducklake import DUCKLAKE
 from tracklake.pipeline.lake.files import MODELS, REPORTS, STORE, TABLE_BY_NAME, TENSORS
 from tracklake.pipeline.lake.history import list_generations
 from tracklake.pipeline.lake.object_access import name_object
@@ -111,7 +112,7 @@ def measure_sizes(place: LakePlace, manifest: Manifest) -> dict[str, int]:
                     continue
                 seen.add((status.st_dev, status.st_ino))
                 is_replaced = top in (STORE, TENSORS) and path.relative_to(root).as_posix() not in live
-                part = "catalog" if path == root / CATALOG else parts.get(top, "others")
+                part = "catalog" if path in (root / CATALOG, root / DUCKLAKE) else parts.get(top, "others")
                 sizes["replaced" if is_replaced else part] += status.st_size
     return sizes | {"total": sum(sizes.values())}
 
