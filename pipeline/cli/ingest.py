@@ -37,6 +37,6 @@ def ingest(
     with command(quiet=quiet, json=json) as terminal:
         named = read_settings(lake=lake, workers=workers, columns=columns, recording=recording, in_folder=False)
         flags: dict[str, Any] = {"replace": replace, "prune": prune, "rebuild": rebuild}
-        with work_in_folder(terminal, named) as settings:
+        with work_in_folder(terminal, named, rebuild=rebuild) as settings:
             outcome = run_steps(terminal, settings, ("ingest",), source, dataset, **flags)
             report_result(terminal, settings, outcome, headline=False)

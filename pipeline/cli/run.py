@@ -57,7 +57,7 @@ def run(
         elif minutes is not None or seed is not None:
             raise typer.BadParameter("--minutes and --seed are for the generated sample, which takes no SOURCE")
         flags = {"replace": replace, "prune": prune, "rebuild": rebuild}
-        with work_in_folder(terminal, named) as settings:
+        with work_in_folder(terminal, named, rebuild=rebuild) as settings:
             files = source or str(provide_sample(settings.lake, minutes, seed, terminal))
             outcome = run_steps(terminal, settings, ALL_STEPS, files, dataset, **flags, check=check)
             report_result(terminal, settings, outcome)

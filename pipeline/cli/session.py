@@ -90,7 +90,7 @@ def run_steps(
 
 
 @contextmanager
-def work_in_folder(terminal: Terminal, settings: Settings) -> Iterator[Settings]:
+def work_in_folder(terminal: Terminal, settings: Settings, *, rebuild: bool = False) -> Iterator[Settings]:
     """Yield settings with the lake in a folder; of a lake on an object store its copy, which is published at the end.
 
     After Ctrl-C or an error nothing is published, and the same command goes on with what the copy holds by then.
@@ -107,13 +107,13 @@ def work_in_folder(terminal: Terminal, settings: Settings) -> Iterator[Settings]
         try:
             yield settings.model_copy(update={"lake": copy.folder})
         except typer.Exit:  # some files were refused, or a stage failed: what is done counts, as in a folder
-            _publish(terminal, copy)
+            _publish(terminal, copy, rebuild)
             raise
-        _publish(terminal, copy)
+        _publish(terminal, copy, rebuild)
 
 
-def _publish(terminal: Terminal, copy: WorkingCopy) -> None:
-    sent = copy.publish()
+def _publish(terminal: Terminal, copy: WorkingCopy, rebuilt: bool) -> None:
+    sent = copy.publish(rebuilt=rebuilt)
     if sent is not None:
         terminal.print_line(f"published {copy.address}: {sent.files:,} files, {sent.bytes / 1e6:,.1f} MB")
 

@@ -128,7 +128,9 @@ def fetch_lake(address: str, root: Path) -> Transfer:
         log = CommitLog(root)
         ours = load(root) if (root / MANIFEST).exists() else Manifest(theirs.lake_id)
         if ours.lake_id != theirs.lake_id:
-            raise LakeError(f"{root}: holds another lake than {address}. Name another folder with --lake.")
+            raise LakeError(
+                f"{root}: holds another lake than {address}. Name another folder with --lake, or delete this one."
+            )
         if not (_includes(theirs, ours) or is_synced(root, address, remote=False)):
             raise LakeError(
                 f"{root}: has results that {address} lacks. Publish them by `tracklake publish store "

@@ -65,9 +65,15 @@ class WorkingCopy:
                 ) from None
             return None
 
-    def publish(self) -> Transfer | None:
-        """Send what was made in the copy, in one commit; None: nothing was made there yet."""
-        return publish_lake(self.folder, self.address) if (self.folder / MANIFEST).exists() else None
+    def publish(self, *, rebuilt: bool = False) -> Transfer | None:
+        """Send what was made in the copy, in one commit; None: nothing was made there yet.
+
+        Args:
+            rebuilt: whether the copy was made again, under a new id, and takes the place of the lake.
+        """
+        if not (self.folder / MANIFEST).exists():
+            return None
+        return publish_lake(self.folder, self.address, replace_other=rebuilt)
 
 
 def name_copy(address: str, cache: Path | None = None) -> Path:

@@ -60,7 +60,7 @@ def run(
         with copy.hold():
             in_copy = chosen.model_copy(update={"lake": copy.folder})
             result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
-            copy.publish()
+            copy.publish(rebuilt=rebuild)
     if result.failed:
         raise LakeError("\n".join(result.failed))
     return result

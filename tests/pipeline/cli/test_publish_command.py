@@ -102,6 +102,11 @@ def test_two_machines_add_recordings_to_one_lake(machine, bucket, tmp_path):
     assert "nothing to do" in idle.out
     (copy,) = (tmp_path / "one").glob("tracklake/*/lake")
     assert list_recordings(copy) == ["01", "02"]
+    rebuilt = machine("one", "ingest", tmp_path / "raw" / "01", "--lake", bucket, "--rebuild", "--replace")
+    assert rebuilt.code == 0, rebuilt.err
+    assert list_recordings(bucket) == ["01"]
+    late = machine("two", "ingest", tmp_path / "raw" / "02", "--lake", bucket)
+    assert (late.code, "holds another lake" in late.err) == (1, True)
 
 
 def test_a_second_machine_is_told_at_once_who_works_on_the_lake(machine, bucket, tmp_path):
