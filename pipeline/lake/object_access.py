@@ -5,7 +5,6 @@ cloud's own chain: none passes through here.
 """
 
 import os
-import ssl
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -102,6 +101,8 @@ def admit_place(connection: "duckdb.DuckDBPyConnection", place: LakePlace) -> No
     """
     if not isinstance(place, str):
         return
+    import ssl
+
     import duckdb
 
     endpoint = find_endpoint(place)
