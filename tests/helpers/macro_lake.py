@@ -1,5 +1,6 @@
 """Subsets of a few entries for the table macros, and how each macro is called on one."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -7,6 +8,7 @@ from known_drive import make_drive
 from small_lake import put
 
 from tracklake.pipeline.lake import open_for_writing
+from tracklake.pipeline.lake.catalog import ADDED
 from tracklake.schemas import BSM, SUBSETS, SURROUNDING, SURROUNDING_TRUTH, TRACKS, VEHICLES, Table
 
 CALLS = {
@@ -70,7 +72,8 @@ def put_subset(
     frames |= {table: drive[table] for table in (BSM, SURROUNDING, SURROUNDING_TRUTH)}
     with open_for_writing(root) as writer:
         for table, frame in frames.items():
-            writer.commit(put(root, f"{table.name}/{dataset}/{subset}", 1, frame, table, **values))
+            commit = put(root, f"{table.name}/{dataset}/{subset}", 1, frame, table, **values)
+            writer.commit(replace(commit, info={ADDED: sorted(table.added)}))
 
 
 PAIRS = [

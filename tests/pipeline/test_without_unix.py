@@ -90,7 +90,7 @@ def test_files_of_a_lake_are_listed_with_slashes(monkeypatch: pytest.MonkeyPatch
 def test_a_folder_above_the_lake_is_no_partition_with_backslashes_either():
     """Otherwise DuckDB would take every row's data set from the folder in which the lake lies."""
     file = SimpleNamespace(path=".files/tracks/dataset=highd/subset=01-upper/part-1.parquet")
-    manifest, root = SimpleNamespace(live=lambda _table: [file]), PureWindowsPath("C:\\dataset=ngsim\\lake")
+    manifest, root = SimpleNamespace(live=lambda _table: [file], commits={}), PureWindowsPath("C:\\dataset=ngsim\\lake")
     select = catalog._write_selects(SimpleNamespace(resolve=lambda: root), manifest)["tracks"]
     assert "CAST('highd' AS VARCHAR)" in select
     assert "hive_partitioning = true" not in select

@@ -24,7 +24,8 @@ from small_recordings import KINDS, write_highd
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import LakeLockedError, LakeMissingError, connect, load, open_for_writing
-from tracklake.pipeline.lake.manifest import Manifest, store_manifest
+from tracklake.pipeline.lake.commit_log import CommitLog
+from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.pipeline.orchestration import artifacts, flows, run_plan, tasks
 from tracklake.pipeline.sources import SourceError
 
@@ -187,7 +188,7 @@ def test_prefect_keeps_no_results_and_the_lake_alone_decides_what_is_done(raw, t
     assert calls == {"04": 1}
     # As if the process had died between the task's end and the commit: the files stay, and are committed.
     written = {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")}
-    store_manifest(root, Manifest(lake_id=finished.lake_id))
+    CommitLog(root).replace(Manifest(lake_id=finished.lake_id))
     assert flows.ingest_files(str(root), str(raw))["built"] == {"ingest": 1}
     assert calls == {"04": 2}
     assert {path: path.stat().st_mtime_ns for path in root.glob("tracks/**/*.parquet")} == written

@@ -312,7 +312,7 @@ def published(entries, vehicles):
         {
             "dataset": "ngsim", "subset": "us-101-0750", "vehicle_id": range(1, vehicles + 1),
             "source_vehicle_id": range(1, vehicles + 1), "class": None, "length_m": None, "width_m": None,
-            "length_range_m": None, "width_range_m": None,
+            "length_range_m": None, "width_range_m": None, "automated": None,
             "first_frame": 1, "last_frame": 1, "entries": [entries - vehicles + 1] + [1] * (vehicles - 1),
             "entries_announced": None, "start_x_m": 0.0, "end_x_m": 0.0, "start_lane": None, "mean_speed_mps": 0.0,
             "lane_changes": None,
