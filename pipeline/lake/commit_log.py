@@ -16,6 +16,7 @@ from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retired
 from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import Changes, append_changes, parse_shards
 from tracklake.schemas import SCHEMA_VERSION
+from tracklake.schemas.hashing import hash_chunks
 
 T = TypeVar("T")
 
@@ -43,6 +44,11 @@ class CommitLog:
     def is_migrated(self) -> bool:
         """Whether manifest.json is a root of shards; one of an earlier layout holds everything itself."""
         return "shards" in self._root
+
+    @property
+    def digest(self) -> str:
+        """Checksum of the root that this process has read or written last; empty: there was none."""
+        return hash_chunks([_encode(self._root)]) if self._root else ""
 
     def replace(self, manifest: Manifest) -> Manifest:
         """Store a manifest in place of the one before, and return what is stored then.

@@ -5,7 +5,8 @@ that no other writer has replaced it: the moment at which readers see the new st
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -18,8 +19,10 @@ from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import (
     AlreadyStoredError,
     DamagedFileError,
+    DamagedShardError,
     LakeError,
     LakeMissingError,
+    LakeVersionError,
     MissingObjectError,
     StoreError,
 )
@@ -37,7 +40,7 @@ from tracklake.pipeline.lake.manifest import (
     parse_manifest,
     read_root,
 )
-from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.object_access import DIGEST_DIGITS, name_object
 from tracklake.pipeline.lake.object_store import refuse_unconditional
 from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import parse_shards
@@ -59,6 +62,11 @@ FETCHING = ".fetching"
 """File of a folder into which a lake is being fetched for the first time: what else is there was put there by us."""
 GRACE = timedelta(days=1)
 """Time for which objects that are no longer needed are kept, for readers of an earlier state and for other writers."""
+OWN_OBJECTS = re.compile(
+    r"manifest/[0-9a-f]{64}\.json|manifest/roots/\d+\.json|\.probe-[^/]*"
+    rf"|(\.files|tensors|reports|models)/.*\.[0-9a-f]{{{DIGEST_DIGITS}}}(\.[^./]*)?"
+)
+"""Names of the objects that a lake makes and may delete. Others stay, also those of a lake in a folder below it."""
 TRANSFERS = 8
 """Files that are sent or received at once."""
 
@@ -72,37 +80,49 @@ class Transfer(NamedTuple):
     generation: int
 
 
-def publish_lake(root: Path, address: str, *, replace_other: bool = False) -> Transfer:
+def publish_lake(root: Path, address: str, *, replace_other: bool = False, expected: str | None = None) -> Transfer:
     """Make the lake at an address the same as the one in a folder, in one commit.
 
     Args:
         root: the lake's folder.
         address: place on an object store: empty, or with an earlier state of this lake.
         replace_other: whether another lake, or a state with work that the folder lacks, is replaced as well.
+        expected: checksum of the manifest's root that is to be replaced (empty: there is none); None: any.
 
     Raises:
         StoreError: the store cannot be used, or does not guard against two writers.
         DamagedFileError: a file in the folder is not as it was committed.
         LakeError: something else is there, or another writer changed the same meanwhile.
     """
+    local = hash_root(root)  # before what it lists is read: an older one only costs a comparison next time
     manifest = load(root)
     store = open_store(address)
     claim_place(store, manifest.lake_id, replace_other=replace_other)
-    log = CommitLog(address)
-    before = log.manifest if log.manifest.lake_id == manifest.lake_id else Manifest(manifest.lake_id)
+    log, generation = _open_log(address, replace_other=replace_other)
+    if expected is not None and log.digest != expected:
+        raise LakeError(
+            f"{address}: another process has published meanwhile, and a rebuild would remove its results. Run the same "
+            "command again."
+        )
+    is_same = log.manifest.lake_id == manifest.lake_id
+    before = log.manifest if is_same else Manifest(manifest.lake_id, generation=generation)
     sealed = replace(manifest, commits={key: _seal(root, commit) for key, commit in manifest.commits.items()})
     if not (replace_other or is_synced(root, address, remote=True) or _includes(sealed, before)):
+        if not _includes(before, sealed):
+            raise LakeError(_describe_fork(root, address))
         raise LakeError(
             f"{address}: has results that {root} lacks; it was published from elsewhere. Get them by `tracklake fetch "
             f"{quote_shell(address)} --lake {quote_shell(root)}`, or give --replace to remove them."
         )
-    after = replace(_mirror(before, sealed), retired=(), ingested_from=())  # paths of this machine stay here
+    # Paths of this machine stay here.
+    after = replace(_mirror(before, sealed), retired=(), ingested_from=(), retention=sealed.retention)
     live = {name_object(file): file for commit in after.commits.values() for file in commit.all_files}
-    sent = _upload(store, root, live)
-    if (after.commits, after.sources) != (log.manifest.commits, log.manifest.sources):
+    there = {name_object(file) for commit in before.commits.values() for file in commit.all_files}
+    sent = _upload(store, root, live, there)
+    if _list_content(after) != _list_content(log.manifest):
         after = log.replace(after)
     if after.commits == sealed.commits:
-        _record_agreement(root, address)
+        _record_agreement(root, address, local, log.digest)
     return Transfer(len(sent), sum(file.bytes for file in sent), sweep_objects(address), after.generation)
 
 
@@ -118,6 +138,7 @@ def fetch_lake(address: str, root: Path) -> Transfer:
         LakeError: the folder holds something else, or results that were not published.
         DamagedFileError: an object is not what was uploaded.
     """
+    remote = hash_root(address)  # before what it lists is read, as in `publish_lake`
     theirs = load(address)
     store = open_store(address)
     if not (root / FETCHING).exists():
@@ -132,6 +153,8 @@ def fetch_lake(address: str, root: Path) -> Transfer:
                 f"{root}: holds another lake than {address}. Name another folder with --lake, or delete this one."
             )
         if not (_includes(theirs, ours) or is_synced(root, address, remote=False)):
+            if not _includes(ours, theirs):
+                raise LakeError(_describe_fork(root, address))
             raise LakeError(
                 f"{root}: has results that {address} lacks. Publish them by `tracklake publish store "
                 f"{quote_shell(address)} --lake {quote_shell(root)}`, or name another folder with --lake."
@@ -143,7 +166,9 @@ def fetch_lake(address: str, root: Path) -> Transfer:
         (root / FETCHING).unlink(missing_ok=True)
     with open_for_writing(root):
         pass  # brings the folders of the tables and the catalog up to date
-    _record_agreement(root, address)
+    local = hash_root(root)
+    if load(root).commits == after.commits:
+        _record_agreement(root, address, local, remote)
     return Transfer(len(received), sum(file.bytes for file in received), 0, theirs.generation)
 
 
@@ -194,7 +219,7 @@ def _read_marker(store: Store) -> str | None:
 
 
 def sweep_objects(address: str) -> int:
-    """Delete the objects that no kept state of a lake needs; returns how many.
+    """Delete the objects of a lake that none of its kept states needs; returns how many.
 
     States are kept as in a folder, and for a day. What is younger than a day is kept, too: another writer may be about
     to commit it.
@@ -208,9 +233,34 @@ def sweep_objects(address: str) -> int:
         needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
         commits = parse_manifest(address, collect_document(address, document)).commits.values()
         needed |= {name_object(file) for commit in commits for file in commit.all_files}
-    old = [item.path for item in objects if item.path not in needed | young]
+    old = [item.path for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)]
     store.delete(old)
     return len(old)
+
+
+def _open_log(address: str, *, replace_other: bool) -> tuple[CommitLog, int]:
+    """Return what is stored at an address, and its generation; what cannot be read counts as nothing if it may go."""
+    try:
+        log = CommitLog(address)
+    except (LakeVersionError, DamagedShardError):
+        if not replace_other:
+            raise
+        return CommitLog(address, is_rebuild=True), int(read_root(address).get("generation", 0))
+    return log, log.manifest.generation
+
+
+def _list_content(manifest: Manifest) -> tuple[object, ...]:
+    """Return what of a manifest is published."""
+    return manifest.lake_id, manifest.commits, manifest.sources, manifest.retention
+
+
+def _describe_fork(root: Path, address: str) -> str:
+    """Return the message where a folder and an address have results that the other lacks."""
+    return (
+        f"{address} and {root}: each has results that the other lacks. Fetch the former into another folder by "
+        f"`tracklake fetch {quote_shell(address)} --lake OTHER`, make what is missing there by `tracklake run SOURCE "
+        f"--lake OTHER`, and publish that one. {root} can be deleted then."
+    )
 
 
 def _seal(root: Path, commit: Commit) -> Commit:
@@ -257,22 +307,27 @@ def _mirror(before: Manifest, wanted: Manifest) -> Manifest:
     return replace(after, sources=wanted.sources)
 
 
-def _upload(store: Store, root: Path, live: Mapping[str, LakeFile]) -> list[LakeFile]:
-    """Send the files that are not there yet, by the names of their objects, and make sure that all are there then."""
+def _upload(store: Store, root: Path, live: Mapping[str, LakeFile], kept: Collection[str]) -> list[LakeFile]:
+    """Send the files that are not there yet, by the names of their objects, and make sure that all are there then.
+
+    Old objects that the lake does not need now (`kept` are those it needs) are sent again: another process may be about
+    to delete them.
+    """
 
     def send(name: str) -> None:
         verify_files(root, [live[name]])
         store.upload(name, root / live[name].path)
 
-    missing = _find_missing(store, live)
+    missing = _find_missing(store, live, kept)
     _transfer(send, missing)
-    if missing and (lost := _find_missing(store, live)):
+    if missing and (lost := _find_missing(store, live, live)):
         raise StoreError(f"{store.place}/{lost[0]}: was deleted while the lake was published. Run the command again.")
     return [live[name] for name in missing]
 
 
-def _find_missing(store: Store, live: Mapping[str, LakeFile]) -> list[str]:
-    there = {item.path: item.bytes for item in store.list()}
+def _find_missing(store: Store, live: Mapping[str, LakeFile], kept: Collection[str]) -> list[str]:
+    recent = datetime.now(UTC) - GRACE / 2
+    there = {item.path: item.bytes for item in store.list() if item.path in kept or item.modified >= recent}
     return [name for name, file in live.items() if there.get(name) != file.bytes]
 
 
@@ -306,9 +361,12 @@ def _transfer(function: Callable[[T], None], items: Iterable[T]) -> None:
         pool.shutdown(cancel_futures=True)
 
 
-def _record_agreement(root: Path, address: str) -> None:
-    """Record that a folder and an address hold the same; without it, the next transfer compares what both hold."""
-    recorded = {**_read_agreements(root), address: [_hash_root(root), _hash_root(address)]}
+def _record_agreement(root: Path, address: str, local: str | None, remote: str | None) -> None:
+    """Record by the checksums of both roots that a folder and an address held the same.
+
+    Without it, the next transfer compares what both hold.
+    """
+    recorded = {**_read_agreements(root), address: [local, remote]}
     with suppress(TracklakeError):
         write_file(root / SYNCED, json.dumps(recorded).encode())
 
@@ -316,7 +374,7 @@ def _record_agreement(root: Path, address: str) -> None:
 def is_synced(root: Path, address: str, *, remote: bool) -> bool:
     """Return whether the lake at an address, or else in a folder, is as it was when both last agreed."""
     recorded = _read_agreements(root).get(address)
-    return recorded is not None and recorded[remote] == _hash_root(address if remote else root)
+    return recorded is not None and recorded[remote] == hash_root(address if remote else root)
 
 
 def was_synced(root: Path, address: str) -> bool:
@@ -331,7 +389,7 @@ def _read_agreements(root: Path) -> dict[str, Any]:
         return {}
 
 
-def _hash_root(place: LakePlace) -> str | None:
+def hash_root(place: LakePlace) -> str | None:
     """Return the checksum of the root of a lake's manifest; None: there is no lake."""
     try:
         return hash_chunks([open_store(place).get(MANIFEST)[0]])

@@ -57,7 +57,7 @@ def run(
         result = _run_in_folder(chosen, source, dataset, replace, prune, rebuild)
     else:
         copy = WorkingCopy(address, name_copy(address, chosen.cache))
-        with copy.hold():
+        with copy.hold(is_rebuild=rebuild):
             in_copy = chosen.model_copy(update={"lake": copy.folder})
             result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
             copy.publish(rebuilt=rebuild)

@@ -10,6 +10,7 @@ from small_lake import check_lake, make_status, put, write_round
 import tracklake
 from tracklake.pipeline.lake import DamagedFileError, LakeError, LakeMissingError, load, open_for_writing, publication
 from tracklake.pipeline.lake.errors import QueryError, StoreError
+from tracklake.pipeline.lake.manifest import Retention
 from tracklake.pipeline.lake.object_access import name_object
 from tracklake.pipeline.lake.object_store import ObjectStore
 from tracklake.pipeline.lake.publication import MARKER, fetch_lake, publish_lake, sweep_objects
@@ -97,10 +98,9 @@ def test_two_folders_take_turns(folder, bucket, tmp_path):
     commit_status(copy, "03", 6)
     publish_lake(copy, bucket)
     commit_status(folder, "02", 4)
-    with pytest.raises(LakeError, match=r"has results that .* lacks; it was published from elsewhere"):
-        publish_lake(folder, bucket)
-    with pytest.raises(LakeError, match=r"has results that .* lacks. Publish them"):
-        fetch_lake(bucket, folder)
+    for move in (lambda: publish_lake(folder, bucket), lambda: fetch_lake(bucket, folder)):
+        with pytest.raises(LakeError, match="each has results that the other lacks"):
+            move()
     assert [subset for subset, _ in read_status(bucket)] == ["01-lower", "01-upper", "03"]
     publish_lake(folder, bucket, replace_other=True)
     assert [subset for subset, _ in read_status(bucket)] == ["01-lower", "01-upper", "02"]
@@ -252,10 +252,14 @@ def test_objects_are_kept_for_states_that_can_be_queried_and_for_a_day(bucket, t
         (objects[number],) = {name_object(file) for each in load(folder).commits.values() for file in each.all_files}
     assert {item.path for item in store.list()} >= {*objects.values()}
     monkeypatch.setattr(publication, "GRACE", timedelta(seconds=-5))
-    store.put_new(".files/left/by/a/killed/process", b"")
+    store.put_new(".files/left/by/a/killed-process.0123456789abcdef.parquet", b"")
+    others = ["v2/manifest.json", "v2/.files/a.0123456789abcdef.parquet", "notes/paper.txt", ".files/mine.txt"]
+    for other in others:
+        store.put_new(other, b"")
     assert sweep_objects(bucket) > 0
     held = {item.path for item in store.list(".files")}
-    assert held == {objects[3], objects[4], objects[5]}
+    assert held == {objects[3], objects[4], objects[5], ".files/mine.txt"}
+    assert {item.path for item in store.list()} >= {*others}
     assert read_status(bucket) == [("01-upper", 5)]
     assert read_status(bucket, "3") == [("01-upper", 3)]
 
@@ -294,3 +298,84 @@ def test_a_machine_s_role_is_used_where_the_environment_has_no_key(folder, bucke
         assert there.sql("FROM subset_status").pl().height == there.table("subset_status").collect().height == 2
     assert len(role.asked) >= 3
     assert any("aws-sdk" in agent for agent in role.asked)
+
+
+def test_what_is_published_during_a_fetch_is_not_taken_for_known(folder, bucket, tmp_path, monkeypatch):
+    """Otherwise the next publication of the copy would remove it without a word."""
+    copy, download = tmp_path / "copy", publication._download
+    publish_lake(folder, bucket)
+
+    def download_late(*arguments):
+        received = download(*arguments)
+        monkeypatch.setattr(publication, "_download", download)
+        commit_status(folder, "03", 6)
+        publish_lake(folder, bucket)
+        return received
+
+    monkeypatch.setattr(publication, "_download", download_late)
+    fetch_lake(bucket, copy)
+    commit_status(copy, "04", 7)
+    with pytest.raises(LakeError, match="each has results that the other lacks"):
+        publish_lake(copy, bucket)
+    assert [subset for subset, _ in read_status(bucket)] == ["01-lower", "01-upper", "03"]
+
+
+def test_what_is_committed_during_a_publication_is_not_taken_for_published(folder, bucket, tmp_path, monkeypatch):
+    """Otherwise a fetch into the folder would remove it."""
+    interrupt(monkeypatch, lambda: commit_status(folder, "03", 6))
+    publish_lake(folder, bucket)
+    copy = tmp_path / "copy"
+    fetch_lake(bucket, copy)
+    commit_status(copy, "04", 7)
+    publish_lake(copy, bucket)
+    with pytest.raises(LakeError, match="each has results that the other lacks"):
+        fetch_lake(bucket, folder)
+    assert [subset for subset, _ in read_status(folder)] == ["01-lower", "01-upper", "03"]
+
+
+def test_a_lake_in_the_place_of_another_goes_on_with_its_generations(folder, bucket, tmp_path):
+    """Numbers that were used would name two states."""
+    for number in range(1, 4):
+        commit_status(folder, "01-upper", number)
+        last = publish_lake(folder, bucket).generation
+    other = tmp_path / "other"
+    commit_status(other, "05", 9)
+    assert publish_lake(other, bucket, replace_other=True).generation == last + 1
+    assert read_status(bucket) == [("05", 9)]
+
+
+def test_a_rebuilt_lake_replaces_only_the_state_that_it_was_made_from(folder, bucket, tmp_path):
+    publish_lake(folder, bucket)
+    seen = publication.hash_root(bucket)
+    commit_status(folder, "03", 6)
+    publish_lake(folder, bucket)
+    other = tmp_path / "other"
+    commit_status(other, "05", 9)
+    with pytest.raises(LakeError, match="another process has published meanwhile"):
+        publish_lake(other, bucket, replace_other=True, expected=seen)
+    assert "03" in [subset for subset, _ in read_status(bucket)]
+
+
+def test_the_store_keeps_as_many_states_as_the_folder(bucket, tmp_path, monkeypatch):
+    folder = tmp_path / "lake"
+    monkeypatch.setattr(publication, "GRACE", timedelta(0))
+    for number in range(1, 7):
+        with open_for_writing(folder, retention=Retention(20, 0.0)) as writer:
+            frame = make_status("01-upper", number)
+            writer.commit(put(folder, "validate/highd/01", number, frame, dataset="highd", subset="01-upper"))
+        publish_lake(folder, bucket)
+    assert read_status(bucket, "1") == [("01-upper", 1)]
+
+
+def test_an_old_object_that_no_state_needs_is_sent_again(folder, bucket, monkeypatch):
+    """Another process may be about to delete it."""
+    publish_lake(folder, bucket)
+    with open_for_writing(folder) as writer:
+        commit = load(folder).commits["validate/highd/01-upper"]
+        writer.remove([commit.key])
+    publish_lake(folder, bucket)
+    with open_for_writing(folder) as writer:
+        writer.commit(commit)
+    monkeypatch.setattr(publication, "GRACE", timedelta(seconds=-10))
+    monkeypatch.setattr(publication, "sweep_objects", lambda _address: 0)
+    assert publish_lake(folder, bucket).files == len(commit.all_files)
