@@ -87,12 +87,13 @@ class CommitLog:
         is_same = manifest.lake_id == self.manifest.lake_id
         before, shards = (self.manifest, self._shards) if is_same else (NOTHING, [])
         items = len(manifest.commits) + len(manifest.sources) + len(manifest.retired)
-        shards = append_changes(self.store, shards, find_changes(before, manifest), items)
+        changes = find_changes(before, manifest)
+        shards = append_changes(self.store, shards, changes, items)
         root = {
             "schema_version": SCHEMA_VERSION,
             "lake_id": manifest.lake_id,
             "generation": manifest.generation,
-            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "written": self._find_time(manifest, changes),
             "kept_generations": manifest.retention.generations,
             "kept_hours": manifest.retention.hours,
             "commits": len(manifest.commits),
@@ -103,6 +104,14 @@ class CommitLog:
             self._keep_root()
         self._tag = self.store.swap(MANIFEST, _encode(root), self._tag)
         self.manifest, self._shards, self._root = manifest, shards, root
+
+    def _find_time(self, manifest: Manifest, changes: Changes) -> str:
+        """Return when a generation changed last; what no query shows does not change it."""
+        is_same = all(self._root.get(name) == getattr(manifest, name) for name in ("generation", "lake_id"))
+        is_shown = any(item is None or item["fingerprint"] for item in changes["commits"].values())  # not only damaged
+        if self.is_migrated and is_same and not is_shown and not changes["sources"]:
+            return str(self._root["written"])
+        return datetime.now(UTC).isoformat(timespec="seconds")
 
     def _keep_root(self) -> None:
         """Keep the root that ends a generation; a lake that was rebuilt in it has two, of which the first is kept."""
@@ -118,12 +127,19 @@ class CommitLog:
         """Return what is stored by now with the changes that a manifest was to bring.
 
         Raises:
-            LakeError: both change the same, or the lake was made or rebuilt by the other process.
+            LakeError: both change the same, or one of both makes or rebuilds the lake.
         """
         base, ours = self.manifest, find_changes(self.manifest, manifest)
         self._read()
+        if _is_same(self.manifest, manifest):  # stored, but the store's answer was lost
+            return manifest
         if self.manifest.lake_id != base.lake_id:
             raise LakeError(f"{self._place}: another process has made or rebuilt this lake meanwhile. Run again.")
+        if manifest.lake_id != base.lake_id:
+            raise LakeError(
+                f"{self._place}: another process has changed the lake that was to be replaced; its version stays. "
+                "Run again."
+            )
         theirs = find_changes(base, self.manifest)
         for section, changed in ours.items():
             for name in changed.keys() & theirs[section].keys():
@@ -132,7 +148,13 @@ class CommitLog:
                         f"{self._place}: another process has changed {name} ({section}) meanwhile; its version stays. "
                         "Run again, one process at a time."
                     )
-        return _apply(self.manifest, manifest, ours)
+        number = self.manifest.generation + (manifest.generation > base.generation)
+        return _apply(self.manifest, manifest, ours, max(number, manifest.generation))
+
+
+def _is_same(manifest: Manifest, other: Manifest) -> bool:
+    numbers = {(each.lake_id, each.generation) for each in (manifest, other)}
+    return len(numbers) == 1 and not any(find_changes(manifest, other).values())
 
 
 def find_changes(before: Manifest, after: Manifest) -> Changes:
@@ -164,13 +186,13 @@ def _describe(item: Commit | Retired | dict[str, Any]) -> dict[str, Any]:
     return fields
 
 
-def _apply(theirs: Manifest, ours: Manifest, changes: Changes) -> Manifest:
-    """Return another process's manifest with our changes; our files are retired no earlier than in its generation."""
-    mine = {item.path: replace(item, generation=max(item.generation, theirs.generation)) for item in ours.retired}
+def _apply(theirs: Manifest, ours: Manifest, changes: Changes, generation: int) -> Manifest:
+    """Return another process's manifest with our changes, as a generation in which our files are retired."""
+    mine = {item.path: replace(item, generation=generation) for item in ours.retired}
     retired = _merge({item.path: item for item in theirs.retired}, mine, changes["retired"])
     merged = replace(
         theirs,
-        generation=max(theirs.generation, ours.generation),
+        generation=generation,
         commits=_merge(theirs.commits, ours.commits, changes["commits"]),
         sources=_merge(theirs.sources, ours.sources, changes["sources"]),
         ingested_from=tuple(dict.fromkeys((*theirs.ingested_from, *ours.ingested_from))),

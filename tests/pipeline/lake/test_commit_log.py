@@ -17,8 +17,8 @@ from small_lake import make_status, put
 
 from tracklake.pipeline.lake import Commit, LakeError, LakeFile, Manifest, connect, load, open_for_writing
 from tracklake.pipeline.lake.commit_log import CommitLog
-from tracklake.pipeline.lake.errors import DamagedShardError
-from tracklake.pipeline.lake.history import find_superseded
+from tracklake.pipeline.lake.errors import DamagedShardError, SwapConflictError
+from tracklake.pipeline.lake.history import find_superseded, list_generations, load_as_of
 from tracklake.pipeline.lake.manifest import read_root
 from tracklake.pipeline.lake.shards import FAN_OUT, find_merge, parse_shards
 from tracklake.pipeline.lake.store import LocalStore
@@ -177,6 +177,47 @@ def test_what_two_processes_commit_of_different_recordings_is_joined(tmp_path):
     third = first.replace(first.manifest.remove_commits({"ingest/highd/02"}, 5))
     assert third.commits.keys() == {"ingest/highd/01", "ingest/highd/03"}
     assert third.generation == 5
+
+
+def test_each_of_two_states_that_are_joined_has_a_generation_that_can_be_queried(tmp_path):
+    first = CommitLog(tmp_path)
+    start = first.replace(Manifest().add_commit(make_commit("ingest/highd/01", 0), 1))
+    second = CommitLog(tmp_path)
+    first.replace(start.add_commit(make_commit("ingest/highd/02", 0), 2))
+    joined = second.replace(start.remove_commits({"ingest/highd/01"}, 2))
+    assert {item.generation for item in joined.retired} == {3}
+    held = {each.number: load_as_of(tmp_path, str(each.number)).commits for each in list_generations(tmp_path)}
+    assert {number: sorted(key[-2:] for key in commits) for number, commits in held.items()} == {
+        1: ["01"],
+        2: ["01", "02"],
+        3: ["02"],
+    }
+
+
+def test_a_commit_whose_answer_was_lost_is_no_second_generation(tmp_path, monkeypatch):
+    log, real = CommitLog(tmp_path), LocalStore.swap
+    start = log.replace(Manifest())
+
+    def swap(store, path, data, tag):
+        real(store, path, data, tag)
+        monkeypatch.setattr(LocalStore, "swap", real)
+        raise SwapConflictError("as a repeated request is answered")
+
+    for after in (start.add_commit(make_commit("ingest/highd/01", 0), 1), Manifest(generation=2)):
+        monkeypatch.setattr(LocalStore, "swap", swap)
+        assert log.replace(after) == after
+        check_equal(load(tmp_path), after)
+
+
+def test_a_lake_is_not_replaced_by_another_with_what_a_process_commits_meanwhile(tmp_path):
+    first = CommitLog(tmp_path)
+    start = first.replace(Manifest())
+    second = CommitLog(tmp_path)
+    first.replace(start.add_commit(make_commit("ingest/highd/01", 0), 1))
+    with pytest.raises(LakeError, match="has changed the lake that was to be replaced; its version stays"):
+        second.replace(Manifest().add_commit(make_commit("ingest/highd/02", 0), 1))
+    assert load(tmp_path).lake_id == start.lake_id
+    assert [*load(tmp_path).commits] == ["ingest/highd/01"]
 
 
 def test_of_two_processes_that_change_the_same_the_later_one_fails_and_the_earlier_one_stays(tmp_path):

@@ -82,6 +82,14 @@ def test_files_of_every_generation_that_is_listed_are_there_and_others_are_not(m
     assert shards == set.union(*listed)
 
 
+def test_what_changes_no_rows_leaves_a_generation_its_time(root: Path):
+    with open_for_writing(root, retention=Retention(5)) as writer:
+        writer.remember_origin("/elsewhere")
+        writer.mark_damaged(["validate/highd/01-upper"])
+    assert list_generations(root)[-1].written == NOON + timedelta(hours=4)
+    assert ask(root, "2026-03-01T16:00:00Z") == 8
+
+
 def test_a_rebuild_leaves_what_was_before_to_be_queried(root: Path):
     with open_for_writing(root, rebuild=True) as writer:
         writer.commit(put(root, "validate/highd/01", 9, make_status("a", 9), dataset="highd", subset="a"))
