@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import polars as pl
 
 from tracklake.pipeline.sources.lanelet_map import read_lanelet_map
@@ -19,7 +20,7 @@ from tracklake.pipeline.sources.levelx_plane import (
 )
 from tracklake.pipeline.sources.levelx_recognition import SIGNATURE, describe_columns, detect, group
 from tracklake.pipeline.sources.source import Canonical, Part, Source
-from tracklake.pipeline.transforms.tracks.axes import Axis, fit_axis
+from tracklake.pipeline.transforms.tracks.axes import Axis, fit_axis, wrap_angle
 from tracklake.pipeline.transforms.tracks.carriageways import (
     LaneLayout,
     find_lanes,
@@ -105,11 +106,16 @@ def _read_lists(entries: pl.DataFrame) -> pl.DataFrame:
 
 
 def _part_carriageways(entries: pl.DataFrame) -> list[pl.DataFrame]:
-    """Part the entries of the two directions of travel, by the mean heading of each vehicle."""
+    """Part the entries of the two directions of travel, by the mean heading of each vehicle.
+
+    A lanelet is that of the direction with most of its entries: vehicles of the other one have no lane there.
+    """
     angle = pl.col("heading").radians()
     means = entries.group_by("trackId", maintain_order=True).agg(angle=pl.arctan2(angle.sin().sum(), angle.cos().sum()))
     way = pl.Series("way", part_directions(means["angle"].to_numpy()))
     parted = entries.join(means.select("trackId", way), on="trackId", how="left", maintain_order="left")
+    is_own = (pl.col("way").mean().over("lanelet") - pl.col("way")).abs() <= 0.5
+    parted = parted.with_columns(lanelet=pl.when(is_own).then("lanelet"))
     return [rows.drop("way") for _, rows in sorted(parted.partition_by("way", as_dict=True).items())]
 
 
@@ -123,10 +129,14 @@ def _find_map_points(carriageway: pl.DataFrame, points: pl.DataFrame | None) -> 
 
 
 def _place_map_points(points: pl.DataFrame, axis: Axis) -> pl.DataFrame:
-    """Put the points of a map's lanelets on an axis, as `find_lanes` takes them; those beyond its ends are left out."""
+    """Put the points of a map's lanelets on an axis, as `find_lanes` takes them.
+
+    Points beyond the axis's ends, and those of lanelets in the opposite direction, are left out.
+    """
     places = axis.project(*_list_points(points, "x_m", "y_m"))
     placed = points.select("lanelet", "width_m", along_m=pl.Series(places.along_m), right_m=pl.Series(places.right_m))
-    return placed.filter(pl.col("along_m").is_between(0, axis.length_m))
+    is_ahead = np.abs(wrap_angle(points["angle_rad"].to_numpy() - places.angle_rad)) < np.pi / 2
+    return placed.filter(pl.Series(is_ahead) & pl.col("along_m").is_between(0, axis.length_m))
 
 
 def _place_lane_points(placed: pl.DataFrame) -> pl.DataFrame:

@@ -104,8 +104,8 @@ def find_lanes(points: pl.DataFrame) -> LaneLayout:
     lanes = lanes.join(numbers, on="lanelet").group_by("lane", "piece").agg(pl.col("right_m", "width_m").median())
     pieces = lanes["piece"].n_unique()
     shares = dict(lanes.group_by("lane").agg(pl.len() / pieces).iter_rows())
-    main = next((lane - 1 for lane in range(1, 100) if shares.get(lane, 0.0) < MAIN_SHARE), 1)
-    main = max(main, 1)
+    # A lane that begins or ends on the left is a main one, as there are main lanes to its right.
+    main = max((lane for lane, share in shares.items() if share >= MAIN_SHARE), default=1)
     return LaneLayout(
         numbers,
         main,

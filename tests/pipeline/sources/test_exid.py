@@ -207,6 +207,24 @@ def test_the_map_of_the_location_gives_axes_and_lanes(tmp_path):
     assert any("location3.osm, 2 lanelets" in note for note in canonical.notes)
 
 
+@pytest.mark.parametrize(("mapped", "others"), [(True, SOUTH), (True, []), (False, SOUTH)])
+def test_a_vehicle_with_a_turned_heading_does_not_shift_the_lanes(tmp_path, mapped, others):
+    path, _ = write_map(tmp_path / "location3.osm", {**LANES, 21: (-6.25, -9.75)})
+    _, north = project_utm(np.array([50.88]), np.array([6.87]), 32)
+    # It drives to the south in lanelet 21, at x = -8, and its heading says north.
+    wrong = drive(4, (-8.0, 60.0), (0, -20), 90.0, frames=20, laneletId=21)
+    vehicles = [*VEHICLES_ROWS, vehicle_row(4, 20)]
+    meta = meta_row(yUtmOrigin=float(north[0]) + 60)
+    paths = write_recording(tmp_path / "data", vehicles, [*NORTH, *others, *wrong], meta=meta)
+    canonical = read([*paths, *[path] * mapped])[1]
+    subset = by_name(canonical)["00-north"]
+    tracks = subset.tracks.filter(frame=0).sort("vehicle_id")
+    assert tracks["lane"].to_list() == [1, 2, 2, None]
+    # The left edge is at x = -1.75, half of 3.5 m left of lanelet 11.
+    assert tracks["y_m"].to_list() == pytest.approx([1.75, 4.75, 5.25, -6.25], abs=0.02)
+    assert subset.facts["lanes"].to_list() == [2]
+
+
 def test_damaged_maps_are_refused_and_lanelets_without_bounds_are_counted(tmp_path):
     path, _ = write_map(tmp_path / "location3.osm", LANES)
     found = read_lanelet_map(*recognise([path]), 6.9, (350_000.0, 5_640_000.0))

@@ -136,6 +136,15 @@ def test_lanes_count_from_the_left_and_ramps_are_no_main_lanes():
     assert found.markings_m == pytest.approx([0, 3.6, 7.2, 10.8])
 
 
+def test_a_lane_that_begins_on_the_left_makes_no_ramps_of_the_others():
+    points = lane_points([(1, 0, 400, 0.0, 3.5), (2, 0, 400, 3.5, 3.5), (3, 60, 400, -3.5, 3.5)])
+    found = find_lanes(points)
+    # Lane 1 exists in 34 of 40 pieces, 85 %.
+    assert dict(found.lanes.iter_rows()) == {3: 1, 1: 2, 2: 3}
+    assert (found.main, found.others, found.left_m) == (3, [], -5.25)
+    assert found.markings_m == [0, 3.5, 7, 10.5]
+
+
 def test_a_lane_that_is_out_of_use_for_a_while_is_still_there():
     points = lane_points([(1, 0, 40, 0.0, 3.5), (1, 160, 200, 0.0, 3.5), (2, 0, 200, 3.5, 3.5)])
     assert dict(find_lanes(points).lanes.iter_rows()) == {1: 1, 2: 2}
