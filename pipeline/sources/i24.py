@@ -89,18 +89,24 @@ def detect(head: bytes, _name: str) -> str | None:
 def spill_file(file: RawFile, folder: Path) -> Spilled:
     """Read a file document by document into a folder for each period of its time."""
     recordings: Counter[str] = Counter()
-    rejects, read, moved = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0
+    rejects, read, moved, lost = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0, 0
     for number, documents in enumerate(read_documents(file)):
         kept, refused = split_unusable(documents)
-        points, between = put_on_frames(kept)
+        points, between, unused = put_on_frames(kept)
         vanished = kept.join(points.select(pl.col("vehicle").cast(pl.Int64).alias(LINE)).unique(), on=LINE, how="anti")
         rejects += [refused, _describe_rejects(vanished.with_columns(reason=pl.lit(NO_FRAMES)))]
         read += documents.read
         moved += between
+        lost += unused
         periods = points.partition_by("period", as_dict=True, include_key=False)
         shares = ((_name_period(file, period), rows) for (period,), rows in sorted(periods.items()))
         recordings += spill_rows(folder, number, shares)
     notes = [f"{file.name}: positions of {moved:,} trajectories lie between frames and are interpolated"] * bool(moved)
+    if lost:
+        notes.append(
+            f"{file.name}: {lost:,} positions are not used: they lie between frames and more than {LONGEST_STEP:g} "
+            f"frames from the others, or another one is nearer to the frame. Expected {RATE_HZ:g} positions a second."
+        )
     refused = pl.concat(rejects).sort(LINE)
     if refused.height and refused["line"][-1] == read and refused["reason"][-1] == "cut short":
         notes.append(f"{file.name}: ends within document {read:,}: probably TRUNCATED. Download the file again.")
@@ -123,16 +129,16 @@ def _describe_rejects(documents: pl.DataFrame) -> pl.DataFrame:
     return documents.select(LINE, "reason", text=text)
 
 
-def put_on_frames(documents: pl.DataFrame) -> tuple[pl.DataFrame, int]:
-    """Put trajectories on the common frames, 25 a second since 1970, and count those that lie between frames.
+def put_on_frames(documents: pl.DataFrame) -> tuple[pl.DataFrame, int, int]:
+    """Put trajectories on the common frames, 25 a second since 1970.
 
     A position within 0.01 frames of one is taken for it; between two, at most 1.5 frames apart, it is interpolated.
 
-    Returns period (number of the PERIOD_S since 1970), vehicle (the document's number), frame (within the period),
+    Returns the number of trajectories that are interpolated, the number of positions that no frame is made of, and
+    period (number of the PERIOD_S since 1970), vehicle (the document's number), frame (within the period),
     x_ft, y_ft, their rates of change (central differences), direction, length_ft, width_ft, class, synthetic.
-    Trajectories of fewer than two positions on frames are left out.
+    Trajectories of fewer than two positions on frames are left out, of the numbers as well.
     """
-    at, x, y = pl.col("timestamp") * RATE_HZ, pl.col("x_position"), pl.col("y_position")
     constants = documents.select(
         vehicle=pl.col(LINE).cast(pl.Int32),
         direction=pl.col("direction").cast(pl.Int8),
@@ -142,30 +148,44 @@ def put_on_frames(documents: pl.DataFrame) -> tuple[pl.DataFrame, int]:
         synthetic=pl.col("_id").struct.field("$oid").str.starts_with(SYNTHETIC_ID).fill_null(value=False),
     )
     points = documents.select(pl.col(LINE).cast(pl.Int32).alias("vehicle"), "timestamp", "x_position", "y_position")
-    points = points.explode("timestamp", "x_position", "y_position").with_columns(frame=(at - ON_FRAME).ceil())
-    ahead = pl.when(pl.col("vehicle") == pl.col("vehicle").shift(-1)).then(at.shift(-1))
-    frame = pl.col("frame")
-    is_between = (frame - at > ON_FRAME).fill_null(value=False)
-    usable = ~is_between | ((frame < ahead - ON_FRAME) & (ahead - at <= LONGEST_STEP)).fill_null(value=False)
-    share = pl.when(is_between).then((frame - at) / (ahead - at)).otherwise(0.0)
-    points = points.select(
-        "vehicle",
-        x_ft=pl.when(is_between).then(x + share * (x.shift(-1) - x)).otherwise(x),
-        y_ft=pl.when(is_between).then(y + share * (y.shift(-1) - y)).otherwise(y),
-        frame=frame.cast(pl.Int64),
-        is_between=is_between,
-        usable=usable,
-    ).filter("usable")
-    points = points.filter(pl.len().over("vehicle") >= LEAST_ENTRIES)
+    points = _find_frames(points.explode("timestamp", "x_position", "y_position"))
+    points = points.filter((pl.col("end") - pl.col("first")).sum().over("vehicle") >= LEAST_ENTRIES)
+    unused = points.filter("is_unused").height
+    points = points.filter(pl.col("end") > pl.col("first")).with_columns(frame=pl.int_ranges("first", "end"))
+    points = points.explode("frame").with_columns(is_between=pl.col("frame") - pl.col("at") > ON_FRAME)
+    share = (pl.col("frame") - pl.col("at")) / (pl.col("ahead") - pl.col("at"))
+    share = pl.when("is_between").then(share).otherwise(0.0)
+    points = points.with_columns(
+        x_ft=pl.col("x_position") + share * (pl.col("x_ahead") - pl.col("x_position")).fill_null(0.0),
+        y_ft=pl.col("y_position") + share * (pl.col("y_ahead") - pl.col("y_position")).fill_null(0.0),
+    )
     between = points.filter("is_between")["vehicle"].n_unique()
     points = points.select(
         *("vehicle", "x_ft", "y_ft"),
         speed_ftps=_derive_rate("x_ft"),
         lateral_ftps=_derive_rate("y_ft"),
-        period=frame // PERIOD_FRAMES,
-        frame=(frame % PERIOD_FRAMES).cast(pl.Int32),
+        period=pl.col("frame") // PERIOD_FRAMES,
+        frame=(pl.col("frame") % PERIOD_FRAMES).cast(pl.Int32),
     )
-    return points.join(constants, on="vehicle", how="left", maintain_order="left"), between
+    return points.join(constants, on="vehicle", how="left", maintain_order="left"), between, unused
+
+
+def _find_frames(points: pl.DataFrame) -> pl.DataFrame:
+    """Find each position's `first` frame and that before which it `end`s: the two are the same where it has none."""
+    at, is_same = pl.col("at"), pl.col("vehicle") == pl.col("vehicle").shift(-1)
+    points = points.with_columns(at=pl.col("timestamp") * RATE_HZ)
+    points = points.with_columns(
+        first=(at - ON_FRAME).ceil().cast(pl.Int64),
+        ahead=pl.when(is_same).then(at.shift(-1)),
+        x_ahead=pl.when(is_same).then(pl.col("x_position").shift(-1)),
+        y_ahead=pl.when(is_same).then(pl.col("y_position").shift(-1)),
+    )
+    first, ahead = pl.col("first"), pl.col("ahead")
+    after_own = first + (first - at <= ON_FRAME).cast(pl.Int64)
+    after = (ahead - ON_FRAME).ceil().cast(pl.Int64)
+    points = points.with_columns(end=pl.when(ahead - at <= LONGEST_STEP).then(after).otherwise(after_own))
+    ends_interpolation = (pl.col("end") > after_own).shift(1, fill_value=False)
+    return points.with_columns(is_unused=(pl.col("end") == first) & ~ends_interpolation)
 
 
 def _name_period(file: RawFile, period: int) -> str:
@@ -298,7 +318,7 @@ I24 = Source(
     licence="that of the I-24 MOTION project (i24motion.org): free, with citation, no re-identification",
     citation=references.GLOUDEMANS.full,
     signature="I-24 MOTION: a JSON list of trajectories",
-    version=1,
+    version=2,
     detect=detect,
     group=group,
     to_canonical=to_canonical,

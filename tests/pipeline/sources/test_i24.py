@@ -121,17 +121,17 @@ def test_a_vehicle_on_the_road_at_a_periods_border_is_in_both_and_shares_its_sou
     st.lists(
         st.tuples(
             st.sampled_from([0.0, 0.004, 0.25, 0.5, 0.8, 0.97, 0.996]),
-            st.sets(st.integers(0, 12), min_size=2, max_size=13),
+            st.dictionaries(st.integers(0, 12), st.sampled_from([0.0, 0.03, 0.3]), min_size=2, max_size=13),
         ),
         min_size=1,
         max_size=4,
     )
 )
 def test_positions_on_frames_are_those_of_a_loop(tracks):
-    """The true position at a frame between two successive times, whatever phase; nothing over a gap or at the ends."""
+    """The true position at a frame between two successive times, also uneven; nothing over a gap or at the ends."""
     documents, expected = [], []
     for number, (late, steps) in enumerate(tracks, start=1):
-        times = [step + late for step in sorted(steps)]
+        times = [step + late + steps[step] for step in sorted(steps)]
         documents.append(
             {"line": number, "timestamp": [START + time / 25 for time in times], "x_position": [7 * t for t in times]}
         )
@@ -146,10 +146,46 @@ def test_positions_on_frames_are_those_of_a_loop(tracks):
         y_position="x_position", direction=1.0, length=pl.lit([1.0]), width=pl.lit([1.0]), coarse_vehicle_class=0.0,
         _id=pl.struct(pl.lit("").alias("$oid")),
     )  # fmt: skip
-    points, _ = put_on_frames(lists)
+    points, _, _ = put_on_frames(lists)
     assert points["period"].unique().to_list() in ([], [int(START / PERIOD_S)])
     assert points.select("vehicle", "frame").rows() == [each[:2] for each in expected]
     assert np.allclose(points["x_ft"].to_numpy(), [each[2] for each in expected], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("times", "frames", "unused"),
+    [
+        # Frame 2 lies between the second and the third position.
+        ([0, 1, 2.02, 3], [0, 1, 2, 3], 0),
+        # Frames 2 and 4 lie between two positions; of frame 1, 0.98 is nearer than 0.02.
+        ([0.02, 0.98, 2.015, 2.985, 4.02, 5], [1, 2, 3, 4, 5], 1),
+        # 0.2 ms apart: the second is taken.
+        ([0, 1, 1.005, 2], [0, 1, 2], 1),
+        # 10 Hz: every second position is on a frame.
+        ([0, 2.5, 5, 7.5, 10], [0, 5, 10], 2),
+        # The first and the last are ends of interpolations.
+        ([0.5, 1.5, 2.5, 3.5], [1, 2, 3], 0),
+        # 20 Hz.
+        ([0, 1.25, 2.5, 3.75, 5], [0, 1, 2, 3, 4, 5], 0),
+    ],
+)
+def test_no_position_that_is_off_the_frames_is_lost_unseen(tmp_path, times, frames, unused):
+    text = as_list(
+        [
+            document(
+                timestamp=[START + time / 25 for time in times],
+                x_position=[EAST + 4 * time for time in times],
+                y_position=[18.0] * len(times),
+            )
+        ]
+    )
+    made, spilled = read(tmp_path, text)
+    tracks = made["i-24-20221122-0600"].subsets[0].tracks
+    assert tracks["frame"].to_list() == frames
+    ways = [(10_560 + 4 * frame + 15) * 0.3048 for frame in frames]
+    assert tracks["x_m"].to_numpy() == pytest.approx(ways, abs=0.007)  # 0.005 frames are 0.02 ft
+    noted = [note for note in spilled.notes if "not used" in note]
+    assert [note.split(": ")[1] for note in noted] == [f"{unused} positions are not used"] * bool(unused)
 
 
 @settings(max_examples=30)
