@@ -6,6 +6,7 @@ as its clock or network stood still, fails at its next commit only if the other 
 
 import json
 import threading
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -26,6 +27,8 @@ RENEWALS = 4
 def hold_lease(store: Store, holder: str, lease_s: float = LEASE_S) -> Iterator[None]:
     """Hold the lease of a lake, renewed in the background until the block ends.
 
+    Each has an id: a request whose answer was lost may be refused when it is repeated, and is found to have succeeded.
+
     Args:
         store: where the lake is kept.
         holder: name of this process, for the messages of others.
@@ -34,15 +37,16 @@ def hold_lease(store: Store, holder: str, lease_s: float = LEASE_S) -> Iterator[
     Raises:
         LakeLockedError: another process holds it.
     """
-    tag = _acquire(store, holder, lease_s)
+    own = uuid.uuid4().hex
+    tag = _acquire(store, own, holder, lease_s)
     ended = threading.Event()
 
     def renew() -> None:
         nonlocal tag
         while not ended.wait(lease_s / RENEWALS):
             try:
-                tag = store.swap(LEASE, _describe(holder, lease_s), tag)
-            except SwapConflictError:
+                tag = _swap(store, own, _describe(own, holder, lease_s), tag)
+            except (SwapConflictError, MissingObjectError):
                 return  # taken over; the root decides whose commits count
             except TracklakeError:
                 continue  # the network may be back before the lease ends
@@ -54,20 +58,22 @@ def hold_lease(store: Store, holder: str, lease_s: float = LEASE_S) -> Iterator[
     finally:
         ended.set()
         renewal.join()
-        _release(store, tag)
+        _release(store, own)
 
 
-def _acquire(store: Store, holder: str, lease_s: float) -> str:
+def _acquire(store: Store, own: str, holder: str, lease_s: float) -> str:
     """Create the lease, or take over one that has ended, and return its tag."""
     try:
-        return store.put_new(LEASE, _describe(holder, lease_s))
+        return store.put_new(LEASE, _describe(own, holder, lease_s))
     except AlreadyStoredError:
         pass
     try:
         content, tag = store.get(LEASE)
-        other, end = _read(content)
+        other, end, found = _read(content)
+        if found == own:  # created, but the store's answer was lost
+            return tag
         if end <= datetime.now(UTC):
-            return store.swap(LEASE, _describe(holder, lease_s), tag)
+            return _swap(store, own, _describe(own, holder, lease_s), tag)
     except (MissingObjectError, SwapConflictError):  # given back or taken over just now
         other, end = "another process", datetime.now(UTC)
     free = end.astimezone().isoformat(timespec="seconds")
@@ -77,24 +83,40 @@ def _acquire(store: Store, holder: str, lease_s: float) -> str:
     )
 
 
-def _release(store: Store, tag: str) -> None:
+def _swap(store: Store, own: str, content: bytes, tag: str) -> str:
+    """Replace the lease, or find that an earlier attempt did, whose answer was lost; returns its tag.
+
+    Raises:
+        SwapConflictError: it is another process's.
+        MissingObjectError: it was given back.
+    """
+    try:
+        return store.swap(LEASE, content, tag)
+    except SwapConflictError:
+        found, tag = store.get(LEASE)
+        if _read(found)[2] == own:
+            return tag
+        raise
+
+
+def _release(store: Store, own: str) -> None:
     """Give a lease back, unless another process has taken it over."""
     try:
-        if store.get(LEASE)[1] == tag:
+        if _read(store.get(LEASE)[0])[2] == own:
             store.delete([LEASE])
     except TracklakeError:  # it ends by itself
         return
 
 
-def _describe(holder: str, lease_s: float) -> bytes:
+def _describe(own: str, holder: str, lease_s: float) -> bytes:
     end = datetime.now(UTC) + timedelta(seconds=lease_s)
-    return json.dumps({"holder": holder, "ends": end.isoformat()}).encode()
+    return json.dumps({"id": own, "holder": holder, "ends": end.isoformat()}).encode()
 
 
-def _read(content: bytes) -> tuple[str, datetime]:
-    """Return holder and end of a lease; one that is damaged has ended."""
+def _read(content: bytes) -> tuple[str, datetime, str | None]:
+    """Return holder, end and id of a lease; one that is damaged has ended."""
     try:
         found = json.loads(content)
-        return str(found["holder"]), datetime.fromisoformat(found["ends"]).astimezone()
+        return str(found["holder"]), datetime.fromisoformat(found["ends"]).astimezone(), found.get("id")
     except (ValueError, KeyError, TypeError):
-        return "another process", datetime.now(UTC)
+        return "another process", datetime.now(UTC), None

@@ -47,6 +47,8 @@ REGIONS = ("AWS_REGION", "AWS_DEFAULT_REGION")
 """Environment variables that name the region of a bucket."""
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", re.DOTALL)
 """Pattern of an address, also of one from which `Path` took a slash."""
+_OPTIONS = re.compile("[@?#]")
+"""Pattern of what comes before or after credentials and options in an address."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"status code: (\d+ [A-Za-z ]+)")
 
@@ -62,7 +64,7 @@ def find_address(lake: Path | str) -> str | None:
         return None
     scheme, rest = found[1].lower(), found[2].strip("/")
     bucket = rest.partition("/")[0]
-    if "@" in bucket or "?" in rest or "#" in rest:
+    if _OPTIONS.search(rest):
         raise UsageError(
             f"{scheme}://...: an address names a bucket and a folder only. Credentials belong in the environment "
             "(docs/object-store.md)."
@@ -227,13 +229,17 @@ def find_endpoint(address: str) -> Endpoint:
     given = {name.upper(): (name, value) for name, value in os.environ.items() if value}
     found: list[SplitResult] = []
     for name, endpoint in (given[each] for each in ENDPOINTS[scheme] if each in given):
-        parts = urlsplit(endpoint)
-        if parts.username or parts.password:
+        if _OPTIONS.search(endpoint):
             raise UsageError(f"{name}: expected an address without credentials, which have variables of their own")
+        try:
+            parts = urlsplit(endpoint)
+        except ValueError:
+            parts = SplitResult("", "", "", "", "")
         is_safe = parts.scheme == "https" or (parts.scheme == "http" and _is_loopback(parts.hostname or ""))
         if not is_safe:
+            got = f"{parts.scheme}://..." if parts.netloc else "no address of a server"
             raise UsageError(
-                f"{name}: expected an address that begins with https://, or http:// on this machine; got {endpoint}. "
+                f"{name}: expected an address that begins with https://, or http:// on this machine; got {got}. "
                 "Data and credentials would cross the network readable."
             )
         found.append(parts)

@@ -149,11 +149,11 @@ def _count_items(changes: Changes) -> int:
 def _write_shard(store: Store, changes: Changes) -> Shard:
     filled = {section: changed for section, changed in changes.items() if changed}
     content = json.dumps(filled, sort_keys=True, separators=(",", ":")).encode()
-    shard = Shard(hash_chunks([content]), len(content), _count_items(filled))
-    try:
-        store.put_new(shard.path, content)
-    except AlreadyStoredError:  # by a process that was killed before it stored the root
-        found, tag = store.get(shard.path)
-        if found != content:
-            store.swap(shard.path, content, tag)
-    return shard
+    while True:
+        shard = Shard(hash_chunks([content]), len(content), _count_items(filled))
+        try:
+            store.put_new(shard.path, content)
+        except AlreadyStoredError:  # left by a process that was killed, perhaps damaged, perhaps about to be swept
+            content += b"\n"  # so that ours has a name that no sweep knows
+        else:
+            return shard

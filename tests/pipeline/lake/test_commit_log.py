@@ -160,6 +160,18 @@ def test_a_death_between_shard_and_root_changes_nothing_and_the_shard_is_swept(t
     assert find_shards(tmp_path) == shards
 
 
+def test_a_shard_left_by_another_process_may_be_swept_after_its_content_is_committed(tmp_path):
+    start = CommitLog(tmp_path).replace(Manifest())
+    after = start.add_commit(make_commit("ingest/highd/01", 0), 1)
+    CommitLog(tmp_path).replace(after)
+    left = find_shards(tmp_path)
+    (tmp_path / "manifest.json").unlink()  # as if it had been killed before the root
+    CommitLog(tmp_path).replace(after)
+    for name in left:
+        (tmp_path / "manifest" / f"{name}.json").unlink()
+    check_equal(load(tmp_path), after)
+
+
 def test_what_two_processes_commit_of_different_recordings_is_joined(tmp_path):
     first = CommitLog(tmp_path)
     start = first.replace(Manifest().add_commit(make_commit("ingest/highd/01", 0), 1))

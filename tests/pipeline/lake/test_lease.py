@@ -7,9 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from tracklake.pipeline.lake.errors import LakeLockedError, MissingObjectError
+from tracklake.pipeline.lake.errors import (
+    AlreadyStoredError,
+    LakeLockedError,
+    MissingObjectError,
+    StoreError,
+    SwapConflictError,
+)
 from tracklake.pipeline.lake.lease import LEASE, hold_lease
 from tracklake.pipeline.lake.store import LocalStore
+from tracklake.schemas.errors import TracklakeError
 
 
 @pytest.fixture
@@ -52,6 +59,36 @@ def test_it_is_renewed_while_the_block_lasts(store):
         while json.loads(store.get(LEASE)[0])["ends"] == first and time.monotonic() < limit:
             time.sleep(0.01)
         assert json.loads(store.get(LEASE)[0])["ends"] > first
+
+
+class Forgetful(LocalStore):
+    """A store whose answer to each other write is lost, as a client sees it after it repeated the request or not."""
+
+    def __init__(self, root: Path, error: TracklakeError) -> None:
+        super().__init__(root)
+        self.error, self.swaps = error, 0
+
+    def put_new(self, path, data):
+        super().put_new(path, data)
+        raise AlreadyStoredError(path)
+
+    def swap(self, path, data, tag):
+        written = super().swap(path, data, tag)
+        self.swaps += 1
+        if self.swaps % 2:
+            raise self.error
+        return written
+
+
+@pytest.mark.parametrize("error", [SwapConflictError("conflict"), StoreError("timeout")])
+def test_an_answer_that_was_lost_does_not_end_it(tmp_path, error):
+    store = Forgetful(tmp_path, error)
+    with hold_lease(store, "me", lease_s=0.4):
+        limit = time.monotonic() + 20
+        while store.swaps < 4 and time.monotonic() < limit:
+            time.sleep(0.01)
+    assert store.swaps >= 4
+    assert [*store.list()] == []
 
 
 def test_one_that_was_taken_over_is_not_given_back(store):

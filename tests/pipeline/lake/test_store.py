@@ -143,7 +143,14 @@ def test_addresses_are_told_from_folders(lake, address):
     assert find_address(lake) == address
 
 
-@pytest.mark.parametrize("lake", [f"s3://{KEY_ID}:password@bucket/lake", "s3://bucket/lake?X-Amz-Signature=password"])
+@pytest.mark.parametrize(
+    "lake",
+    [
+        f"s3://{KEY_ID}:password@bucket/lake",
+        f"s3://bucket/{KEY_ID}:password@x",
+        "s3://bucket/lake?X-Amz-Signature=password",
+    ],
+)
 def test_an_address_with_credentials_is_refused_and_not_repeated(lake):
     with pytest.raises(UsageError, match="Credentials belong in the environment") as refused:
         find_address(lake)
@@ -164,6 +171,25 @@ def test_other_addresses_are_refused(lake):
 def test_servers_are_reached_encrypted_or_on_this_machine(monkeypatch, bucket, endpoint, plain):
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
     assert find_endpoint(bucket).is_plain == plain
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        f"{KEY_ID}:password@storage.example:9000",
+        f"https://{KEY_ID}:password@storage.example",
+        "http://storage.example/?token=password",
+        f"{KEY_ID}:password",
+        "http://[::password",
+        "http://storage.example/password",
+    ],
+)
+def test_a_server_whose_address_is_refused_is_not_repeated(monkeypatch, bucket, endpoint):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    with pytest.raises(UsageError, match="AWS_ENDPOINT_URL: expected an address") as refused:
+        find_endpoint(bucket)
+    assert "password" not in str(refused.value)
+    assert KEY_ID.lower() not in str(refused.value).lower()
 
 
 @pytest.mark.parametrize("name", ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AWS_endpoint"])
