@@ -1,6 +1,7 @@
 """What a raw file is: its format, columns, counts and units, without any value of it."""
 
 import csv
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,10 +16,12 @@ from tracklake.pipeline.sources.csv import BOM, LINE, UNNAMED, Chunk, Layout, re
 from tracklake.pipeline.sources.i24 import DIALECT as I24_JSON
 from tracklake.pipeline.sources.i24 import split_unusable
 from tracklake.pipeline.sources.i24_documents import read_documents
+from tracklake.pipeline.sources.ngsim_dialects import ALIASES, GUESSES
 from tracklake.pipeline.sources.source import ColumnsOfFile
 from tracklake.pipeline.sources.v2v.logs import READERS
 from tracklake.schemas import BSM
 from tracklake.schemas.arrays import Floats
+from tracklake.schemas.markdown import RAW_TABLES
 from tracklake.schemas.raw_i24 import RAW_I24
 
 READ, LACKING, UNREAD = "read", "missing", "not read"
@@ -69,6 +72,11 @@ SHARED |= dict.fromkeys(("levelx-recordingMeta", "levelx-tracksMeta"), "exid, in
 """Datasets by dialect, where several share it."""
 AGREEING = (0.9, 1.1)
 """Ratios of ways to speeds times, in the median, at which the two agree."""
+_NOT_PLAIN = re.compile(r"\(.*?\)|\[.*?\]|[\s_.-]+")
+KNOWN = {*ALIASES, *GUESSES, *(_NOT_PLAIN.sub("", name.lower()) for table in RAW_TABLES for name in table.columns)}
+"""Names of columns of all datasets, in lower case without blanks, underscores and units."""
+FEWEST_KNOWN = 2
+"""Fewest names of KNOWN in a line that is taken for a header; lines of data can have such a word."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +261,7 @@ def _compare_motion(frame: pl.DataFrame, motion: Motion | None, units: Mapping[s
 
 
 def _describe_unknown(file: RawFile) -> FileProbe:
-    """Describe the columns of a file of no known format, by the names in its first line where that is a header."""
+    """Describe the columns of a file of no known format, by the names in its first line if some are known."""
     try:
         head = read_head(file)
     except SourceError:
@@ -262,10 +270,14 @@ def _describe_unknown(file: RawFile) -> FileProbe:
     if not lines:
         return FileProbe(file.name, "", "", problem="empty")
     names = next(csv.reader(lines[:1]), [])
-    is_header = len(names) > 1 and not any(_is_number(name) for name in names)
+    known = KNOWN & {_NOT_PLAIN.sub("", name.lower()) for name in names}
+    is_json = lines[0].lstrip().startswith(("{", "["))
+    is_header = len(known) >= FEWEST_KNOWN and not is_json and not any(_is_number(name) for name in names)
     columns = tuple(ColumnProbe(name.strip(), UNREAD) for name in names) if is_header else ()
     problem = (
-        "no known format" if is_header else f"no known format, and no header; {len(names)} fields in its first line"
+        "no known format"
+        if is_header
+        else f"no known format, and no header with known names; {len(names)} fields in its first line"
     )
     return FileProbe(file.name, "", "", columns=columns, problem=problem)
 

@@ -22,6 +22,8 @@ MAX_DOCUMENT_BYTES = 256 << 20
 """Size of the largest document, in bytes; a day's longest trajectories have some MB."""
 TEXT_BYTES = 500
 """First bytes of a rejected document that are kept."""
+NO_DOCUMENT = "no trajectory's document: not JSON, or a value of another type"
+"""Reason to reject a document that cannot be parsed."""
 FIRST_KEY = re.compile(rb'^\s*\[\s*\{\s*"([^"\\]+)"\s*:')
 """Pattern of a list's beginning, up to the first key of its first document."""
 SCALAR = re.compile(rb'"(length|width|height)"\s*:\s*(-?[0-9][-+0-9.eE]*)')
@@ -94,11 +96,10 @@ def _parse(texts: list[bytes], first: int) -> tuple[pl.DataFrame, list[tuple[int
         frame = pl.read_ndjson(io.BytesIO(b"\n".join(lines)), schema=SCHEMA) if lines else pl.DataFrame(schema=SCHEMA)
         if frame.height == len(texts):
             return frame.with_columns(pl.int_range(first, first + len(texts), dtype=pl.Int64).alias(LINE)), []
-        reason = "not one document"
-    except (pl.exceptions.PolarsError, ValueError) as error:
-        reason = str(error).splitlines()[0]
+    except (pl.exceptions.PolarsError, ValueError):
+        pass  # Its message quotes values, which a reason must not have.
     if len(texts) == 1:
-        reason = "cut short" if not texts[0].endswith(b"}") else f"no trajectory's document: {reason}"
+        reason = "cut short" if not texts[0].endswith(b"}") else NO_DOCUMENT
         text = texts[0][:TEXT_BYTES].decode("utf-8", errors="replace")
         return pl.DataFrame(schema={**SCHEMA, LINE: pl.Int64}), [(first, reason, text)]
     half = len(texts) // 2

@@ -8,6 +8,7 @@ from highd_files import write_recording as write_highd
 from levelx_files import drive, meta_row, vehicle_row, write_recording
 from raw_texts import as_text, ngsim_row, write
 
+NO_HEADER = "no known format, and no header with known names"
 VEHICLES = [vehicle_row(0, 60), vehicle_row(1, 60, "truck")]
 ROWS = drive(0, (123.456, -98.7654), (0, 20.125), 90.0, frames=60) + drive(
     1, (127.125, 44.3751), (0, 21.375), 90.0, frames=60
@@ -105,10 +106,11 @@ def test_a_list_of_documents(command, tmp_path):
         "x_position": [316_800 + step for step in steps],
     }
     sound |= {"y_position": [18.0] * 50, "length": 15.0, "width": [6.0, 6.5], "direction": 1, "coarse_vehicle_class": 0}
-    documents = [sound] * 12 + [sound | {"x_position": []}]
+    documents = [sound] * 12 + [sound | {"x_position": []}, sound | {"direction": "at 77.77 N"}]
     path = write(tmp_path / "i24.json", json.dumps(documents).encode())
-    ((file,), _) = probe(command, path, code=3)
-    assert (file["dataset"], file["rows"], sum(file["rejected"].values())) == ("i24", 13, 1)
+    ((file,), shown) = probe(command, path, code=3)
+    assert (file["dataset"], file["rows"], sum(file["rejected"].values())) == ("i24", 14, 2)
+    assert "77.77" not in shown
     assert columns_of(file)["length"] == {"name": "length", "state": "read", "unit": "ft", "filled": 1.0, "fits": True}
 
 
@@ -116,8 +118,13 @@ def test_a_list_of_documents(command, tmp_path):
     ("content", "problem", "names"),
     [
         (b"", "empty", []),
-        (b"speed,colour\n77.77,red\n", "no known format", ["speed", "colour"]),
-        (b"77.77,red,88.88\n", "no known format, and no header; 3 fields in its first line", []),
+        (b"Speed (m/s),track-id,colour\n77.77,8,red\n", "no known format", ["Speed (m/s)", "track-id", "colour"]),
+        (b"77.77,red,88.88\n", f"{NO_HEADER}; 3 fields in its first line", []),
+        (b"id,lane,77.77\n", f"{NO_HEADER}; 3 fields in its first line", []),
+        (b"veh_12,at 77.77 N,northbound,lane\n", f"{NO_HEADER}; 4 fields in its first line", []),
+        (b'{"lane":"77.77 N","id":"AB,123"},id,lane\n', f"{NO_HEADER}; 5 fields in its first line", []),
+        (b'["x","y",id,lane,"at 77.77"]\n', f"{NO_HEADER}; 5 fields in its first line", []),
+        (b"wagen;77.77;AB-123\n", f"{NO_HEADER}; 1 fields in its first line", []),
     ],
 )
 def test_what_is_not_known_is_described_without_a_value(command, tmp_path, content, problem, names):
