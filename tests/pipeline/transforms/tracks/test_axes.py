@@ -51,6 +51,19 @@ def test_places_on_a_circle(radius_m, share, right_m):
     assert np.stack(axis.locate(places.along_m, places.right_m)) == pytest.approx(np.stack([x, y]), abs=1e-6)
 
 
+def test_places_on_a_way_that_comes_back_beside_itself():
+    # 40 m to the north at x = 2.5, half a circle of 2.5 m to the left, back to the south at x = -2.5.
+    north, turn = np.arange(0, 40, 0.1), np.arange(0, np.pi, 0.02)
+    x = np.concatenate([np.full(400, 2.5), 2.5 * np.cos(turn), np.full(400, -2.5)])
+    axis = draw_axis(x, np.concatenate([north, 40 + 2.5 * np.sin(turn), 40 - north]))
+    at = np.arange(3.0, 37.0, 0.25)
+    # 1 m towards the other way, which is then 4 m away.
+    for x_m, along in ((1.5, at), (-1.5, 80 + 2.5 * np.pi - at)):
+        places = axis.project(np.full(len(at), x_m), at)
+        assert places.along_m == pytest.approx(along, abs=0.3)
+        assert places.right_m == pytest.approx(np.full(len(at), -1.0), abs=0.1)
+
+
 def test_a_way_along_the_axis_is_as_long_as_its_stretch_says():
     axis = draw_circle(150.0, 300.0)
     along = np.arange(20, 280, 1.0)
