@@ -115,7 +115,11 @@ def plan(discovery: Discovery, manifest: Manifest) -> list[Job]:
             by_recording.setdefault((source.name, recording), []).extend(unit.files)
         if contents["unassigned"]:
             jobs.append(_make_job(source.name, f"lines-{unit.files[0].sha256[:12]}", unit.files, recording=None))
-    jobs += [_make_job(name, recording, files, recording) for (name, recording), files in sorted(by_recording.items())]
+    # Several files of a recording may have the same one beside them.
+    jobs += [
+        _make_job(name, recording, list(dict.fromkeys(files)), recording)
+        for (name, recording), files in sorted(by_recording.items())
+    ]
     return jobs
 
 

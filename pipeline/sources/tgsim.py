@@ -90,9 +90,10 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     """Turn the spilled rows of one run, a part per file that holds some of it, into its tables."""
+    logged = [part for part in parts if part.rows is not None]
     shares = [
         part.rows.collect().with_columns(pl.lit(index, pl.Int64).alias(FILE))
-        for index, part in enumerate(parts)
+        for index, part in enumerate(logged)
         if part.rows is not None
     ]
     rows = pl.concat(shares)
@@ -103,7 +104,6 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     entries, conflicts = split_conflicts(entries, key)
     run = rows["run_index"][0]
     centrelines, described = _read_centrelines([part.file for part in parts if part.rows is None], run)
-    logged = [part for part in parts if part.rows is not None]
     dropped = [(off_grid, OFF_GRID), (duplicates, DUPLICATE), (conflicts, CONFLICT)]
     counts = [*(share.height for share in shares), *(lines.frame.height for _, lines in described)]
     logged += [Part(file, rejects=lines.rejects) for file, lines in described]
@@ -204,7 +204,8 @@ def _to_subset(
     sign = -1 if entries.select(pl.col("speed_kf").median() < 0).item() else 1
     if sign < 0:
         notes.append(f"{name}: most speeds are negative, so the signs of speeds and accelerations are turned")
-    left_m = lanes["across"][0] - LANE_M / 2 if lanes.height else entries["across"].min()
+    leftmost = lanes.filter(lane=1)["across"]
+    left_m = leftmost.item() - LANE_M / 2 if leftmost.len() else entries["across"].min()
     entries = entries.join(lanes.select(lane="source", number="lane"), on="lane", how="left", maintain_order="left")
     missing = [made for raw, made in FILLED_BY.items() if entries[raw].is_null().all()]
     tracks = entries.select(
@@ -220,7 +221,7 @@ def _to_subset(
     own_facts = {
         **facts,
         "lanes": main.height or None,
-        "on_ramp_lanes": lanes.filter(pl.col("ramp") == ON_RAMP)["lane"].to_list(),
+        "on_ramp_lanes": lanes.filter(pl.col("ramp") == ON_RAMP)["lane"].drop_nulls().to_list(),
         "columns_missing": sorted({*missing, "headway_recorded_m"}),
     }
     made = assemble_subset(
@@ -235,11 +236,13 @@ def _raise(points: pl.DataFrame) -> pl.DataFrame:
 
 
 def _number_lanes(entries: pl.DataFrame, centrelines: pl.DataFrame) -> pl.DataFrame:
-    """Number the lanes from the left by their vehicles' places across the road, which is how they are sorted.
+    """Number the lanes from the leftmost main one by their vehicles' places across the road, by which they are sorted.
 
-    Returns source (the file's number), lane, across (the median), ramp (the commonest code of its centreline; null
-    where there is none), is_main.
+    Returns source (the file's number), lane (null of others left of a main lane), across (the median), ramp (the
+    commonest code of its centreline; null where there is none), is_main.
     """
+    is_left_of_main = pl.col("is_main").reverse().cum_sum().reverse() > 0
+    has_number = pl.col("is_main") | ~is_left_of_main
     codes = centrelines.group_by(source="lane").agg(ramp=pl.col("ramp").drop_nulls().mode().min())
     return (
         entries.drop_nulls("lane")
@@ -248,18 +251,23 @@ def _number_lanes(entries: pl.DataFrame, centrelines: pl.DataFrame) -> pl.DataFr
         .sort("across", "source")
         .join(codes, on="source", how="left", maintain_order="left")
         .with_columns(
-            lane=pl.int_range(1, pl.len() + 1, dtype=pl.Int16),
             is_main=(pl.col("share") >= MAIN_LANE_SHARE)
             & ~pl.col("ramp").is_in([ON_RAMP, OFF_RAMP]).fill_null(value=False),
         )
+        .with_columns(lane=pl.when(has_number).then(has_number.cum_sum().cast(pl.Int16)))
     )
 
 
 def _describe_lanes(name: str, lanes: pl.DataFrame) -> list[str]:
-    """Say which lanes of the file got other numbers."""
-    if lanes["source"].to_list() == lanes["lane"].to_list():
-        return []
-    return [f"{name}: lanes {', '.join(map(str, lanes['source']))} of the file are numbered 1, 2, ... from the left"]
+    """Say which lanes of the file got other numbers, and which got none."""
+    notes, numbered = [], lanes.drop_nulls("lane")
+    if numbered["source"].to_list() != numbered["lane"].to_list():
+        sources = ", ".join(map(str, numbered["source"]))
+        notes.append(f"{name}: lanes {sources} of the file are numbered 1, 2, ... from the left")
+    return notes + [
+        f"{name}: lane {source} of the file, left of a main lane, is no main lane itself and gets no number"
+        for source in lanes.filter(pl.col("lane").is_null())["source"]
+    ]
 
 
 def _find_range(column: str) -> pl.Expr:

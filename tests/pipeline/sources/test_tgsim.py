@@ -6,11 +6,14 @@ import polars as pl
 import pytest
 from raw_texts import check_accounts, raw_file, write
 
+from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
+from tracklake.pipeline.lake import open_for_writing, scan
 from tracklake.pipeline.sources import tgsim_files
+from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.sources.source import Part, SourceError
 from tracklake.pipeline.sources.tgsim import CONFLICT, DUPLICATE, OFF_GRID, TGSIM
-from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
+from tracklake.schemas import INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES
 
 PORTAL = (
     "id,time,xloc_kf,yloc_kf,lane_kf,speed_kf,acceleration_kf,length_smoothed,width_smoothed,type_most_common,acc,"
@@ -123,6 +126,53 @@ def test_lane_centrelines_tell_the_axis_and_the_ramps_of_their_run(tmp_path):
     assert canonical.log.filter(file=CENTRELINES).select("rows_read", "rows_kept", "rows_dropped").row(0) == (21, 20, 1)
     check_accounts(canonical, entries_from=[FILE])
     assert canonical.log["file"].to_list() == [CENTRELINES, FILE]
+
+
+def test_other_lanes_left_of_the_main_ones_do_not_shift_their_numbers(tmp_path):
+    rows = [*drive(1, 1, 500, frames=120), *drive(2, 2, 480, frames=120), *drive(3, 1, 540, frames=120)]
+    # 3 of 360 rows are labelled lane 9, 20 m to the left: less than 1 %.
+    rows[50:53] = [row.replace(",96.3424,1,", ",116.3424,9,") for row in rows[50:53]]
+    made, _ = read(tmp_path / "rare", FILE, PORTAL, rows)
+    (subset,) = made["i-294-l1-run-1"].subsets
+    tracks = subset.tracks.filter(vehicle_id=1).sort("frame")
+    assert subset.facts.select("lanes", "on_ramp_lanes").row(0) == (2, [])
+    assert subset.vehicles["start_lane"].to_list() == [1, 2, 1]
+    assert tracks["lane"][49:54].to_list() == [1, None, None, None, 1]
+    # Half of 12 ft from the left edge, and 20 m to the left of that.
+    assert tracks["y_m"][49:51].to_list() == pytest.approx([1.829, -18.171], abs=2e-3)
+    assert "lane 9 of the file, left of a main lane" in made["i-294-l1-run-1"].notes[0]
+
+
+def test_an_on_ramp_on_the_left_does_not_shift_the_numbers_of_main_lanes(tmp_path):
+    ramp = [row.replace(",0,20,", ",5,20,") for row in drive(4, 0, 500)]
+    lines = [f"{600 - 20 * step},96.3424,0,{600 - 20 * step},92.6848,0,{600 - 20 * step},100,1" for step in range(20)]
+    beside = write(tmp_path / CENTRELINES, "\n".join(["x1,y1,ramp1,x2,y2,ramp2,x5,y5,ramp5", *lines, ""]).encode())
+    made, _ = read(tmp_path, FILE, PORTAL, [*ROWS, *ramp], beside)
+    (subset,) = made["i-294-l1-run-1"].subsets
+    assert subset.facts.select("lanes", "on_ramp_lanes").row(0) == (2, [])
+    assert subset.vehicles["start_lane"].to_list() == [1, 2, 1, None]
+    # The ramp's middle is half of 12 ft left of the main lanes' left edge.
+    assert subset.tracks.filter(frame=0)["y_m"].to_list() == pytest.approx([1.829, 5.486, 1.829, -1.829], abs=2e-3)
+
+
+def test_two_files_of_one_run_share_its_lane_centrelines(tmp_path):
+    raw, lake = tmp_path / "raw", tmp_path / "lake"
+    for part, rows in ((1, ROWS[:60]), (2, ROWS[59:])):
+        write(raw / f"TGSIM_I-294_L1_part{part}.csv", "\n".join([PORTAL, *rows, ""]).encode())
+    lines = [f"{600 - 20 * step},96.3424,0,{600 - 20 * step},92.6848,0" for step in range(20)]
+    write(raw / CENTRELINES, "\n".join(["x1,y1,ramp1,x2,y2,ramp2", *lines, ""]).encode())
+    with open_for_writing(lake) as writer:
+        found = discover(raw, digest=hash_raw)
+        for dataset, file in ingest.find_unread_files(found, writer.manifest):
+            writer.remember_sources({file.sha256: ingest.read_file(lake, dataset.name, file)})
+        (job,) = ingest.plan(found, writer.manifest)
+        writer.commit(ingest.build(lake, job))
+        log = scan(lake, writer.manifest, INGEST_LOG).collect().sort("file")
+        rejects = scan(lake, writer.manifest, REJECTS).collect()
+    assert log.select("file", "rows_read", "rows_kept").rows() == [
+        (CENTRELINES, 20, 20), ("TGSIM_I-294_L1_part1.csv", 60, 60), ("TGSIM_I-294_L1_part2.csv", 31, 30)]  # fmt: skip
+    # The last row of part 1 is the first of part 2, too.
+    assert rejects.select("file", "line", "text").rows() == [("TGSIM_I-294_L1_part2.csv", 2, ROWS[59])]
 
 
 def test_every_line_is_kept_or_told_with_its_reason(tmp_path):
