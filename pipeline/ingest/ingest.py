@@ -27,6 +27,8 @@ SPREADSHEET_ROWS = 1_048_575
 """Most rows that a spreadsheet holds under its header."""
 REJECTS_FILE = "rejects.parquet"
 """Name of the file, in a spill folder, of lines that belong to no recording."""
+TOTALS_FILE = "totals.parquet"
+"""File with the totals of a spilled file, in its folder."""
 REASONS_SHOWN = 3
 """Reasons named in the message about a recording of which every row was dropped."""
 MEMORY_BUDGET = MemoryBudget(256 << 20)
@@ -75,6 +77,8 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
     if not spilled.recordings:
         raise SourceError(_explain_unreadable(file, spilled.rows_read, spilled.rejects))
     spilled.rejects.write_parquet(folder / REJECTS_FILE)
+    if spilled.totals is not None:
+        spilled.totals.write_parquet(folder / TOTALS_FILE)
     return {
         "dataset": dataset,
         "version": source.version,
@@ -287,7 +291,8 @@ def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
     folder = locate_spill(root, file)
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
     rejects = pl.read_parquet(folder / REJECTS_FILE, glob=False) if alone else None
-    return Part(file, pl.scan_ipc(sorted((folder / recording).glob("*.arrow")), glob=False), rejects)
+    totals = pl.read_parquet(folder / TOTALS_FILE, glob=False) if (folder / TOTALS_FILE).exists() else None
+    return Part(file, pl.scan_ipc(sorted((folder / recording).glob("*.arrow")), glob=False), rejects, totals)
 
 
 def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:

@@ -39,7 +39,7 @@ NO_FRAMES = "fewer than two positions on frames"
 LANE_FT = 12.0
 """Width of a lane in feet."""
 MAIN_LANE_SHARE = 0.05
-"""Least share of a carriageway's entries in a main lane; the shoulder left of lane 1 has fewer."""
+"""Least share of a direction's entries, in the whole file, of a main lane; the shoulder left of lane 1 has fewer."""
 MOST_LANES = 8
 """Highest number of a lane, right of the main lanes: of ramps."""
 ORIGIN_FT = {1: 58 * MILE_FT, -1: 64 * MILE_FT}
@@ -89,7 +89,7 @@ def detect(head: bytes, _name: str) -> str | None:
 def spill_file(file: RawFile, folder: Path) -> Spilled:
     """Read a file document by document into a folder for each period of its time."""
     recordings: Counter[str] = Counter()
-    rejects, read, moved, lost = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0, 0
+    rejects, read, moved, lost, strips = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0, 0, []
     for number, documents in enumerate(read_documents(file)):
         kept, refused = split_unusable(documents)
         points, between, unused = put_on_frames(kept)
@@ -98,6 +98,7 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
         read += documents.read
         moved += between
         lost += unused
+        strips.append(count_strips(points))
         periods = points.partition_by("period", as_dict=True, include_key=False)
         shares = ((_name_period(file, period), rows) for (period,), rows in sorted(periods.items()))
         recordings += spill_rows(folder, number, shares)
@@ -110,7 +111,7 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
     refused = pl.concat(rejects).sort(LINE)
     if refused.height and refused["line"][-1] == read and refused["reason"][-1] == "cut short":
         notes.append(f"{file.name}: ends within document {read:,}: probably TRUNCATED. Download the file again.")
-    return Spilled(dict(recordings), read, refused, tuple(notes))
+    return Spilled(dict(recordings), read, refused, tuple(notes), _add_strips(strips))
 
 
 def split_unusable(documents: Documents) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -218,8 +219,9 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         "ids_split": 0,
     }
     files = [part.file for part in parts]
+    strips = _add_strips([part.totals for part in parts if part.totals is not None])
     subsets = tuple(
-        _to_subset(points.filter(pl.col("direction") == sign), sign, {**facts, "direction": name}, files)
+        _to_subset(points.filter(pl.col("direction") == sign), sign, strips, {**facts, "direction": name}, files)
         for sign, name in DIRECTIONS.items()
         if (points["direction"] == sign).any()
     )
@@ -237,7 +239,9 @@ def _number_vehicles(points: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _to_subset(points: pl.DataFrame, sign: int, facts: dict[str, Any], files: Sequence[RawFile]) -> Subset:
+def _to_subset(
+    points: pl.DataFrame, sign: int, strips: pl.DataFrame, facts: dict[str, Any], files: Sequence[RawFile]
+) -> Subset:
     """Build the tables of one carriageway: fronts in metres, lanes by strips of 12 ft, speeds from positions."""
     sizes = points.group_by("vehicle_id", maintain_order=True).agg(
         source_vehicle_id=pl.col("vehicle").first(),
@@ -246,9 +250,7 @@ def _to_subset(points: pl.DataFrame, sign: int, facts: dict[str, Any], files: Se
         entries_announced=pl.lit(None, pl.Int32),
         **{"class": pl.col("class").first().replace_strict(CLASSES, default=None, return_dtype=pl.String)},
     )
-    # The driver's right has greater y, where y is not negative on the whole carriageway.
-    side = -1 if points.select(pl.col("y_ft").median() < 0).item() else 1
-    left_ft, lanes = find_lanes(side * points["y_ft"])
+    side, left_ft, lanes = find_lanes(strips.filter(pl.col("direction") == sign))
     back = points.select(
         "vehicle_id",
         "frame",
@@ -286,17 +288,33 @@ def _to_subset(points: pl.DataFrame, sign: int, facts: dict[str, Any], files: Se
     )
 
 
-def find_lanes(offset_ft: pl.Series) -> tuple[float, int]:
-    """Find the left edge of the leftmost main lane, in feet, and the number of main lanes.
+def count_strips(points: pl.DataFrame) -> pl.DataFrame:
+    """Count the entries of each direction by strips of 12 ft, from y = 0."""
+    strip = (pl.col("y_ft") / LANE_FT).floor().cast(pl.Int32)
+    return points.group_by("direction", strip=strip).agg(entries=pl.len().cast(pl.Int64))
+
+
+def _add_strips(counts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Add up the counts of strips of blocks or files."""
+    return pl.concat(counts).group_by("direction", "strip").agg(pl.col("entries").sum()).sort("direction", "strip")
+
+
+def find_lanes(strips: pl.DataFrame) -> tuple[int, float, int]:
+    """Find the sign of y to the driver's right, the left edge of the leftmost main lane in feet, and their number.
 
     A lane is a strip of 12 ft, from y = 0. The main lanes begin with the first strip that has a twentieth of the
-    entries: whether lane 1 or the shoulder lies between 0 and 12 ft is for the data to say.
+    entries: whether lane 1 or the shoulder lies between 0 and 12 ft is for the data to say. They are counted over whole
+    files, so that all recordings of a file have the same lanes.
     """
-    strips = (offset_ft / LANE_FT).floor().cast(pl.Int32).value_counts().sort(offset_ft.name)
-    fewest = pl.min_horizontal(pl.lit(MAIN_LANE_SHARE * offset_ft.len()), pl.col("count").max())
-    main = strips.filter(pl.col("count") >= fewest)[offset_ft.name]
+    # The driver's right has greater y, where y is not negative on the whole carriageway.
+    entries = pl.col("entries")
+    is_negative = entries.filter(pl.col("strip") < 0).sum() * 2 > entries.sum()
+    side = -1 if strips.select(is_negative).item() else 1
+    strip = pl.col("strip") if side == 1 else -1 - pl.col("strip")
+    fewest = pl.min_horizontal(MAIN_LANE_SHARE * entries.sum(), entries.max())
+    main = strips.filter(entries >= fewest).select(strip).to_series().sort()
     first = main[0]
-    return first * LANE_FT, int((main - first == pl.Series(range(main.len()))).sum())
+    return side, first * LANE_FT, int((main - first == pl.Series(range(main.len()))).sum())
 
 
 def _derive_rate(column: str) -> pl.Expr:

@@ -1,7 +1,7 @@
 """The documents of a JSON list, read block by block: each is kept as a row, or rejected with its number and a reason.
 
-A document begins where the first key of the first one stands behind a brace. So one that is cut short spoils no other,
-and a file of any size is read in the memory that some blocks take.
+A document begins where a known key, or the first key of the first one, stands behind a brace. So one that is cut short
+spoils no other, and a file of any size is read in the memory that some blocks take.
 """
 
 import io
@@ -15,6 +15,7 @@ import polars as pl
 
 from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA, open_raw, read_block
 from tracklake.pipeline.sources.source import RawFile, SourceError
+from tracklake.schemas.raw_i24 import RAW_I24_FIELDS
 
 BLOCK_BYTES = 16 << 20
 """Size of the blocks of a file that are read at once, in bytes."""
@@ -71,7 +72,8 @@ def _split(read: Callable[[int], bytes], where: str) -> Iterator[list[bytes]]:
     found = FIRST_KEY.match(waiting)
     if found is None:
         raise SourceError(f'{where}: no list of documents. Expected `[{{"_id": ...`, got {waiting[:40]!r}.')
-    begin = re.compile(rb"\{\s*\"" + re.escape(found[1]) + rb"\"\s*:")
+    keys = b"|".join(map(re.escape, {found[1]: None, **dict.fromkeys(map(str.encode, RAW_I24_FIELDS))}))
+    begin = re.compile(rb"\{\s*\"(?:" + keys + rb")\"\s*:")
     ended = False
     while not ended:
         block = read(BLOCK_BYTES)

@@ -73,13 +73,15 @@ class Spilled:
     """The rows of one file that holds several recordings, left in the staging folder.
 
     `recordings` counts rows by recording, which are in `<folder>/<recording>/*.arrow`; `rows_read` counts data lines;
-    `rejects` are `line`, `reason`, `text` of lines that belong to no recording; `notes` are for the user.
+    `rejects` are `line`, `reason`, `text` of lines that belong to no recording; `notes` are for the user; `totals` are
+    counts of the whole file that each of its recordings needs, in columns of the source's own.
     """
 
     recordings: Mapping[str, int]
     rows_read: int
     rejects: pl.DataFrame
     notes: tuple[str, ...] = ()
+    totals: pl.DataFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -87,12 +89,13 @@ class Part:
     """One file's share of a recording.
 
     `rows` are spilled rows, None if the source reads the raw file itself; `rejects` are `line`, `reason`, `text` of
-    rejected lines that can only belong to this recording.
+    rejected lines that can only belong to this recording; `totals` are those of `Spilled`.
     """
 
     file: RawFile
     rows: pl.LazyFrame | None = None
     rejects: pl.DataFrame | None = None
+    totals: pl.DataFrame | None = None
 
 
 @dataclass(frozen=True)

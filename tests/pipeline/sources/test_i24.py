@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from raw_texts import raw_file, write
 
 from tracklake.pipeline.sources import i24_documents
-from tracklake.pipeline.sources.i24 import I24, PERIOD_S, detect, find_lanes, put_on_frames
+from tracklake.pipeline.sources.i24 import I24, PERIOD_S, count_strips, detect, find_lanes, put_on_frames
 from tracklake.pipeline.sources.source import Part, RawFile, SourceError
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 
@@ -49,7 +49,7 @@ def read(folder, text, name=FILE):
     for recording in spilled.recordings:
         rejects = spilled.rejects if len(spilled.recordings) == 1 else None
         rows = pl.scan_ipc(folder / "spilled" / recording / "*.arrow")
-        made[recording] = I24.to_canonical([Part(file, rows, rejects)], recording)
+        made[recording] = I24.to_canonical([Part(file, rows, rejects, spilled.totals)], recording)
         for subset in made[recording].subsets:
             TRACKS.validate(subset.tracks, where=subset.name)
             VEHICLES.validate(subset.vehicles, where=subset.name)
@@ -270,5 +270,28 @@ def test_a_document_without_end_and_no_list_are_refused(monkeypatch):
     ("places", "left", "lanes"),
     [([6, 18, 30], 0, 3), ([18, 30, 42, 54, 66], 12, 5), ([6] + [18] * 30 + [30] * 30, 12, 2), ([18, 42], 12, 1)],
 )
-def test_lanes_begin_with_the_first_strip_that_has_traffic(places, left, lanes):
-    assert find_lanes(pl.Series("y", places, dtype=pl.Float64)) == (left, lanes)
+@pytest.mark.parametrize("side", [1, -1])
+def test_lanes_begin_with_the_first_strip_that_has_traffic(places, left, lanes, side):
+    points = pl.DataFrame({"y_ft": [side * float(place) for place in places]}).with_columns(direction=1)
+    assert find_lanes(count_strips(points)) == (side, left, lanes)
+
+
+def test_all_recordings_of_a_file_have_the_same_lanes(tmp_path):
+    """The strip at 18 ft has 10 of 300 entries in the first five minutes, and 110 of 600 in all."""
+    later = PERIOD_S * 25
+    documents = [document(frames=10, y=18.0)]
+    documents += [document(frames=145, y=y) for y in (30.0, 42.0)]
+    documents += [document(first=later, frames=100, y=y) for y in (18.0, 30.0, 42.0)]
+    made, _ = read(tmp_path, as_list(documents))
+    found = [canonical.subsets[0] for canonical in made.values()]
+    assert [subset.facts["lanes"][0] for subset in found] == [3, 3]
+    assert [sorted(subset.tracks["lane"].unique()) for subset in found] == [[1, 2, 3], [1, 2, 3]]
+    assert [subset.tracks["y_m"].min() for subset in found] == pytest.approx([6 * 0.3048] * 2, abs=1e-3)
+
+
+def test_a_document_with_its_keys_in_another_order_is_one_of_its_own(tmp_path):
+    changed = document(number=2)
+    changed = {"timestamp": changed.pop("timestamp"), **changed}
+    made, spilled = read(tmp_path, as_list([document(), changed, document(number=3)]))
+    assert (spilled.rows_read, spilled.rejects.height) == (3, 0)
+    assert made["i-24-20221122-0600"].subsets[0].vehicles["source_vehicle_id"].to_list() == [1, 2, 3]

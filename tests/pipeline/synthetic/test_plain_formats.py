@@ -86,7 +86,9 @@ def test_the_generated_list_of_i24_is_recognised_as_such_and_holds_what_was_simu
     spilled = I24.spill(file, tmp_path)
     assert spilled.rejects.is_empty()
     (recording,) = spilled.recordings
-    made = I24.to_canonical([Part(file, pl.scan_ipc(tmp_path / recording / "*.arrow"))], recording)
+    made = I24.to_canonical(
+        [Part(file, pl.scan_ipc(tmp_path / recording / "*.arrow"), totals=spilled.totals)], recording
+    )
     assert made.subsets[0].facts["origin"][0] == "synthetic"
     for subset, miles in zip(made.subsets, (59 - 58, 64 - 62), strict=True):
         simulated = truth.filter(kind="first_frame", subset=subset.name).sort("vehicle_id")
