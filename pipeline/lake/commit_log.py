@@ -53,11 +53,15 @@ class CommitLog:
     def replace(self, manifest: Manifest) -> Manifest:
         """Store a manifest in place of the one before, and return what is stored then.
 
-        That has the changes of other processes, too, where they have changed nothing of the same.
+        That has the changes of other processes, too, where they have changed nothing of the same. A lake that takes the
+        place of another goes on with its generations, so that each number stands for one state of this place.
 
         Raises:
             LakeError: another process has changed the same, or others do not cease to replace the root.
         """
+        number = self._root.get("generation")
+        if isinstance(number, int) and self._root.get("lake_id") != manifest.lake_id:
+            manifest = replace(manifest, generation=max(manifest.generation, number + 1))
         for _ in range(MAX_CONFLICTS):
             try:
                 self._swap(manifest)
@@ -114,14 +118,12 @@ class CommitLog:
         return datetime.now(UTC).isoformat(timespec="seconds")
 
     def _keep_root(self) -> None:
-        """Keep the root that ends a generation; a lake that was rebuilt in it has two, of which the first is kept."""
+        """Keep the root that ends a generation."""
         path, content = name_root(self._root["generation"]), _encode(self._root)
         try:
             self.store.put_new(path, content)
-        except AlreadyStoredError:
-            found, tag = self.store.get(path)
-            if found != content and json.loads(found)["lake_id"] == self._root["lake_id"]:
-                self.store.swap(path, content, tag)
+        except AlreadyStoredError:  # by a process that was killed before it stored the next root
+            self.store.swap(path, content, self.store.get(path)[1])
 
     def _rebase(self, manifest: Manifest) -> Manifest:
         """Return what is stored by now with the changes that a manifest was to bring.

@@ -108,7 +108,7 @@ def list_roots(place: LakePlace) -> list[dict[str, Any]]:
     number = present["generation"] if isinstance(present.get("generation"), int) else 0
     store = open_store(place)
     limit = _find_limit(store, number, read_retention(present))
-    kept = (read_kept_root(store, name_root(each)) for each in range(limit, number + 1))
+    kept = (read_kept_root(store, name_root(each)) for each in range(limit, number))
     return [*(document for document in kept if document is not None), present]
 
 

@@ -22,7 +22,7 @@ from tracklake.schemas import SCHEMA_VERSION
 
 
 def start_rebuild(root: Path) -> Manifest:
-    """Return the manifest that takes a lake's place, not stored yet: without commits, under a new id.
+    """Return the manifest that takes a lake's place, not stored yet: its next generation, without commits, a new id.
 
     Readers of the old tables find their files for two more generations, like those of any replaced file. Nothing of
     them is used again, and none is overwritten: see `files.find_free_path`. Raises what `read_document` does.
@@ -37,11 +37,11 @@ def start_rebuild(root: Path) -> Manifest:
         # Other programs number the schemas of their manifest.json, too; theirs must not be replaced.
         raise make_foreign_error(root, ValueError(f"no lake_id in it, and no {CATALOG} beside it"))
     number = document.get("generation")
-    generation = max(number, 0) if isinstance(number, int) else 0
+    generation = 1 + (max(number, 0) if isinstance(number, int) else 0)
     files = {*_list_committed(root, document), *_list_existing(root)}
     return Manifest(
         generation=generation,
-        retired=tuple(Retired(path, generation + 1, void=True) for path in sorted(files)),
+        retired=tuple(Retired(path, generation, void=True) for path in sorted(files)),
         ingested_from=read_sources(document),
         retention=read_retention(document),
     )

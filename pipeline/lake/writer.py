@@ -26,12 +26,12 @@ LOCK = ".lock"
 class Writer:
     """The only process that changes a lake; made by `open_for_writing`."""
 
-    def __init__(self, root: Path, log: CommitLog, *, has_catalog: bool) -> None:
+    def __init__(self, root: Path, log: CommitLog, generation: int, *, has_catalog: bool) -> None:
         self.root = root
         self._log = log
         self.manifest = manifest = log.manifest
         self._cataloged = manifest if has_catalog else None
-        self._generation = manifest.generation + 1
+        self._generation = generation
         self._guard = threading.Lock()
         self._process = os.getpid()
 
@@ -177,8 +177,9 @@ def _open_writer(root: Path, *, rebuild: bool, retention: Retention | None) -> W
     log = CommitLog(root, is_rebuild=rebuild)
     try:
         manifest = start_rebuild(root) if rebuild else log.manifest if log.is_migrated else load(root)
+        generation = manifest.generation + (not rebuild)
     except LakeMissingError:
-        is_new, manifest = True, Manifest()
+        is_new, manifest, generation = True, Manifest(), 1
     if is_new:
         log.replace(manifest)
     shutil.rmtree(root / files.STAGING, ignore_errors=True)
@@ -197,7 +198,7 @@ def _open_writer(root: Path, *, rebuild: bool, retention: Retention | None) -> W
             catalog.rebuild_catalog(root, manifest)
             has_catalog = True
         live_folders.show_manifest(root, manifest)
-    return Writer(root, log, has_catalog=has_catalog)
+    return Writer(root, log, generation, has_catalog=has_catalog)
 
 
 def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:

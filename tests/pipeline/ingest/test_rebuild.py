@@ -198,7 +198,7 @@ def test_manifests_of_any_shape_are_rebuilt(tmp_path, rest):
         load(tmp_path)
     with open_for_writing(tmp_path, rebuild=True) as writer:
         assert (writer.manifest.commits, writer.manifest.retired) == ({}, ())
-    assert load(tmp_path).generation == 0
+    assert load(tmp_path).generation == 1
 
 
 def test_all_folders_it_was_made_from_are_named_the_last_one_first(tmp_path):

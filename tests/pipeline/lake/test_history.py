@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 from small_lake import commit_round, make_status, put, write_round
 
 import tracklake
-from tracklake.pipeline.lake import LakeError, Retention, connect, is_intact, load, open_for_writing
+from tracklake.pipeline.lake import LakeError, Manifest, Retention, connect, is_intact, load, open_for_writing
+from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.history import find_superseded, list_generations, load_as_of
 
 QUESTION = "SELECT sum(backward_vehicles) FROM subset_status"
@@ -92,10 +94,30 @@ def test_what_changes_no_rows_leaves_a_generation_its_time(root: Path):
 
 def test_a_rebuild_leaves_what_was_before_to_be_queried(root: Path):
     with open_for_writing(root, rebuild=True) as writer:
+        assert ask(root, "5") == 8
+        assert list_generations(root)[-1].commits == 0
         writer.commit(put(root, "validate/highd/01", 9, make_status("a", 9), dataset="highd", subset="a"))
     assert [(each.number, each.commits) for each in list_generations(root)] == [(4, 2), (5, 2), (6, 1)]
     assert [ask(root, str(number)) for number in (4, 5, 6)] == [6, 8, 9]
     assert load_as_of(root, "5").lake_id != load(root).lake_id
+
+
+def test_a_lake_that_replaces_another_goes_on_with_its_numbers(root: Path):
+    for _ in range(2):
+        log = CommitLog(root)
+        log.replace(Manifest(generation=1))
+        assert log.replace(replace(log.manifest, sources={"0": {}}, generation=log.manifest.generation + 1)).sources
+    assert [(each.number, each.commits) for each in list_generations(root)] == [(7, 0), (8, 0), (9, 0)]
+    assert len({load_as_of(root, str(number)).lake_id for number in (7, 8, 9)}) == 2
+
+
+def test_a_death_between_both_roots_leaves_each_generation_once(root: Path):
+    kept = root / "manifest" / "roots" / "5.json"
+    shutil.copy(root / "manifest.json", kept)
+    assert [each.number for each in list_generations(root)] == [3, 4, 5]
+    kept.write_text(kept.read_text().replace('"commits": 2', '"commits": 1'))  # and then went on with the session
+    write_round(root, 5)
+    assert [(each.number, each.commits) for each in list_generations(root)] == [(4, 2), (5, 2), (6, 2)]
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b'{"shards": [{}]}'])
