@@ -40,13 +40,14 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     entries, dropped = split_motor_vehicles(entries, read.vehicles)
     sizes, notes = summarise_vehicles(entries, read.vehicles)
     map_points, map_part = None, None
-    about_map = f"SOURCE has no location{read.meta['locationId']}.osm: road axes and lanes are fitted to the tracks"
+    about_map, is_mapped = f"SOURCE has no location{read.meta['locationId']}.osm", False
+    if len(parts) > len(KINDS):
+        about_map = f"{files[-1].name} is of no use, as the recording has no lonLocation"
     if len(parts) > len(KINDS) and read.meta["lonLocation"] is not None:
         origin = read.meta["xUtmOrigin"], read.meta["yUtmOrigin"]
         lanelets = read_lanelet_map(files[-1], read.meta["lonLocation"], origin)
         map_points, map_part = lanelets.points, (Part(files[-1]), lanelets.lanelets)
-        about_map = f"road axes and lanes from {files[-1].name}, {lanelets.lanelets} lanelets"
-        about_map += f"; {lanelets.skipped} without their bounds are skipped" if lanelets.skipped else ""
+        about_map = f"{files[-1].name} has none of the lanelets that vehicles use"
     subsets = []
     for carriageway in _part_carriageways(_read_lists(entries)):
         axis = trace_longest(carriageway)
@@ -57,6 +58,7 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         if points is None:
             axis = fit_to_entries(axis, carriageway)
         else:
+            is_mapped = True
             axis = fit_axis(axis, *_list_points(points, "x_m", "y_m"), points["angle_rad"].to_numpy())
         placed, impossible = split_impossible(place_entries(carriageway, axis))
         dropped += impossible
@@ -81,6 +83,10 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
                 facts=_describe_lanes(lanes),
             )
         )
+    about_map += ": road axes and lanes are fitted to the tracks"
+    if is_mapped:
+        about_map = f"road axes and lanes from {files[-1].name}, {lanelets.lanelets} lanelets"
+        about_map += f"; {lanelets.skipped} without their bounds are skipped" if lanelets.skipped else ""
     return finish_recording("exid", recording, read, dropped, subsets, (about_map, *notes), map_part)
 
 

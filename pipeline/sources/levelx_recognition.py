@@ -4,6 +4,7 @@ import csv
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import PurePosixPath
 
 from tracklake.pipeline.sources.csv import read_head
 from tracklake.pipeline.sources.lanelet_map import is_lanelet_map
@@ -77,8 +78,8 @@ def group(files: Sequence[RawFile], only: Dataset | None = None) -> Grouping:
         grouping = EXID_FORMAT.group_recordings(own)
         refusals += grouping.refusals
         for unit in grouping.units:
-            maps_of_unit = [*filter(None, [maps.get(_find_location(unit.files[0]))])] if dataset == "exid" else []
-            units.append(replace(unit, files=(*unit.files, *maps_of_unit), dataset=dataset))
+            own_map = _find_map(unit.files[0], maps) if dataset == "exid" else []
+            units.append(replace(unit, files=(*unit.files, *own_map), dataset=dataset))
     return Grouping(tuple(units), tuple(refusals))
 
 
@@ -104,11 +105,21 @@ def _read_rows(file: RawFile) -> list[dict[str, str]]:
     return [dict(zip(header, row, strict=False)) for row in csv.reader(lines[1:])]
 
 
-def _sort_maps(files: Iterable[RawFile]) -> dict[str, RawFile]:
-    """Sort maps by the number of their location (`location0.osm`); of several the first by name counts."""
-    maps: dict[str, RawFile] = {}
+def _find_map(recording_meta: RawFile, maps: dict[str, list[RawFile]]) -> list[RawFile]:
+    """Find the map of a recording's location: of several the one with the longest common folder, the first by name."""
+
+    def count_common(file: RawFile) -> int:
+        one, other = ({*PurePosixPath(each.folder, each.filename).parents} for each in (recording_meta, file))
+        return len(one & other)
+
+    return sorted(maps.get(_find_location(recording_meta), []), key=count_common, reverse=True)[:1]
+
+
+def _sort_maps(files: Iterable[RawFile]) -> dict[str, list[RawFile]]:
+    """Sort maps by the number of their location (`location0.osm`), and by name."""
+    maps: dict[str, list[RawFile]] = {}
     for file in sorted(files, key=lambda each: each.name):
         number = re.fullmatch(r"location(\d+)\.osm", file.filename.lower())
         if number is not None:
-            maps.setdefault(number.group(1), file)
+            maps.setdefault(number.group(1), []).append(file)
     return maps

@@ -27,6 +27,11 @@ PARKED_M, PARKED_MPS = 5.0, 0.5
 """Distance between a track's outermost positions and median speed below which a vehicle is taken to be parked."""
 PARKED = "vehicle is parked: it stays within 5 m"
 NO_DRIVE = "no vehicle drives this way for long enough to give it an axis"
+COMMON_CLASSES = ("van", "truck", "trailer")
+"""Classes that recordings of rounD are expected to have."""
+MAYBE_UNID = (
+    "read as rounD by its classes, without van, truck and trailer; uniD's files look the same, and are cited otherwise"
+)
 MISSING = ("lane", "leader_id", "follower_id", "gap_m", "headway_recorded_m")
 """Columns of tracks that the files do not have."""
 
@@ -37,6 +42,8 @@ def to_canonical(parts: Sequence[Part], recording: str, dataset: Dataset) -> Can
     read, entries = URBAN_FORMAT.read_recording(parts[: len(KINDS)], recording)
     entries, dropped = split_motor_vehicles(entries, read.vehicles)
     sizes, notes = summarise_vehicles(entries, read.vehicles)
+    if dataset == "round" and not read.vehicles["class"].str.to_lowercase().is_in(COMMON_CLASSES).any():
+        notes = (*notes, MAYBE_UNID)
     entries, parked = _split_parked(entries)
     dropped += [(parked, PARKED)] if not parked.is_empty() else []
     subsets = []

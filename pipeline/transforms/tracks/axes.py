@@ -10,7 +10,7 @@ from tracklake.schemas.arrays import Floats
 STEP_M = 0.5
 """Distance of two points of an axis, in m; between them it is a straight line, 0.3 mm off at a radius of 100 m."""
 COARSE = 10
-"""Every so many points of an axis one is compared with a position; ways 5 m apart are told from each other."""
+"""Every so many points of an axis one is compared with a position; ways 5 m apart are kept apart."""
 ROWS_AT_ONCE = 50_000
 """Positions that are compared at once with the coarse points."""
 STEPS = 4

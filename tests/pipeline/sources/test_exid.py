@@ -225,6 +225,21 @@ def test_a_vehicle_with_a_turned_heading_does_not_shift_the_lanes(tmp_path, mapp
     assert subset.facts["lanes"].to_list() == [2]
 
 
+def test_of_several_maps_of_a_location_the_one_in_the_same_download_counts(tmp_path):
+    near, _ = write_map(tmp_path / "b" / "maps" / "location3.osm", LANES)
+    far, _ = write_map(tmp_path / "a" / "maps" / "location3.osm", LANES)
+    paths = write_recording(tmp_path / "b" / "data", VEHICLES_ROWS, NORTH)
+    (unit,) = group(recognise([*paths, far, near])).units
+    assert [file.path for file in unit.files[3:]] == [near]
+
+
+def test_a_map_without_the_lanelets_of_a_recording_is_not_said_to_be_used(tmp_path):
+    path, _ = write_map(tmp_path / "location3.osm", {71: (-1.75, 1.75)})
+    canonical = read([*write_recording(tmp_path, VEHICLES_ROWS, NORTH), path])[1]
+    (note,) = [note for note in canonical.notes if "location3.osm" in note]
+    assert "has none of the lanelets that vehicles use: road axes and lanes are fitted to the tracks" in note
+
+
 def test_damaged_maps_are_refused_and_lanelets_without_bounds_are_counted(tmp_path):
     path, _ = write_map(tmp_path / "location3.osm", LANES)
     found = read_lanelet_map(*recognise([path]), 6.9, (350_000.0, 5_640_000.0))

@@ -82,6 +82,13 @@ def test_a_subset_is_a_way_over_the_junction_with_its_own_axis(tmp_path):
     assert canonical.notes == ()
 
 
+@pytest.mark.parametrize(("kind", "is_told"), [("bus", True), ("van", False)])
+def test_a_recording_that_may_be_unid_is_told(tmp_path, kind, is_told):
+    dataset, canonical = read(write_urban(tmp_path, [vehicle_row(0, 250, kind)], turn_right(0)))
+    assert dataset == "round"
+    assert any("uniD" in note for note in canonical.notes) == is_told
+
+
 def test_a_recording_of_parked_vehicles_has_no_subset(tmp_path):
     _, canonical = read(write_urban(tmp_path, [vehicle_row(0, 30, "van")], stay(0)))
     assert canonical.subsets == ()
