@@ -65,8 +65,8 @@ FILLED_BY = {"lane": "lane", "acceleration_kf": "accel_mps2", "length_m": "gap_m
 """Columns of tracks that are null where a column of the entries is."""
 UNKNOWN = "unknown"
 """Site of files whose names tell none."""
-MOVED_M = 1.0
-"""Least distance that tells in which direction a vehicle travels, in m."""
+MOVED_M = 20.0
+"""Distance that tells in which direction a vehicle travels, in m, or half of the greatest one where that is less."""
 
 
 def spill_file(file: RawFile, folder: Path) -> Spilled:
@@ -152,18 +152,20 @@ def _read_centrelines(files: Sequence[RawFile], run: int | None) -> tuple[pl.Dat
 def _split_directions(entries: pl.DataFrame) -> list[tuple[str, Vector, pl.DataFrame]]:
     """Split entries by the vehicles' direction of travel: its name in the image, and a vector, roughly.
 
-    Vehicles that hardly move belong to the direction in which most others travel.
+    Vehicles that hardly move belong to the direction in which most entries of their lanes travel.
     """
     ways = entries.group_by("id", maintain_order=True).agg(
         dx=pl.col("xloc_kf").last() - pl.col("xloc_kf").first(), dy=pl.col("yloc_kf").last() - pl.col("yloc_kf").first()
     )
     x, y = find_direction(ways["dx"].to_numpy(), ways["dy"].to_numpy())
     ahead = pl.col("dx") * x + pl.col("dy") * y
-    side = pl.when(ahead.abs() >= MOVED_M).then(ahead.sign().cast(pl.Int8))
-    ways = ways.select("id", side=side).with_columns(
-        side=pl.col("side").fill_null(pl.col("side").drop_nulls().mode().min())
-    )
-    sides = entries.join(ways.with_columns(pl.col("side").fill_null(1)), on="id", how="left", maintain_order="left")
+    moves = (ahead.abs() >= pl.min_horizontal(MOVED_M, ahead.abs().max() / 2)) & (ahead != 0)
+    ways = ways.select("id", side=pl.when(moves).then(ahead.sign().cast(pl.Int8)))
+    sides = entries.join(ways, on="id", how="left", maintain_order="left")
+    sides = sides.with_columns(lanes=pl.col("side").sum().over("lane_kf").sign())
+    of_lanes, most = pl.col("lanes").sum().over("id").sign(), pl.col("side").drop_nulls().mode().min()
+    side = pl.coalesce("side", pl.when(of_lanes != 0).then(of_lanes), most, 1)
+    sides = sides.with_columns(side=side).drop("lanes")
     found = []
     for sign in (1, -1):
         vector = (sign * x, sign * y)

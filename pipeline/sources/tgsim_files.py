@@ -12,8 +12,8 @@ from tracklake.schemas.raw_tgsim import RAW_TGSIM, RAW_TGSIM_CENTRELINES
 PORTAL, ORIGINAL, URBAN, CENTRELINES = "tgsim-portal", "tgsim-file", "tgsim-urban", "tgsim-centrelines"
 """Dialects: names with underscores (the portal) or hyphens, the urban site's, and lane centrelines."""
 SITES = {
-    "i-294-l1": r"i-?294.*l-?1",
-    "i-294-l2": r"i-?294.*l-?2",
+    "i-294-l1": r"i-?294-?l-?1(?!\d)",
+    "i-294-l2": r"i-?294-?l-?2(?!\d)",
     "i-90-94-moving": r"i-?90.*moving",
     "i-90-94-stationary": r"i-?90.*stationary",
     "i-395": r"i-?395",

@@ -112,6 +112,16 @@ def test_vehicles_of_both_directions_are_two_subsets_and_negative_speeds_are_tur
     assert any("the signs of speeds and accelerations are turned" in note for note in made["i-294-l1-run-1"].notes)
 
 
+def test_a_standing_vehicle_that_drifts_back_stays_in_the_direction_of_its_lane(tmp_path):
+    # Its middle drifts from 300 to 302.9 m in 3 s, in lane 1.
+    standing = [f"9,{tenth / 10},{300 + tenth / 10},96.3424,1,0,0,4,2,small-vehicle,no,1" for tenth in range(30)]
+    made, _ = read(tmp_path, FILE, PORTAL, [*ROWS, *standing])
+    (subset,) = made["i-294-l1-run-1"].subsets
+    first = subset.tracks.filter(frame=0, vehicle_id=1).row(0, named=True)
+    # Its front is at 298 m and its rear at 302 m, 196 m ahead of vehicle 1's front at 498 m.
+    assert (first["leader_id"], first["gap_m"]) == (9, pytest.approx(196, abs=2e-3))
+
+
 def test_lane_centrelines_tell_the_axis_and_the_ramps_of_their_run(tmp_path):
     header = "x1,y1,ramp1,x2,y2,ramp2"
     lines = [f"{600 - 20 * step},{100 - 3.6576:.4f},0,{600 - 20 * step},{100 - 7.3152:.4f},1" for step in range(20)]
@@ -218,3 +228,21 @@ def test_the_runs_are_named_by_the_user_the_site_or_the_file(tmp_path):
     }
     assert sites == {"i-90-94-moving"}
     assert tgsim_files.find_site(replace(file, path=tmp_path / "I-90-I-94 Stationary.csv")) == "i-90-94-stationary"
+
+
+@pytest.mark.parametrize(
+    ("name", "site"),
+    [
+        (FILE, "i-294-l1"),
+        (CENTRELINES, "i-294-l1"),
+        ("TGSIM_I-294_L1_Trajectories.csv", "i-294-l1"),
+        ("I-294_L2_final_1.csv", "i-294-l2"),
+        ("I294L2_Run_1.csv", "i-294-l2"),
+        ("I-294_L12.csv", None),
+        ("I-90_I-94_Moving_Trajectories.csv", "i-90-94-moving"),
+        ("I395_final.csv", "i-395"),
+    ],
+)
+def test_names_tell_their_site(tmp_path, name, site):
+    file = raw_file(write(tmp_path / name, f"{PORTAL}\n".encode()), TGSIM)
+    assert tgsim_files.find_site(file) == site
