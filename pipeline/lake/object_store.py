@@ -33,6 +33,8 @@ ENDPOINTS = {
     "az": ("AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT"),
 }
 """Schemes of addresses, each with the environment variables that name another server than the cloud's own."""
+PROBES = ".probe-"
+"""How the names of objects begin by which a store is tried; a killed process may leave one."""
 CHUNK = 8 << 20
 """Bytes of a piece in which large files are sent."""
 PIECES = 4
@@ -261,7 +263,7 @@ def refuse_unconditional(store: Store) -> None:
     Raises:
         StoreError: it creates what exists, or replaces what has changed.
     """
-    path = f".probe-{uuid.uuid4().hex}"
+    path = f"{PROBES}{uuid.uuid4().hex}"
     lacking = "If-None-Match: *"
     tag = store.put_new(path, b"1")
     try:

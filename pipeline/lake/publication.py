@@ -41,7 +41,7 @@ from tracklake.pipeline.lake.manifest import (
     read_root,
 )
 from tracklake.pipeline.lake.object_access import DIGEST_DIGITS, name_object
-from tracklake.pipeline.lake.object_store import refuse_unconditional
+from tracklake.pipeline.lake.object_store import PROBES, refuse_unconditional
 from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import parse_shards
 from tracklake.pipeline.lake.store import Store
@@ -184,7 +184,6 @@ def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = Fals
         StoreError: the store ignores the conditions of writes.
         LakeError: another lake or something else is there.
     """
-    refuse_unconditional(store)
     try:
         owner = read_root(store.place).get("lake_id")
         if not isinstance(owner, str):
@@ -192,22 +191,23 @@ def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = Fals
     except LakeMissingError:
         owner = _read_marker(store)
     if owner is None:
-        other = next((item for item in store.list() if item.path != LEASE), None)
+        other = next((item for item in store.list() if item.path != LEASE and not item.path.startswith(PROBES)), None)
         if other is not None:
             raise LakeError(
                 f"{store.place}: holds other objects, such as {other.path}, and no lake. Name an empty or new folder "
                 "of the bucket."
-            ) from None
-        if lake_id is not None:
-            try:
-                store.put_new(MARKER, lake_id.encode())
-            except AlreadyStoredError:
-                raise LakeError(f"{store.place}: another process has just put a lake there. Run again.") from None
+            )
     elif lake_id not in (None, owner) and not replace_other:
         raise LakeError(
             f"{store.place}: holds another lake ({owner}). Name another folder of the bucket, or give --replace to put "
             "this one in its place."
         )
+    refuse_unconditional(store)
+    if owner is None and lake_id is not None:
+        try:
+            store.put_new(MARKER, lake_id.encode())
+        except AlreadyStoredError:
+            raise LakeError(f"{store.place}: another process has just put a lake there. Run again.") from None
 
 
 def _read_marker(store: Store) -> str | None:
@@ -233,8 +233,9 @@ def sweep_objects(address: str) -> int:
         needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
         commits = parse_manifest(address, collect_document(address, document)).commits.values()
         needed |= {name_object(file) for commit in commits for file in commit.all_files}
-    old = [item.path for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)]
-    store.delete(old)
+    old = {item for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)}
+    old &= {*store.list()} if old else set()  # what another writer has sent again meanwhile has another time
+    store.delete(item.path for item in old)
     return len(old)
 
 

@@ -379,3 +379,17 @@ def test_an_old_object_that_no_state_needs_is_sent_again(folder, bucket, monkeyp
     monkeypatch.setattr(publication, "GRACE", timedelta(seconds=-10))
     monkeypatch.setattr(publication, "sweep_objects", lambda _address: 0)
     assert publish_lake(folder, bucket).files == len(commit.all_files)
+
+
+def test_a_probe_that_a_killed_process_left_blocks_no_place(folder, bucket):
+    ObjectStore(bucket).put_new(".probe-0123", b"")
+    publish_lake(folder, bucket)
+    assert read_status(bucket) == read_status(folder)
+
+
+def test_nothing_is_written_to_a_place_of_others(folder, bucket, monkeypatch):
+    """Not even to try whether the store honours conditions."""
+    ObjectStore(bucket).put_new("paper.txt", b"")
+    monkeypatch.setattr(ObjectStore, "put_new", None)
+    with pytest.raises(LakeError, match=r"holds other objects, such as paper\.txt"):
+        publish_lake(folder, bucket)
