@@ -43,8 +43,8 @@ def judge_vehicles(feeds: Feeds) -> dict[str, Figure]:
     missed = np.ones(len(overhead))
     missed[feeds.shared] = 0.0
     false = np.repeat((0.0, 1.0), (len(perceived), len(feeds.ghosts)))
-    strangers = np.append(perceived.vehicle, _name_ghosts(feeds))
-    return {"missed_share": Figure(missed, overhead.vehicle), "false_share": Figure(false, strangers)}
+    perceived_or_false = np.append(perceived.vehicle, _name_ghosts(feeds))
+    return {"missed_share": Figure(missed, overhead.vehicle), "false_share": Figure(false, perceived_or_false)}
 
 
 def judge_model(model: Forecaster, feeds: Feeds, seen: dict[tuple[str, bytes], Singles]) -> list[dict[str, Figure]]:

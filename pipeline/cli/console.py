@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -33,6 +34,7 @@ class Terminal:
         self.as_json = as_json
         self.verbose = not (quiet or as_json)
         self._synthetic: str | None = None
+        self._held: list[dict[str, Any]] | None = None
 
     def print_line(self, text: str, *, style: str = "") -> None:
         """Print a line for people."""
@@ -63,10 +65,32 @@ class Terminal:
 
     def print_json(self, record: dict[str, Any]) -> None:
         """Print the result for programs, with --json."""
-        if self.as_json:
+        if self._held is not None:
+            self._held.append(record)
+        elif self.as_json:
             synthetic = {} if self._synthetic is None else {"synthetic": self._synthetic}
             json.dump({**record, **synthetic}, sys.stdout, indent=1, allow_nan=False, default=str)
             sys.stdout.write("\n")
+
+    @contextmanager
+    def hold_json(self) -> Iterator[None]:
+        """Print the results of a block at its end, and none of them if it fails, which is then the result."""
+        held: list[dict[str, Any]] = []
+        self._held = held
+        try:
+            yield
+        except typer.Exit:  # a part was refused or failed, which the results say
+            self._release_json(held)
+            raise
+        except BaseException:
+            self._held = None
+            raise
+        self._release_json(held)
+
+    def _release_json(self, held: list[dict[str, Any]]) -> None:
+        self._held = None
+        for record in held:
+            self.print_json(record)
 
     @contextmanager
     def show_stages(self) -> Iterator[None]:

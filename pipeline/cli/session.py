@@ -101,7 +101,7 @@ def work_in_folder(terminal: Terminal, settings: Settings, *, rebuild: bool = Fa
         return
     copy = WorkingCopy(address, name_copy(address, settings.cache))
     terminal.print_line(f"working in {copy.folder}, a copy of {address}", style="dim")
-    with copy.hold(is_rebuild=rebuild) as received:
+    with terminal.hold_json(), copy.hold(is_rebuild=rebuild) as received:
         if received is not None and received.files:
             terminal.print_line(f"fetched {received.files:,} files, {received.bytes / 1e6:,.1f} MB", style="dim")
         try:

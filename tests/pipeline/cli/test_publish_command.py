@@ -1,6 +1,7 @@
 """`tracklake publish store`, `fetch`, and commands on a lake at an address, as a user runs them."""
 
 import json
+from unittest.mock import Mock
 
 import pytest
 from object_stores import HEEDLESS
@@ -9,8 +10,10 @@ from small_recordings import write_highd
 
 import tracklake
 from tracklake.pipeline.lake import LakeMissingError, load
+from tracklake.pipeline.lake.errors import StoreError
 from tracklake.pipeline.lake.lease import hold_lease
 from tracklake.pipeline.lake.places import open_store
+from tracklake.pipeline.lake.working_copy import WorkingCopy
 from tracklake.pipeline.orchestration import api
 from tracklake.pipeline.orchestration.run_plan import RunRequest
 from tracklake.schemas.errors import UsageError
@@ -155,3 +158,15 @@ def test_a_store_that_does_not_guard_is_refused_before_any_work(machine, object_
     done = machine("one", "ingest", tmp_path / "raw", "--lake", object_store_server.make_bucket(HEEDLESS))
     assert (done.code, "ignores the condition" in done.err) == (1, True)
     assert not [*(tmp_path / "one").rglob("*.parquet")]
+
+
+@pytest.mark.usefixtures("plain_flows")
+def test_a_failed_publication_is_the_only_result_for_programs(machine, bucket, tmp_path, monkeypatch):
+    write_highd(tmp_path / "raw", "01")
+    refuse = Mock(side_effect=StoreError("no room"))
+    with monkeypatch.context() as patched:
+        patched.setattr(WorkingCopy, "publish", refuse)
+        done = machine("one", "ingest", tmp_path / "raw", "--lake", bucket, "--json")
+    assert (done.code, json.loads(done.out)) == (1, {"error": "no room"})
+    done = machine("one", "ingest", tmp_path / "raw", "--lake", bucket, "--json")
+    assert (done.code, "error" in json.loads(done.out)) == (0, False)
