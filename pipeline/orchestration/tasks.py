@@ -1,16 +1,13 @@
 """Prefect's tasks, one per (stage, recording), records in and records out; and the work that submits them."""
 
-import errno
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
-from prefect.client.schemas.objects import State
 from prefect.futures import PrefectFuture, as_completed
 from prefect.logging import get_run_logger
 
@@ -26,6 +23,7 @@ from tracklake.pipeline.lake import (
     list_ingested,
     open_for_writing,
 )
+from tracklake.pipeline.orchestration import batches
 from tracklake.pipeline.orchestration.artifacts import name_run
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.orchestration.run_plan import (
@@ -43,51 +41,37 @@ from tracklake.pipeline.orchestration.run_plan import (
 )
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile, SourceError
-from tracklake.pipeline.stages.planner import Planner, build_jobs, group_jobs
+from tracklake.pipeline.stages.planner import Planner, group_jobs
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas import StructureError
-from tracklake.schemas.errors import FileAccessError, describe_error
+from tracklake.schemas.errors import describe_error
 
-LASTING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EROFS, errno.EACCES, errno.EPERM)
-"""Errors of the operating system that a second try does not cure: full disks, limits, missing rights."""
 LOCK_POLL_S = 1.0
 """Time between two looks at a lake that another process writes to, in seconds."""
 Results = Iterable[tuple[str, Any]]
 """Titles of tasks with their results or errors."""
 
 
-def _is_io_error(_task: object, _run: object, state: State[Any]) -> bool:
-    """Retry what a busy disk or a network share may cause; nothing else becomes right by a retry."""
-    error = state.result(raise_on_failure=False)
-    cause = error.__cause__ if isinstance(error, FileAccessError) else error
-    return isinstance(cause, OSError) and cause.errno not in LASTING
-
-
 TASK: dict[str, Any] = {
     "cache_policy": NO_CACHE,
     "persist_result": False,
-    "retries": 2,
-    "retry_delay_seconds": 1,
-    "retry_condition_fn": _is_io_error,
 }
-"""Options of every task: nothing is cached, and input and output are tried three times."""
+"""Options of every task: nothing is cached."""
 
 
 @task(task_run_name="read {title}", **TASK)
 def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
     """Read one file that holds several recordings into the staging folder."""
     del title
-    return ingest.read_file(Path(lake), dataset, RawFile.from_dict(file))
+    return batches.read_file(lake, dataset, file)
 
 
 @task(task_run_name="{stage} {title}", **TASK)
 def build(stage: str, title: str, lake: str, jobs: list[dict[str, Any]], settings: dict[str, Any]) -> list[Commit]:
     """Do one stage's work on one recording, or some: read, transform, validate, write; returns the commits to make."""
     del title
-    if stage == INGEST:
-        return [ingest.build(Path(lake), Job(**job)) for job in jobs]
-    return build_jobs(STAGE_BY_NAME[stage], Path(lake), [Job(**job) for job in jobs], Settings(**settings))
+    return batches.build_group(lake, stage, [Job(**job) for job in jobs], Settings(**settings))
 
 
 def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
