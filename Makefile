@@ -43,12 +43,13 @@ test-thorough: install
 LOWEST := .venv-lowest
 CORE := tests/test_extras.py tests/schemas tests/quality_reports/rules tests/pipeline/transforms/starts \
 	tests/pipeline/sources/csv/test_table_files.py tests/pipeline/lake/test_macros.py tests/pipeline/cli/test_sql_command.py \
-	tests/pipeline/export tests/training/lane_changes/test_lane_forest.py
+	tests/pipeline/export tests/training/lane_changes/test_lane_forest.py \
+	tests/pipeline/orchestration/test_dask_workers.py
 
 test-lowest: install
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
 	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct \
-		--editable ".[flows,report,forest,matlab,reconstruct,sample,dev]"
+		--editable ".[flows,report,forest,matlab,reconstruct,sample,distributed,dev]"
 	$(LOWEST)/bin/pytest -n 2 --dist loadgroup $(CORE)
 
 # mypy and import-linter read folders, not what an import finds: links give the packages their installed names.

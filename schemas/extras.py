@@ -12,7 +12,7 @@ EXTRAS = {
     "matlab": ("scipy",),
     "reconstruct": ("scipy",),
     "sample": ("sumo",),
-    "distributed": ("prefect_dask",),
+    "distributed": ("distributed",),
     "object-store": ("obstore", "duckdb_extension_httpfs", "duckdb_extension_aws"),
     "ducklake": ("duckdb_extension_ducklake",),
     "onboard": ("pyproj", "rosbags", "scipy", "sklearn"),

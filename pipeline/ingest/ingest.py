@@ -1,7 +1,9 @@
 """Ingest: raw files to tracks, vehicles and subsets, every row accounted for."""
 
 import os
+import shutil
 import time
+import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -72,13 +74,19 @@ def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
     source = SOURCE_BY_NAME[dataset]
     assert source.spill is not None
     folder = locate_spill(root, file)
-    folder.mkdir(parents=True, exist_ok=True)
-    spilled = source.spill(file, folder)
-    if not spilled.recordings:
-        raise SourceError(_explain_unreadable(file, spilled.rows_read, spilled.rejects))
-    spilled.rejects.write_parquet(folder / REJECTS_FILE)
-    if spilled.totals is not None:
-        spilled.totals.write_parquet(folder / TOTALS_FILE)
+    aside = folder.with_name(f"{uuid.uuid4().hex}.tmp")  # what a killed worker leaves is not taken for the whole
+    aside.mkdir(parents=True)
+    try:
+        spilled = source.spill(file, aside)
+        if not spilled.recordings:
+            raise SourceError(_explain_unreadable(file, spilled.rows_read, spilled.rejects))
+        spilled.rejects.write_parquet(aside / REJECTS_FILE)
+        if spilled.totals is not None:
+            spilled.totals.write_parquet(aside / TOTALS_FILE)
+        if not folder.exists():
+            aside.replace(folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
     return {
         "dataset": dataset,
         "version": source.version,

@@ -32,9 +32,9 @@ def list_names(commits: Iterable[Commit]) -> dict[str, str]:
     return names
 
 
-def show_commit(root: Path, commit: Commit | None, replaced: Iterable[Commit]) -> None:
-    """Let the live folders show a commit and no longer what it replaces; each name changes in one step."""
-    names = list_names([] if commit is None else [commit])
+def show_commits(root: Path, commits: Iterable[Commit], replaced: Iterable[Commit]) -> None:
+    """Let the live folders show commits and no longer what they replace; each name changes in one step."""
+    names = list_names(commits)
     for name, path in names.items():
         _link(root, path, name)
     remove_files(root, (root / name for name in list_names(replaced) if name not in names))

@@ -1,7 +1,7 @@
 """The manifest: the live files of every table, and what each was built from."""
 
 import uuid
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -154,8 +154,13 @@ class Manifest:
 
     def add_commit(self, commit: Commit, generation: int) -> "Manifest":
         """Return the manifest with a commit added or replaced; the replaced files are retired."""
-        replaced = [self.commits[commit.key]] if commit.key in self.commits else []
-        return self._replace_commits({**self.commits, commit.key: commit}, replaced, [commit], generation)
+        return self.add_commits([commit], generation)
+
+    def add_commits(self, commits: Sequence[Commit], generation: int) -> "Manifest":
+        """Return the manifest with commits added or replaced, each with a key of its own."""
+        replaced = [self.commits[commit.key] for commit in commits if commit.key in self.commits]
+        all_commits = {**self.commits, **{commit.key: commit for commit in commits}}
+        return self._replace_commits(all_commits, replaced, commits, generation)
 
     def mark_damaged(self, keys: Collection[str]) -> "Manifest":
         """Return the manifest with some commits without fingerprints, so that they are made again; files stay live."""

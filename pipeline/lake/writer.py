@@ -35,15 +35,20 @@ class Writer:
         self._guard = threading.Lock()
         self._process = os.getpid()
 
-    def commit(self, commit: Commit) -> None:
-        """Make a commit's files live and those it replaces retired."""
+    def commit(self, *commits: Commit) -> None:
+        """Make the files of commits live at once, and those they replace retired."""
         with self._guard:
-            if not files.is_intact(self.root, commit.all_files):
-                raise LakeError(f"{self.root}: files of {commit.key} vanished before they were committed. Run again.")
-            before = self.manifest.commits.get(commit.key)
-            if before != commit:
-                self._store(self.manifest.add_commit(commit, self._generation))
-                live_folders.show_commit(self.root, commit, [] if before is None else [before])
+            for commit in commits:
+                if not files.is_intact(self.root, commit.all_files):
+                    raise LakeError(
+                        f"{self.root}: files of {commit.key} vanished before they were committed. Run again."
+                    )
+            known = self.manifest.commits
+            new = [commit for commit in commits if known.get(commit.key) != commit]
+            if new:
+                self._store(self.manifest.add_commits(new, self._generation))
+                replaced = [known[commit.key] for commit in new if commit.key in known]
+                live_folders.show_commits(self.root, new, replaced)
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -58,7 +63,7 @@ class Writer:
             removed = [commit for key, commit in self.manifest.commits.items() if key in keys]
             if removed:
                 self._store(self.manifest.remove_commits(keys, self._generation))
-                live_folders.show_commit(self.root, None, removed)
+                live_folders.show_commits(self.root, [], removed)
 
     def mark_damaged(self, keys: Collection[str]) -> None:
         """Record commits as damaged, so that the next run makes them again; their files stay live until then."""

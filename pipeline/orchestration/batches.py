@@ -1,11 +1,17 @@
-"""The work that a thread or a worker does, with nothing of Prefect and Dask: records in, records out."""
+"""The work that a thread or a worker does, and how it is divided; with nothing of Prefect and Dask.
+
+Records go in and come out, never frames: what is sent to a worker is a `Call` of `build_group` or `read_file`.
+"""
 
 import errno
 import logging
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import Commit
@@ -17,6 +23,8 @@ from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas.errors import FileAccessError
 
 T = TypeVar("T")
+Outcome = tuple["Call", Any]
+"""A call, and its result or the exception that it raised."""
 
 LASTING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EROFS, errno.EACCES, errno.EPERM)
 """Errors of the operating system that a second try does not cure: full disks, limits, missing rights."""
@@ -24,7 +32,80 @@ TRIES = 3
 """Times that input and output are tried."""
 RETRY_DELAY_S = 1.0
 """Time between two tries, in seconds."""
+MOST_BATCHES = 100
+"""Batches of one stage, of which each is one task of Prefect's and one commit; with more calls than that, they grow."""
+BATCHES_AT_ONCE = 3
+"""Batches under way at once on Dask workers, which have work while the last calls of one of them end."""
 LOG = logging.getLogger("tracklake")
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a function for one recording, or for some that are built together: fit to be sent to a worker.
+
+    Args:
+        titles: names of the recordings, or files, in progress bars and messages.
+    """
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    titles: tuple[str, ...]
+
+    def run(self) -> Any:  # noqa: ANN401  (records of several kinds)
+        """Do the work, and return its records."""
+        return self.function(*self.arguments)
+
+
+class Engine(Protocol):
+    """Whatever does calls: threads of this process, or Dask workers.
+
+    Args:
+        slots: calls that are done at once.
+        batch_calls: fewest calls in a batch, so that none of the slots is idle.
+    """
+
+    slots: int
+    batch_calls: int
+
+    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+        """Yield the outcome of each call as it ends."""
+
+
+class Threads:
+    """Does the calls of a batch one after the other, in the thread that asks for them."""
+
+    def __init__(self, workers: int) -> None:
+        self.slots = workers
+        self.batch_calls = 1
+        self._stopped = threading.Event()
+
+    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+        """Yield the outcome of each call as it ends."""
+        del stage
+        for call in calls:
+            if self._stopped.is_set():
+                return
+            try:
+                made = call.run()
+            except Exception as error:  # noqa: BLE001  (an outcome, which the flow sorts)
+                made = error
+            yield call, made
+
+    def stop(self) -> None:
+        """Begin no further call: the flow was interrupted."""
+        self._stopped.set()
+
+
+def divide_calls(engine: Engine, calls: Sequence[Call]) -> list[Sequence[Call]]:
+    """Divide a stage's calls into batches: of one, where threads do at most a hundred of them."""
+    size = max(engine.batch_calls, ceil(len(calls) / MOST_BATCHES))
+    return [calls[start : start + size] for start in range(0, len(calls), size)]
+
+
+def name_batch(calls: Sequence[Call]) -> str:
+    """Return the name of a batch: `04`, or `01 to 20 (20)`."""
+    titles = [title for call in calls for title in call.titles]
+    return ", ".join(titles) if len(calls) < 2 else f"{titles[0]} to {titles[-1]} ({len(titles)})"
 
 
 def build_group(lake: str, stage: str, jobs: Sequence[Job], settings: Settings) -> list[Commit]:

@@ -1,7 +1,7 @@
-"""Prefect flows: ingest, quality, and the whole run; one task per (stage, recording), records in and records out.
+"""Prefect flows: ingest, quality, and the whole run; one task per stage and batch of recordings.
 
-Prefect runs tasks, retries them, and shows runs and artifacts. It caches nothing: what is done already is decided by
-the lake's fingerprints (`pipeline.orchestration.run_plan`), so that an idle command never comes here.
+Prefect runs tasks, and shows runs and artifacts. It caches nothing: what is done already is decided by the lake's
+fingerprints (`pipeline.orchestration.run_plan`), so that an idle command never comes here.
 """
 
 import logging
@@ -18,12 +18,13 @@ from prefect.logging import get_run_logger
 from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
 from prefect.states import Completed, Failed
-from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
+from prefect.task_runners import ThreadPoolTaskRunner
 from pydantic import Field
 from typing_extensions import TypedDict
 
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.orchestration.artifacts import attach, name_run, publish, summarise_report, tabulate_messages
+from tracklake.pipeline.orchestration.batches import BATCHES_AT_ONCE
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
     QUALITY_STEPS,
@@ -42,7 +43,6 @@ from tracklake.pipeline.stages.planner import Planner
 from tracklake.pipeline.stages.stage import INGEST
 from tracklake.schemas.columns import Dataset
 from tracklake.schemas.errors import TracklakeError
-from tracklake.schemas.extras import require_extras
 
 REPORT = "report"
 """Name of the stage whose figures a run shows as artifacts."""
@@ -224,11 +224,13 @@ def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
     else:
         parameters["stage"] = "+".join(request.steps)
     heartbeat = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}  # costs a second, and nothing uses it
+    settings = request.get_settings()
+    threads = settings.workers if settings.runner == "threads" else BATCHES_AT_ONCE
     with use_server() as notes, temporary_settings(heartbeat):
         _mute_console()  # after all that sets logging up
         token = _PLAN.set(plan)
         try:
-            made = chosen.with_options(task_runner=_choose_runner(request.get_settings()))(**parameters)
+            made = chosen.with_options(task_runner=ThreadPoolTaskRunner(max_workers=threads))(**parameters)
             result = RunResult(**made)
         except FlowFailedError as failed:
             result = failed.result
@@ -236,19 +238,6 @@ def execute(request: RunRequest, plan: RunPlan | None = None) -> RunResult:
             _PLAN.reset(token)
     result.notes += notes
     return result
-
-
-def _choose_runner(settings: Settings) -> TaskRunner[Any]:
-    """Return threads (Polars and DuckDB release the interpreter) or Dask workers (which need a shared disk)."""
-    if settings.runner == "threads":
-        return ThreadPoolTaskRunner(max_workers=settings.workers)
-    require_extras('the setting runner = "dask"', "distributed")
-    from prefect_dask.task_runners import DaskTaskRunner
-
-    if settings.dask_address is not None:
-        return DaskTaskRunner(address=settings.dask_address)
-    cluster = {"n_workers": settings.workers, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
-    return DaskTaskRunner(cluster_kwargs=cluster)
 
 
 def _mute_console() -> None:

@@ -1,19 +1,18 @@
-"""Prefect's tasks, one per (stage, recording), records in and records out; and the work that submits them."""
+"""Prefect's tasks, one per stage and batch of recordings; the work that submits them, and commits what they made."""
 
 import time
-from collections.abc import Iterable
-from contextlib import ExitStack
-from dataclasses import asdict, replace
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
-from prefect.futures import PrefectFuture, as_completed
+from prefect.futures import as_completed
 from prefect.logging import get_run_logger
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.lake import (
-    Commit,
     DamagedFileError,
     LakeLockedError,
     Manifest,
@@ -23,8 +22,18 @@ from tracklake.pipeline.lake import (
     list_ingested,
     open_for_writing,
 )
-from tracklake.pipeline.orchestration import batches
+from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.pipeline.orchestration.artifacts import name_run
+from tracklake.pipeline.orchestration.batches import (
+    Call,
+    Engine,
+    Outcome,
+    Threads,
+    build_group,
+    divide_calls,
+    name_batch,
+    read_file,
+)
 from tracklake.pipeline.orchestration.progress import reporter
 from tracklake.pipeline.orchestration.run_plan import (
     RunPlan,
@@ -39,46 +48,67 @@ from tracklake.pipeline.orchestration.run_plan import (
     remove_missing,
     remove_outdated,
 )
-from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile, SourceError
 from tracklake.pipeline.stages.planner import Planner, group_jobs
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas import StructureError
-from tracklake.schemas.errors import describe_error
+from tracklake.schemas.errors import TracklakeError, describe_error
+from tracklake.schemas.extras import require_extras
 
 LOCK_POLL_S = 1.0
 """Time between two looks at a lake that another process writes to, in seconds."""
-Results = Iterable[tuple[str, Any]]
-"""Titles of tasks with their results or errors."""
 
 
-TASK: dict[str, Any] = {
-    "cache_policy": NO_CACHE,
-    "persist_result": False,
-}
-"""Options of every task: nothing is cached."""
+class BatchFailedError(Exception):
+    """The end of a batch in which some calls failed, or which broke off; it carries the outcomes that there are."""
+
+    def __init__(self, outcomes: list[Outcome], broken: TracklakeError | None) -> None:
+        failures = [describe_error(made) for _, made in outcomes if isinstance(made, BaseException)]
+        said = [str(broken)] if broken is not None else failures
+        super().__init__(f"{len(failures)} of {len(outcomes)} failed: {said[0]}")
+        self.outcomes = outcomes
+        self.broken = broken
 
 
-@task(task_run_name="read {title}", **TASK)
-def read_file(title: str, lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
-    """Read one file that holds several recordings into the staging folder."""
+@task(task_run_name="{stage} {title}", cache_policy=NO_CACHE, persist_result=False)
+def do_batch(stage: str, title: str, do: Callable[[], Iterator[Outcome]]) -> list[Outcome]:
+    """Do one stage's work on a batch of recordings, and return its outcomes."""
     del title
-    return batches.read_file(lake, dataset, file)
+    outcomes, broken = [], None
+    try:
+        for call, made in do():
+            outcomes.append((call, made))
+            for name in call.titles:
+                reporter().advance(stage, name)
+    except TracklakeError as error:  # of the workers as a whole
+        broken = error
+    if broken is not None or any(isinstance(made, BaseException) for _, made in outcomes):
+        raise BatchFailedError(outcomes, broken)
+    return outcomes
 
 
-@task(task_run_name="{stage} {title}", **TASK)
-def build(stage: str, title: str, lake: str, jobs: list[dict[str, Any]], settings: dict[str, Any]) -> list[Commit]:
-    """Do one stage's work on one recording, or some: read, transform, validate, write; returns the commits to make."""
-    del title
-    return batches.build_group(lake, stage, [Job(**job) for job in jobs], Settings(**settings))
+def _do_calls(engine: Engine, stage: str, calls: Sequence[Call]) -> Iterator[list[Outcome]]:
+    """Do a stage's calls and yield the outcomes of each batch as it ends.
 
-
-def _await_results(futures: dict[PrefectFuture[Any], str]) -> Results:
-    """Yield (title, result or error) of each future as it ends."""
-    for future in as_completed(list(futures)):
+    Raises:
+        TracklakeError: the workers broke off; what they had done was yielded before.
+    """
+    reporter().begin(stage, sum(len(call.titles) for call in calls))
+    batches = divide_calls(engine, calls)
+    futures = [do_batch.submit(stage, name_batch(batch), partial(engine.do, stage, batch)) for batch in batches]
+    broken = None
+    for future in as_completed(futures):
         future.wait()
-        yield futures[future], future.state.result(raise_on_failure=False)
+        made: list[Outcome] | BaseException = future.state.result(raise_on_failure=False)
+        if isinstance(made, BatchFailedError):
+            broken = broken or made.broken
+            made = made.outcomes
+        if isinstance(made, BaseException):
+            raise made
+        yield made
+    if broken is not None:
+        raise broken
 
 
 def _record_error(title: str, error: BaseException, result: RunResult) -> None:
@@ -89,45 +119,40 @@ def _record_error(title: str, error: BaseException, result: RunResult) -> None:
         result.failed.append(f"{title}: {describe_error(error)}")
 
 
-def _build_all(writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult) -> None:
-    """Run a stage's jobs and commit each as it ends."""
+def _build_all(
+    writer: Writer, stage: str, jobs: list[Job], request: RunRequest, result: RunResult, engine: Engine
+) -> None:
+    """Run a stage's jobs and commit each batch as it ends."""
     if not jobs:
         return
-    show = reporter()
-    show.begin(stage, len(jobs))
     settings = request.get_settings()
-    if stage == INGEST:
-        groups = [[job] for job in jobs]
-    else:
-        groups = group_jobs(STAGE_BY_NAME[stage], writer.manifest, jobs, settings.workers)
-    titles = [", ".join(job.title for job in group) for group in groups]
-    values = settings.model_dump(mode="json")
-    futures = {
-        build.submit(stage, title, request.lake, [asdict(job) for job in group], values): title
-        for title, group in zip(titles, groups, strict=True)
-    }
-    for title, made in _await_results(futures):
-        if isinstance(made, list):
-            for commit in made:
-                writer.commit(commit)
-                result.notes += commit.info.get("notes", [])
+    groups = [[job] for job in jobs]
+    if stage != INGEST:
+        groups = group_jobs(STAGE_BY_NAME[stage], writer.manifest, jobs, engine.slots)
+    calls = [
+        Call(build_group, (request.lake, stage, group, settings), tuple(job.title for job in group)) for group in groups
+    ]
+    for outcomes in _do_calls(engine, stage, calls):
+        made = [commit for _, commits in outcomes if isinstance(commits, list) for commit in commits]
+        writer.commit(*made)
+        result.notes += [note for commit in made for note in commit.info.get("notes", [])]
+        if made:
             result.built[stage] = result.built.get(stage, 0) + len(made)
-        else:
-            _record_error(title, made, result)
-            if isinstance(made, DamagedFileError):
-                writer.mark_damaged({file.key for file in find_damaged_files(writer.root, writer.manifest)})
-        for name in title.split(", "):
-            show.advance(stage, name)
+        errors = [(", ".join(call.titles), error) for call, error in outcomes if isinstance(error, BaseException)]
+        for title, error in errors:
+            _record_error(title, error, result)
+        if any(isinstance(error, DamagedFileError) for _, error in errors):
+            writer.mark_damaged({file.key for file in find_damaged_files(writer.root, writer.manifest)})
 
 
-def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult) -> None:
+def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunResult, engine: Engine) -> None:
     """Read what must be read to know its recordings, then make each recording that is not in the lake."""
     discovery, plan = prepared.discovery, prepared.ingest
     assert discovery is not None
     result.refused += discovery.refusals
     result.skipped += discovery.skipped
     unknown = ingest.find_unread_files(discovery, writer.manifest)
-    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result)
+    _read_all(writer, {file.sha256: (source.name, file) for source, file in unknown}, request, result, engine)
     if plan is None or plan.manifest != writer.manifest:  # there was no lake, or it has changed since
         plan = plan_ingest(request, discovery, writer.manifest)
     result.refused += plan.conflicts
@@ -141,27 +166,42 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
         for file in ingest.list_spilled(job)
         if not ingest.locate_spill(writer.root, file).exists()
     }
-    _read_all(writer, needed, request, result)
-    _build_all(writer, INGEST, plan.jobs, request, result)
+    _read_all(writer, needed, request, result, engine)
+    _build_all(writer, INGEST, plan.jobs, request, result, engine)
 
 
-def _read_all(writer: Writer, files: dict[str, tuple[str, RawFile]], request: RunRequest, result: RunResult) -> None:
+def _read_all(
+    writer: Writer, files: dict[str, tuple[str, RawFile]], request: RunRequest, result: RunResult, engine: Engine
+) -> None:
     if not files:
         return
-    show = reporter()
-    show.begin("read", len(files))
-    futures = {
-        read_file.submit(file.name, request.lake, dataset, file.to_dict()): sha256
-        for sha256, (dataset, file) in files.items()
-    }
-    contents = {}
-    for sha256, record in _await_results(futures):
-        if isinstance(record, dict):
-            contents[sha256] = record
-        else:
-            _record_error(files[sha256][1].name, record, result)
-        show.advance("read", files[sha256][1].name)
-    writer.remember_sources(contents)
+    calls = [Call(read_file, (request.lake, dataset, file.to_dict()), (file.name,)) for dataset, file in files.values()]
+    for outcomes in _do_calls(engine, "read", calls):
+        contents = {}
+        for call, made in outcomes:
+            if isinstance(made, BaseException):
+                _record_error(call.titles[0], made, result)
+            else:
+                contents[call.arguments[2]["sha256"]] = made
+        writer.remember_sources(contents)
+
+
+@contextmanager
+def _open_engine(request: RunRequest) -> Iterator[Engine]:
+    """Open what does the work: threads (Polars and DuckDB release the interpreter), or Dask workers."""
+    settings = request.get_settings()
+    if settings.runner == "threads":
+        threads = Threads(settings.workers)
+        try:
+            yield threads
+        finally:
+            threads.stop()
+        return
+    require_extras('the setting runner = "dask"', "distributed")
+    from tracklake.pipeline.orchestration.dask_workers import open_workers
+
+    with open_workers(settings, [request.root / WRITER, *([request.origin] if request.source else [])]) as workers:
+        yield workers
 
 
 def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[RunResult, Manifest]:
@@ -169,8 +209,13 @@ def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[
 
     Returns what was done, and the lake as it is then.
     """
+    with _open_engine(request) as engine:
+        return _work(request, plan, lock_timeout_s, engine)
+
+
+def _work(request: RunRequest, plan: RunPlan, lock_timeout_s: float, engine: Engine) -> tuple[RunResult, Manifest]:
     result = RunResult()
-    manifest = _work_once(request, plan, result, lock_timeout_s)
+    manifest = _work_once(request, plan, result, lock_timeout_s, engine)
     if (
         result.failed
         and INGEST in request.steps
@@ -178,11 +223,13 @@ def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[
     ):
         note = f"made again, as files of the lake were damaged: {result.failed[0]}"
         result = RunResult(built=result.built, notes=[note])
-        manifest = _work_once(replace(request, rebuild=False), plan, result, lock_timeout_s)
+        manifest = _work_once(replace(request, rebuild=False), plan, result, lock_timeout_s, engine)
     return result, manifest
 
 
-def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeout_s: float) -> Manifest:
+def _work_once(
+    request: RunRequest, plan: RunPlan, result: RunResult, lock_timeout_s: float, engine: Engine
+) -> Manifest:
     before = list_ingested(request.root) if request.rebuild else set()
     if request.rebuild and (plan.discovery is None or not plan.discovery.units):
         raise SourceError(f"{request.source}: nothing in it can be used, so the lake was not rebuilt.")
@@ -190,7 +237,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
     with ExitStack() as stack:
         writer = _await_writer(stack, request, lock_timeout_s)
         if INGEST in request.steps:
-            _ingest(writer, request, plan, result)
+            _ingest(writer, request, plan, result, engine)
         else:
             name_run(request, [commit.tail.rpartition("/")[2] for commit in writer.manifest.of_stage(INGEST)])
         remove_outdated(writer, request, settings)
@@ -201,7 +248,7 @@ def _work_once(request: RunRequest, plan: RunPlan, result: RunResult, lock_timeo
                 continue  # everything was refused
             jobs, stale = Planner(writer.root, writer.manifest, settings).find_outstanding(stage.name)
             writer.remove(stale)
-            _build_all(writer, stage.name, jobs, request, result)
+            _build_all(writer, stage.name, jobs, request, result, engine)
         if set(request.steps) & {"reconstruct", "repair", "traffic", "samples", "split", "tensors"}:
             result.notes += explain_left_out(writer.manifest)
         result.notes += explain_not_reconstructed(request)

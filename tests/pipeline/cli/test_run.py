@@ -8,7 +8,6 @@ from pathlib import Path
 import duckdb
 import polars as pl
 import pytest
-from small_recordings import write_highd
 
 from tracklake.pipeline.lake import connect
 from tracklake.pipeline.synthetic.expected_findings import RULE_TESTS
@@ -274,21 +273,6 @@ def test_a_model_trains_and_every_run_is_evaluated(command, lake, tmp_path):
         assert shown in scored.out
     table = pl.read_csv(root / "evaluations" / "csp.csv").filter(origin="measured")
     assert set(table["model"]) == {"constant-velocity", "lstm"}
-
-
-@pytest.mark.usefixtures("plain_flows", "prefect_server")
-def test_dask_workers_make_the_same_lake(command, tmp_path):
-    for number in ("01", "02"):
-        write_highd(tmp_path / "raw", number)
-    to_dask = ("--workers", "1", "--json")
-    done = command("ingest", tmp_path / "raw", "--lake", tmp_path / "dask", *to_dask, TRACKLAKE_RUNNER="dask")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["built"] == {"ingest": 2}
-    assert command.here("ingest", tmp_path / "raw", "--lake", tmp_path / "threads").code == 0
-    with connect(tmp_path / "dask") as one, connect(tmp_path / "threads") as other:
-        for table in ("tracks", "vehicles", "subsets"):
-            query = f"SELECT * FROM {table} ORDER BY ALL"
-            assert one.sql(query).pl().equals(other.sql(query).pl()), table
 
 
 def test_everything_made_of_the_sample_says_that_it_is_synthetic(command, lake, tmp_path):

@@ -1,4 +1,4 @@
-"""What Prefect adds: tasks and ends that are seen, retries on I/O; and that it caches nothing."""
+"""What Prefect adds: tasks and ends that are seen; that it caches nothing; and what is tried again."""
 
 import errno
 import json

@@ -1,0 +1,294 @@
+"""Dask workers: a cluster on this machine, or an existing one, that does the calls of a flow run."""
+
+import asyncio
+import logging
+import os
+import threading
+import time
+import uuid
+import warnings
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from platform import python_version
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from distributed import Client, LocalCluster, Security, rpc
+from distributed.scheduler import KilledWorker
+from distributed.system import MEMORY_LIMIT
+
+from tracklake.pipeline.orchestration.batches import Call, Outcome, name_batch
+from tracklake.pipeline.settings import Settings
+from tracklake.schemas.errors import TracklakeError
+
+CONNECT_S = 10.0
+"""Longest wait for a scheduler, in seconds."""
+WORKERS_WAIT_S = 60.0
+"""Longest time without any worker, in seconds: at first, and while there is work."""
+POLL_S = 1.0
+"""Time between two looks at the workers while work goes on, in seconds."""
+LOCAL_DEATHS = 1
+"""Deaths of workers of a cluster on this machine after which a call is suspected; it is then tried again alone."""
+PACKAGES = (
+    *("tracklake", "polars", "pyarrow", "duckdb", "numpy", "pandera", "pydantic", "dask", "distributed"),
+    *("scipy", "scikit-learn", "altair", "vl-convert-python", "pyproj", "rosbags"),
+)
+"""Packages that results depend on; those installed here must be installed in the same versions on each worker."""
+SETUP = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import tracklake.pipeline.orchestration.batches"
+"""What a worker of a cluster on this machine does first: Ctrl-C is for the command, which ends its workers."""
+
+
+class WorkersError(TracklakeError):
+    """Dask workers cannot do the work, or cannot go on with it; the message says why and what to do."""
+
+
+class KilledWorkerError(TracklakeError):
+    """Workers died of one call; the message names its recording."""
+
+
+class DaskWorkers:
+    """Does the calls of a batch on all workers of a cluster.
+
+    Args:
+        client: client of the cluster.
+        address: address of an existing scheduler; None: the cluster is one of ours on this machine.
+        places: files and folders that each worker must see.
+    """
+
+    def __init__(self, client: Client, address: str | None, places: Collection[Path]) -> None:
+        self._client = client
+        self._address = address
+        self._places = places
+        self._admitted: set[str] = set()
+        self._guard = threading.Lock()
+        self._last_seen = time.monotonic()
+        self.slots = sum(client.nthreads().values())
+        self.batch_calls = 2 * self.slots
+
+    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+        """Yield the outcome of each call as it ends.
+
+        A call that was under way on a worker when it died is done again on another, and at last alone: what shares a
+        worker with a call that kills it is suspected as well.
+
+        Raises:
+            WorkersError: the scheduler is lost, no worker is left, or a worker cannot do the work.
+        """
+        suspects = []
+        for call, made in self._map(stage, calls):
+            if isinstance(made, KilledWorker):
+                suspects.append(call)
+            else:
+                yield call, made
+        for call in suspects:
+            for _, made in self._map(stage, [call]):
+                if isinstance(made, KilledWorker):
+                    yield call, _explain_deaths(made.allowed_failures + 1)
+                else:
+                    yield call, made
+
+    def _map(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+        """Send calls to the workers, and yield their outcomes as they end."""
+        self.check_workers()
+        batch = uuid.uuid4().hex
+        keys = [f"{stage}-{batch}-{number}" for number in range(len(calls))]
+        pending = dict(zip(keys, calls, strict=True))
+        ended: SimpleQueue[Any] = SimpleQueue()
+        futures = self._client.map(Call.run, calls, key=keys, pure=False)
+        try:
+            for future in futures:
+                future.add_done_callback(ended.put)
+            while pending:
+                try:
+                    future = ended.get(timeout=POLL_S)
+                except Empty:
+                    self.check_workers()
+                    continue
+                made = self._fetch(future)
+                self.check_workers()  # so that nothing is committed that a worker made which should have made nothing
+                yield pending.pop(future.key), made
+        finally:
+            if pending:
+                self._client.cancel(futures, force=True)
+
+    def _fetch(self, future: Any) -> Any:  # noqa: ANN401  (untyped in distributed; a record, or an exception)
+        """Return the result of a call that has ended, or the exception that it raised."""
+        while future.status not in ("error", "cancelled"):
+            try:
+                return future.result(timeout=POLL_S)
+            except TimeoutError:  # its worker has died since; another does it again
+                self.check_workers()
+        if future.status == "cancelled":
+            raise self._explain_loss()
+        return future.exception().with_traceback(future.traceback())
+
+    def check_workers(self) -> None:
+        """Refuse to go on without workers, or with one that has joined and cannot do the work.
+
+        Raises:
+            WorkersError: as above, or the scheduler is lost.
+        """
+        with self._guard:
+            if self._client.status != "running":
+                raise self._explain_loss()
+            try:
+                workers = self._client.nthreads().keys()
+            except OSError:
+                raise self._explain_loss() from None
+            now = time.monotonic()
+            if workers:
+                self._last_seen = now
+            elif now - self._last_seen > WORKERS_WAIT_S:
+                raise WorkersError(
+                    f"{self._name()}: no worker was left for {WORKERS_WAIT_S:g} s. What was committed to the lake is "
+                    "kept: start workers, and run the same command again."
+                )
+            if self._address is not None and workers - self._admitted:
+                self.refuse_unfit(workers - self._admitted)
+                self._admitted |= workers
+
+    def refuse_unfit(self, workers: Collection[str], *, is_first: bool = False) -> None:
+        """Compare the packages of workers with those here, and find out whether they see the lake's folder.
+
+        Raises:
+            WorkersError: a worker lacks something, or has another version.
+        """
+        here = {"Python": python_version()} | {name: found for name in PACKAGES if (found := _find_version(name))}
+        run, options = self._client.run, {"workers": list(workers), "on_error": "return"}
+        faults: dict[str, list[str]] = {}
+        for name, own in here.items():
+            found = run(python_version, **options) if name == "Python" else run(version, name, **options)
+            if is_first and name != "Python":
+                found["the scheduler"] = self._ask_scheduler(name)
+            for place, answer in found.items():
+                if isinstance(answer, PackageNotFoundError):
+                    faults.setdefault(place, []).append(f"{name} is missing")
+                elif isinstance(answer, str) and _shorten(name, answer) != _shorten(name, own):
+                    faults.setdefault(place, []).append(f"{name} {answer} instead of {own}")
+        if not faults:  # now that they should: tracklake may be listed and yet not be found
+            for place, answer in run(name_batch, (), **options).items():
+                if isinstance(answer, ImportError):
+                    faults[place] = [f"tracklake cannot be imported: {answer}"]
+        for path in () if is_first else self._places:
+            for place, answer in run(os.path.exists, str(path), **options).items():
+                if answer is False:
+                    faults.setdefault(place, []).append(f"{path} is not seen")
+        if faults:
+            listed = "\n".join(f"  {place}: {', '.join(found)}" for place, found in sorted(faults.items()))
+            same = " ".join(f'"{name}=={own}"' for name, own in here.items() if name != "Python")
+            raise WorkersError(
+                f"{self._name()}: nothing was sent to its workers, as some are not like this machine:\n{listed}\n"
+                "Each needs the same packages, in the same versions, and the disks that hold the lake and the raw "
+                f"files at the same paths: pip install {same}"
+            )
+
+    def _ask_scheduler(self, package: str) -> str | PackageNotFoundError:
+        try:
+            return str(self._client.run_on_scheduler(version, package))
+        except PackageNotFoundError as missing:
+            return missing
+
+    def _explain_loss(self) -> WorkersError:
+        return WorkersError(
+            f"{self._name()}: the connection to the scheduler was lost. What was committed to the lake is kept: start "
+            "the scheduler and its workers again, and run the same command again."
+        )
+
+    def _name(self) -> str:
+        return "the Dask cluster on this machine" if self._address is None else f"Dask at {self._address}"
+
+
+@contextmanager
+def open_workers(settings: Settings, places: Collection[Path]) -> Iterator[DaskWorkers]:
+    """Connect to the cluster that the settings name, or start one on this machine, for the length of a block.
+
+    At its end what is still to be done is cancelled.
+
+    Raises:
+        WorkersError: no scheduler answers, it has no workers, or they are not like this machine.
+    """
+    _mute()
+    address = settings.dask_address
+    with ExitStack() as stack:
+        if address is None:
+            client = stack.enter_context(Client(_start_cluster(stack, settings.workers), set_as_default=False))
+        else:
+            client = stack.enter_context(_connect(address))
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_WAIT_S)
+        except TimeoutError:
+            raise WorkersError(
+                f"Dask at {address}: the scheduler has no workers, and none joined within {WORKERS_WAIT_S:g} s. Start "
+                "some: dask worker " + str(address)
+            ) from None
+        workers = DaskWorkers(client, address, places)
+        if address is not None:
+            workers.refuse_unfit(client.nthreads().keys(), is_first=True)
+        yield workers
+
+
+def _connect(address: str) -> Any:  # noqa: ANN401  (untyped in distributed)
+    """Return a client of a scheduler, after it has answered: `Client` waits for ever for what is none."""
+    with ThreadPoolExecutor(max_workers=1) as thread:  # a notebook has a loop of its own in the main one
+        asked = thread.submit(lambda: asyncio.run(asyncio.wait_for(_identify(address), CONNECT_S)))
+        try:
+            kind = asked.result()
+        except (OSError, ValueError) as failed:
+            kind = str(failed) or "no answer"
+    if kind != "Scheduler":
+        raise WorkersError(
+            f"dask_address = {address}: no Dask scheduler answered within {CONNECT_S:g} s ({kind}). Start one (dask "
+            "scheduler), or correct the address, such as tcp://host:8786."
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of other versions, which are refused
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+
+
+async def _identify(address: str) -> str:
+    """Return what answers at an address: Scheduler, Worker or Nanny."""
+    async with rpc(address, connection_args=Security().get_connection_args("client")) as server:
+        return str((await server.identity())["type"])
+
+
+def _start_cluster(stack: ExitStack, workers: int) -> Any:  # noqa: ANN401  (untyped in distributed)
+    """Start a scheduler in this process and workers in processes of one thread, which share the memory."""
+    options: dict[str, Any] = {"memory_limit": MEMORY_LIMIT // workers, "preload": [SETUP]}
+    cluster = LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+        scheduler_kwargs={"allowed_failures": LOCAL_DEATHS},
+        **options,
+    )
+    return stack.enter_context(cluster)
+
+
+def _mute() -> None:
+    """Keep Dask's lines off the terminal, where each death of a worker fills a page; the user gets ours."""
+    for name in ("distributed", "distributed.client", "tornado", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def _explain_deaths(tries: int) -> KilledWorkerError:
+    return KilledWorkerError(
+        f"each Dask worker that worked on it died, at last {tries} times while it had nothing else to do, probably "
+        "because its memory ran out. Give workers more memory (fewer at once, with --workers, or larger machines), and "
+        "run the same command again."
+    )
+
+
+def _find_version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _shorten(name: str, release: str) -> str:
+    """Return a version, of Python without the last number."""
+    return release.rpartition(".")[0] if name == "Python" else release
