@@ -38,7 +38,8 @@ ColumnsOption = Annotated[
     typer.Option("--columns", metavar="FILE", help="TOML file that names the columns of SOURCE (docs/data.md)."),
 ]
 RecordingOption = Annotated[
-    str | None, typer.Option("--recording", help="Name of the recording, where a file's times do not tell it.")
+    str | None,
+    typer.Option("--recording", help="Name of the recording, where times do not tell it; I-24: of all of it."),
 ]
 OnlyDatasetOption = Annotated[
     str | None,

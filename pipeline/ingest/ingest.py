@@ -4,7 +4,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import account_rows
 from tracklake.pipeline.sources.csv import measure_unpacked
-from tracklake.pipeline.sources.source import Canonical, Part
+from tracklake.pipeline.sources.source import Canonical, DividedSubset, Drive, Part, Subset
 from tracklake.pipeline.stages.stage import Job, make_commit, make_job
 from tracklake.schemas import COMPLETENESS, INGEST_LOG, REJECTS, SUBSETS, TRACKS, VEHICLES, Table
 
@@ -209,8 +209,10 @@ def list_spilled(job: Job) -> list[RawFile]:
     return [] if source.spill is None else [file for file in list_files(job) if file.dialect not in source.beside]
 
 
-def build(root: Path, job: Job) -> Commit:
+def build(root: Path, job: Job, slice_entries: int = 2_000_000) -> Commit:
     """Make one recording's tables and account for the rows of its files.
+
+    `slice_entries` is the setting: entries of a subset that are held at once, where its source can do with that.
 
     Raises:
         SourceError, schemas.StructureError: the recording cannot be used.
@@ -221,6 +223,7 @@ def build(root: Path, job: Job) -> Commit:
         tables, info = _build_unassigned(root, job, files[0])
     elif spilled := list_spilled(job):
         parts = [_open_spilled(root, file, recording) if file in spilled else Part(file) for file in files]
+        parts = [replace(part, slice_entries=slice_entries) for part in parts]
         tables, info = _build_recording(root, job, parts)
     else:
         with MEMORY_BUDGET.reserve(sum(map(measure_unpacked, files))):
@@ -300,20 +303,18 @@ def _open_spilled(root: Path, file: RawFile, recording: str) -> Part:
     alone = sum(1 for item in folder.iterdir() if item.is_dir()) == 1
     rejects = pl.read_parquet(folder / REJECTS_FILE, glob=False) if alone else None
     totals = pl.read_parquet(folder / TOTALS_FILE, glob=False) if (folder / TOTALS_FILE).exists() else None
-    return Part(file, pl.scan_ipc(sorted((folder / recording).glob("*.arrow")), glob=False), rejects, totals)
+    rows = pl.scan_ipc(sorted((folder / recording).rglob("*.arrow")), glob=False)
+    return Part(file, rows, rejects, totals, folder / recording)
 
 
 def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
     files: Files = {}
-    made: list[tuple[str, Mapping[Table, pl.DataFrame | Iterable[pl.DataFrame]]]] = [
-        *((own.name, {TRACKS: own.tracks, VEHICLES: own.vehicles, SUBSETS: own.facts}) for own in canonical.subsets),
-        *((drive.name, drive.tables) for drive in canonical.drives),
-    ]
-    for name, tables in made:
-        values = {"dataset": dataset, "subset": name}
-        for table, rows in tables.items():
-            written = write_table(root, table, rows, values, job.fingerprint, where=f"recording {recording}")
+    for own in (*canonical.subsets, *canonical.drives):
+        values = {"dataset": dataset, "subset": own.name}
+        for part, table, rows in _list_tables(own):
+            name = "-".join(filter(None, [job.fingerprint, part]))
+            written = write_table(root, table, rows, values, name, where=f"recording {recording}")
             files.setdefault(table.name, []).extend(written)
     for table, frame in (
         (INGEST_LOG, canonical.log),
@@ -324,6 +325,21 @@ def _write_tables(root: Path, job: Job, canonical: Canonical) -> Files:
             root, table, frame, {"dataset": dataset}, job.fingerprint, where=f"recording {recording}"
         )
     return files
+
+
+def _list_tables(
+    own: Subset | DividedSubset | Drive,
+) -> Iterator[tuple[str, Table, pl.DataFrame | Iterable[pl.DataFrame]]]:
+    """Yield what is to be written of a subset or drive: name of the slice (empty without one), table and rows."""
+    if isinstance(own, Drive):
+        yield from (("", table, rows) for table, rows in own.tables.items())
+        return
+    if isinstance(own, DividedSubset):
+        yield from ((name, TRACKS, tracks) for name, tracks in own.slices)
+    else:
+        yield "", TRACKS, own.tracks
+    yield "", VEHICLES, own.vehicles
+    yield "", SUBSETS, own.facts
 
 
 def _build_unassigned(root: Path, job: Job, file: RawFile) -> tuple[Files, dict[str, Any]]:

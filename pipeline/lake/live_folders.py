@@ -8,6 +8,7 @@ files or none while one replaces the other.
 import os
 import shutil
 import uuid
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -20,15 +21,19 @@ from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest
 def list_names(commits: Iterable[Commit]) -> dict[str, str]:
     """Return the files of tables by the names that they have in the live folders: `tracks/.../part-01.parquet`.
 
-    The name is that of the recording, so that it stays when the recording's content is replaced.
+    The name is that of the recording, so that it stays when the recording's content is replaced. Further files of one
+    recording in a folder, those of its slices, are numbered after a comma, which no recording's name has here.
     """
-    names = {}
+    names: dict[str, str] = {}
     for commit in commits:
         recording = escape_name(commit.tail.partition("/")[2] or "0")
+        files: Counter[PurePosixPath] = Counter()
         for file in commit.all_files:
             folders = PurePosixPath(file.path).parent
             if folders.parts[0] == STORE:
-                names[f"{folders.relative_to(STORE)}/part-{recording}.parquet"] = file.path
+                files[folders] += 1
+                number = f",{files[folders]}" if files[folders] > 1 else ""
+                names[f"{folders.relative_to(STORE)}/part-{recording}{number}.parquet"] = file.path
     return names
 
 

@@ -115,7 +115,7 @@ def build_group(lake: str, stage: str, jobs: Sequence[Job], settings: Settings) 
     """
     root = Path(lake)
     if stage == INGEST:
-        return try_again(lambda: [ingest.build(root, job) for job in jobs])
+        return try_again(lambda: [ingest.build(root, job, settings.slice_entries) for job in jobs])
     return try_again(lambda: build_jobs(STAGE_BY_NAME[stage], root, jobs, settings))
 
 

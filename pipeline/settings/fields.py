@@ -38,9 +38,16 @@ class DeclaredSettings(BaseModel):
     recording: str | None = Field(
         None,
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
-        description="name of the recording of a file without usable times; none: the file's name",
+        description="name of the recording of a file without usable times; none: the file's name; I-24: makes one "
+        "recording of all of it, instead of one for each 5 minutes",
     )
     workers: int = Field(min(os.cpu_count() or 1, 4), ge=1, description="recordings worked on at once")
+    slice_entries: int = Field(
+        2_000_000,
+        ge=1,
+        description="entries of a subset that a worker holds at once: longer ones are worked on in slices of time, "
+        "where a stage can, with equal results",
+    )
     runner: Literal["threads", "dask"] = Field(
         "threads", description="where recordings are worked on: threads of this process, or Dask workers"
     )

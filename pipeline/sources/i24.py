@@ -2,8 +2,10 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import ceil
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -11,12 +13,21 @@ from zoneinfo import ZoneInfo
 import polars as pl
 
 from tracklake.pipeline.sources.accounting import FILE, account_rows
-from tracklake.pipeline.sources.assembly import assemble_subset
+from tracklake.pipeline.sources.assembly import KINEMATICS_S, assemble_slices, assemble_subset
 from tracklake.pipeline.sources.csv import BOM, LINE, REJECT_SCHEMA
 from tracklake.pipeline.sources.i24_documents import Documents, read_documents
+from tracklake.pipeline.sources.i24_frames import (
+    LONGEST_STEP,
+    PERIOD_FRAMES,
+    PERIOD_S,
+    RATE_HZ,
+    add_headings,
+    put_on_frames,
+)
 from tracklake.pipeline.sources.ngsim import group
-from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, Spilled, Subset
+from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, Spilled
 from tracklake.pipeline.sources.spill import spill_rows
+from tracklake.pipeline.transforms.slices import Slice, cut_frames
 from tracklake.pipeline.transforms.tracks.headings import find_headings
 from tracklake.pipeline.transforms.tracks.leaders import derive_lanes
 from tracklake.schemas import COMPLETENESS, references
@@ -24,17 +35,6 @@ from tracklake.schemas.columns import FOOT_M
 from tracklake.schemas.raw_i24 import MILE_FT, RAW_I24
 
 DIALECT = "i24-json"
-RATE_HZ = 25.0
-"""Rate of the trajectories, in Hz."""
-PERIOD_S = 300
-"""Length of a recording in s, so that its tables fit into memory; a day is cut into these, as NGSIM's are published."""
-PERIOD_FRAMES = round(PERIOD_S * RATE_HZ)
-ON_FRAME = 0.01
-"""Farthest from a frame, in frames, at which a position counts as that of the frame."""
-LONGEST_STEP = 1.5
-"""Longest step in frames over which a position at a frame between is interpolated; frame gaps are longer."""
-LEAST_ENTRIES = 2
-"""Fewest positions on frames of a trajectory: one has no speed."""
 NO_FRAMES = "fewer than two positions on frames"
 LANE_FT = 12.0
 """Width of a lane in feet."""
@@ -47,8 +47,6 @@ ORIGIN_FT = {1: 58 * MILE_FT, -1: 64 * MILE_FT}
 DIRECTIONS = {1: "east", -1: "west"}
 CLASSES = {0: "car", 1: "car", 2: "car", 3: "car", 4: "truck", 5: "truck", 6: "motorcycle"}
 """Classes by coarse_vehicle_class."""
-SYNTHETIC_ID = "73796e746865746963"
-"""Beginning of _id in generated documents: `synthetic` in hex; those of databases begin with a time."""
 _LOCAL = ZoneInfo("America/Chicago")
 _BEGIN = re.compile(rb'^\s*\[\s*\{\s*("_id"\s*:\s*(\{[^{}]*\}|"[^"]*")\s*,\s*)?"timestamp"\s*:\s*\[')
 REASONS: tuple[tuple[str, pl.Expr], ...] = (
@@ -87,7 +85,10 @@ def detect(head: bytes, _name: str) -> str | None:
 
 
 def spill_file(file: RawFile, folder: Path) -> Spilled:
-    """Read a file document by document into a folder for each period of its time."""
+    """Read a file document by document into a folder for each period of its time.
+
+    With a name from the user the file is one recording, with a folder of its own in which the periods are.
+    """
     recordings: Counter[str] = Counter()
     rejects, read, moved, lost, strips = [pl.DataFrame(schema=REJECT_SCHEMA)], 0, 0, 0, []
     for number, documents in enumerate(read_documents(file)):
@@ -99,9 +100,15 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
         moved += between
         lost += unused
         strips.append(count_strips(points))
+        if file.recording:
+            points = add_headings(points).with_columns(frame=pl.col("period") * PERIOD_FRAMES + pl.col("frame"))
         periods = points.partition_by("period", as_dict=True, include_key=False)
-        shares = ((_name_period(file, period), rows) for (period,), rows in sorted(periods.items()))
-        recordings += spill_rows(folder, number, shares)
+        if file.recording:
+            shares = ((str(period), rows) for (period,), rows in sorted(periods.items()))
+            recordings[file.recording] += spill_rows(folder / file.recording, number, shares).total()
+        else:
+            shares = ((_name_period(period), rows) for (period,), rows in sorted(periods.items()))
+            recordings += spill_rows(folder, number, shares)
     notes = [f"{file.name}: positions of {moved:,} trajectories lie between frames and are interpolated"] * bool(moved)
     if lost:
         notes.append(
@@ -130,74 +137,17 @@ def _describe_rejects(documents: pl.DataFrame) -> pl.DataFrame:
     return documents.select(LINE, "reason", text=text)
 
 
-def put_on_frames(documents: pl.DataFrame) -> tuple[pl.DataFrame, int, int]:
-    """Put trajectories on the common frames, 25 a second since 1970.
-
-    A position within 0.01 frames of one is taken for it; between two, at most 1.5 frames apart, it is interpolated.
-
-    Returns the number of trajectories that are interpolated, the number of positions that no frame is made of, and
-    period (number of the PERIOD_S since 1970), vehicle (the document's number), frame (within the period),
-    x_ft, y_ft, their rates of change (central differences), direction, length_ft, width_ft, class, synthetic.
-    Trajectories of fewer than two positions on frames are left out, of the numbers as well.
-    """
-    constants = documents.select(
-        vehicle=pl.col(LINE).cast(pl.Int32),
-        direction=pl.col("direction").cast(pl.Int8),
-        length_ft=pl.col("length").list.median(),
-        width_ft=pl.col("width").list.median(),
-        **{"class": pl.col("coarse_vehicle_class").cast(pl.Int16, strict=False)},
-        synthetic=pl.col("_id").struct.field("$oid").str.starts_with(SYNTHETIC_ID).fill_null(value=False),
-    )
-    points = documents.select(pl.col(LINE).cast(pl.Int32).alias("vehicle"), "timestamp", "x_position", "y_position")
-    points = _find_frames(points.explode("timestamp", "x_position", "y_position"))
-    points = points.filter((pl.col("end") - pl.col("first")).sum().over("vehicle") >= LEAST_ENTRIES)
-    unused = points.filter("is_unused").height
-    points = points.filter(pl.col("end") > pl.col("first")).with_columns(frame=pl.int_ranges("first", "end"))
-    points = points.explode("frame").with_columns(is_between=pl.col("frame") - pl.col("at") > ON_FRAME)
-    share = (pl.col("frame") - pl.col("at")) / (pl.col("ahead") - pl.col("at"))
-    share = pl.when("is_between").then(share).otherwise(0.0)
-    points = points.with_columns(
-        x_ft=pl.col("x_position") + share * (pl.col("x_ahead") - pl.col("x_position")).fill_null(0.0),
-        y_ft=pl.col("y_position") + share * (pl.col("y_ahead") - pl.col("y_position")).fill_null(0.0),
-    )
-    between = points.filter("is_between")["vehicle"].n_unique()
-    points = points.select(
-        *("vehicle", "x_ft", "y_ft"),
-        speed_ftps=_derive_rate("x_ft"),
-        lateral_ftps=_derive_rate("y_ft"),
-        period=pl.col("frame") // PERIOD_FRAMES,
-        frame=(pl.col("frame") % PERIOD_FRAMES).cast(pl.Int32),
-    )
-    return points.join(constants, on="vehicle", how="left", maintain_order="left"), between, unused
-
-
-def _find_frames(points: pl.DataFrame) -> pl.DataFrame:
-    """Find each position's `first` frame and that before which it `end`s: the two are the same where it has none."""
-    at, is_same = pl.col("at"), pl.col("vehicle") == pl.col("vehicle").shift(-1)
-    points = points.with_columns(at=pl.col("timestamp") * RATE_HZ)
-    points = points.with_columns(
-        first=(at - ON_FRAME).ceil().cast(pl.Int64),
-        ahead=pl.when(is_same).then(at.shift(-1)),
-        x_ahead=pl.when(is_same).then(pl.col("x_position").shift(-1)),
-        y_ahead=pl.when(is_same).then(pl.col("y_position").shift(-1)),
-    )
-    first, ahead = pl.col("first"), pl.col("ahead")
-    after_own = first + (first - at <= ON_FRAME).cast(pl.Int64)
-    after = (ahead - ON_FRAME).ceil().cast(pl.Int64)
-    points = points.with_columns(end=pl.when(ahead - at <= LONGEST_STEP).then(after).otherwise(after_own))
-    ends_interpolation = (pl.col("end") > after_own).shift(1, fill_value=False)
-    return points.with_columns(is_unused=(pl.col("end") == first) & ~ends_interpolation)
-
-
-def _name_period(file: RawFile, period: int) -> str:
-    """Name a period by the user's name of the file, or the local date, and its local time."""
+def _name_period(period: int) -> str:
+    """Name a period by its local date and time."""
     start = datetime.fromtimestamp(period * PERIOD_S, tz=UTC).astimezone(_LOCAL)
     again = "-again" if start.fold else ""  # the hour repeated at the end of summer time
-    return f"{file.recording or f'i-24-{start:%Y%m%d}'}-{start:%H%M}{again}"
+    return f"i-24-{start:%Y%m%d-%H%M}{again}"
 
 
 def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
-    """Turn the spilled positions of one period, a part per file that holds some of it, into its tables."""
+    """Turn the spilled positions of one recording, a part per file that holds some of it, into its tables."""
+    if parts[0].file.recording == recording:
+        return _to_long(parts, recording)
     shares = [
         part.rows.collect().with_columns(pl.lit(index, pl.Int64).alias(FILE))
         for index, part in enumerate(parts)
@@ -206,11 +156,54 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
     points = _number_vehicles(pl.concat(shares))
     # What was rejected are documents, and these are rows of no period.
     log, rejects = account_rows("i24", recording, parts, [share.height for share in shares], [])
-    first_frame, last_frame = points.select(a=pl.col("frame").min(), b=pl.col("frame").max()).row(0)
-    facts: dict[str, Any] = {
+    bounds = points.select(first=pl.col("frame").min(), last=pl.col("frame").max()).row(0)
+    facts = _describe_recording(recording, *bounds, is_synthetic=points["synthetic"].all())
+    files = [part.file for part in parts]
+    strips = _add_strips([part.totals for part in parts if part.totals is not None])
+    subsets = []
+    for sign, name in DIRECTIONS.items():
+        own = points.filter(pl.col("direction") == sign)
+        if own.height:
+            road = Road(sign, *find_lanes(strips.filter(pl.col("direction") == sign)))
+            subsets.append(
+                assemble_subset(
+                    _orient(own, road),
+                    _find_sizes(own.lazy()).collect(),
+                    dataset="i24",
+                    name=f"{recording}-{name}",
+                    facts={**facts, "direction": name, **road.facts},
+                    use_recorded_headway=False,
+                    files=files,
+                )
+            )
+    return Canonical(tuple(subsets), log, rejects, COMPLETENESS.empty(), (), "vehicle")
+
+
+@dataclass(frozen=True)
+class Road:
+    """One carriageway: its direction, and its lanes as `find_lanes` returns them."""
+
+    sign: int
+    side: int
+    left_ft: float
+    lanes: int
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Columns of SUBSETS that it gives."""
+        return {
+            "lanes": self.lanes,
+            "lane_markings_m": [round(number * LANE_FT * FOOT_M, 4) for number in range(self.lanes + 1)],
+            "columns_missing": ["accel_mps2", "headway_recorded_m"],
+        }
+
+
+def _describe_recording(recording: str, first_frame: int, last_frame: int, *, is_synthetic: bool) -> dict[str, Any]:
+    """Return the columns of SUBSETS that both carriageways share."""
+    return {
         "recording": recording,
         "site": "i-24",
-        "origin": "synthetic" if points["synthetic"].all() else "recorded",
+        "origin": "synthetic" if is_synthetic else "recorded",
         "freeway": True,
         "frame_rate_hz": RATE_HZ,
         "first_frame": first_frame,
@@ -218,14 +211,74 @@ def to_canonical(parts: Sequence[Part], recording: str) -> Canonical:
         "on_ramp_lanes": [],
         "ids_split": 0,
     }
-    files = [part.file for part in parts]
+
+
+def _to_long(parts: Sequence[Part], recording: str) -> Canonical:
+    """Turn the spilled positions of whole files into the tables of one recording, slice by slice.
+
+    Frames count from the beginning of the first period.
+    """
+    rows, offsets = _number_long([_scan(part.folder) for part in parts if part.folder is not None])
+    counts = rows.group_by(FILE, "direction", "frame").agg(rows=pl.len().cast(pl.Int64)).collect(engine="streaming")
+    of_files = counts.group_by(FILE).agg(pl.col("rows").sum()).sort(FILE)["rows"].to_list()
+    log, rejects = account_rows("i24", recording, parts, of_files, [])
+    first, last = counts.select(first=pl.col("frame").min(), last=pl.col("frame").max()).row(0)
+    zero = first // PERIOD_FRAMES * PERIOD_FRAMES
+    is_synthetic = rows.select(pl.col("synthetic").all()).collect(engine="streaming").item()
+    facts = _describe_recording(recording, first - zero, last - zero, is_synthetic=is_synthetic)
     strips = _add_strips([part.totals for part in parts if part.totals is not None])
-    subsets = tuple(
-        _to_subset(points.filter(pl.col("direction") == sign), sign, strips, {**facts, "direction": name}, files)
-        for sign, name in DIRECTIONS.items()
-        if (points["direction"] == sign).any()
-    )
-    return Canonical(subsets, log, rejects, COMPLETENESS.empty(), (), "vehicle")
+    subsets = []
+    for sign, name in DIRECTIONS.items():
+        own = counts.filter(pl.col("direction") == sign).group_by("frame").agg(pl.col("rows").sum()).sort("frame")
+        if own.height:
+            road = Road(sign, *find_lanes(strips.filter(pl.col("direction") == sign)))
+            context = ceil(KINEMATICS_S * RATE_HZ)
+            cuts = cut_frames(own["frame"].to_numpy() - zero, own["rows"].to_numpy(), parts[0].slice_entries, context)
+            subsets.append(
+                assemble_slices(
+                    _orient_slices(parts, offsets, zero, road, cuts),
+                    _find_sizes(rows.filter(pl.col("direction") == sign)).collect(engine="streaming"),
+                    dataset="i24",
+                    name=f"{recording}-{name}",
+                    facts={**facts, "direction": name, **road.facts},
+                    files=[part.file for part in parts],
+                )
+            )
+    return Canonical(tuple(subsets), log, rejects, COMPLETENESS.empty(), (), "vehicle")
+
+
+def _number_long(shares: Sequence[pl.LazyFrame]) -> tuple[pl.LazyFrame, list[int]]:
+    """Add FILE and vehicle_id to the rows of several files; also return what that adds to each file's numbers."""
+    numbered, offsets = [], [0]
+    for index, rows in enumerate(shares):
+        numbered.append(
+            rows.with_columns(pl.lit(index, pl.Int64).alias(FILE), vehicle_id=pl.col("vehicle") + offsets[-1])
+        )
+        last = rows.select(pl.col("vehicle").max()).collect(engine="streaming").item()
+        offsets.append(offsets[-1] + last)
+    return pl.concat(numbered), offsets[:-1]
+
+
+def _scan(folder: Path) -> pl.LazyFrame:
+    """Return the spilled rows below a folder."""
+    return pl.scan_ipc(sorted(folder.rglob("*.arrow")), glob=False)
+
+
+def _orient_slices(
+    parts: Sequence[Part], offsets: Sequence[int], zero: int, road: Road, slices: Iterable[Slice]
+) -> Iterator[tuple[Slice, pl.DataFrame]]:
+    """Yield the slices of one carriageway with their entries and those of their context."""
+    for each in slices:
+        first, end = zero + each.first_frame - each.context, zero + each.end_frame + each.context
+        shares = [
+            _scan(folder).with_columns(vehicle_id=pl.col("vehicle") + offset)
+            for part, offset in zip(parts, offsets, strict=True)
+            for period in range(first // PERIOD_FRAMES, (end - 1) // PERIOD_FRAMES + 1)
+            if part.folder is not None and (folder := part.folder / str(period)).is_dir()
+        ]
+        rows = pl.concat(shares).filter(pl.col("direction") == road.sign, pl.col("frame").is_between(first, end - 1))
+        points = rows.with_columns((pl.col("frame") - zero).cast(pl.Int32)).collect().sort("vehicle_id", "frame")
+        yield each, _orient(points, road)
 
 
 def _number_vehicles(points: pl.DataFrame) -> pl.DataFrame:
@@ -239,52 +292,48 @@ def _number_vehicles(points: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _to_subset(
-    points: pl.DataFrame, sign: int, strips: pl.DataFrame, facts: dict[str, Any], files: Sequence[RawFile]
-) -> Subset:
-    """Build the tables of one carriageway: fronts in metres, lanes by strips of 12 ft, speeds from positions."""
-    sizes = points.group_by("vehicle_id", maintain_order=True).agg(
-        source_vehicle_id=pl.col("vehicle").first(),
-        length_m=pl.col("length_ft").first() * FOOT_M,
-        width_m=pl.col("width_ft").first() * FOOT_M,
-        entries_announced=pl.lit(None, pl.Int32),
-        **{"class": pl.col("class").first().replace_strict(CLASSES, default=None, return_dtype=pl.String)},
+def _find_sizes(points: pl.LazyFrame) -> pl.LazyFrame:
+    """Find the sizes and classes of vehicles, which are the same in all rows of each, and their documents' numbers."""
+    return (
+        points.group_by("vehicle_id")
+        .agg(
+            source_vehicle_id=pl.col("vehicle").first(),
+            length_m=pl.col("length_ft").first() * FOOT_M,
+            width_m=pl.col("width_ft").first() * FOOT_M,
+            entries_announced=pl.lit(None, pl.Int32),
+            **{"class": pl.col("class").first().replace_strict(CLASSES, default=None, return_dtype=pl.String)},
+        )
+        .sort("vehicle_id")
     )
-    side, left_ft, lanes = find_lanes(strips.filter(pl.col("direction") == sign))
+
+
+def _orient(points: pl.DataFrame, road: Road) -> pl.DataFrame:
+    """Return the entries of one carriageway: fronts in metres, lanes by strips of 12 ft, speeds from positions."""
+    sign, side = road.sign, road.side
     back = points.select(
         "vehicle_id",
         "frame",
         length_m=pl.col("length_ft").fill_null(0.0) * FOOT_M,
         x_m=sign * (pl.col("x_ft") - ORIGIN_FT[sign]) * FOOT_M,
-        y_m=(side * pl.col("y_ft") - left_ft) * FOOT_M,
+        y_m=(side * pl.col("y_ft") - road.left_ft) * FOOT_M,
         speed_mps=sign * pl.col("speed_ftps") * FOOT_M,
         lateral_speed_mps=side * pl.col("lateral_ftps") * FOOT_M,
     )
-    names = ("vehicle_id", "frame", "speed_mps", "lateral_speed_mps")
-    vehicle, frame, forward_mps, right_mps = (back[name].to_numpy() for name in names)
-    headings = find_headings(vehicle, frame, forward_mps, right_mps, RATE_HZ)
-    cosine, sine = (pl.lit(pl.Series(values)) for values in headings)
+    if "sine" in points.columns:
+        cosine, sine = (pl.lit(points[name]) for name in ("cosine", "sine"))
+        sine = sine * side
+    else:
+        names = ("vehicle_id", "frame", "speed_mps", "lateral_speed_mps")
+        vehicle, frame, forward_mps, right_mps = (back[name].to_numpy() for name in names)
+        headings = find_headings(vehicle, frame, forward_mps, right_mps, RATE_HZ)
+        cosine, sine = (pl.lit(pl.Series(values)) for values in headings)
     half = pl.col("length_m") / 2
-    entries = back.with_columns(
+    return back.with_columns(
         lane=derive_lanes(pl.col("y_m") + half * sine, LANE_FT * FOOT_M, MOST_LANES),  # by the body's middle
         x_m=(pl.col("x_m") + 2 * half * cosine).round(3),
         y_m=(pl.col("y_m") + 2 * half * sine).round(3),
         heading_rad=sine.arcsin().round(4),
         accel_mps2=pl.lit(None),
-    )
-    return assemble_subset(
-        entries,
-        sizes,
-        dataset="i24",
-        name=f"{facts['recording']}-{facts['direction']}",
-        facts={
-            **facts,
-            "lanes": lanes,
-            "lane_markings_m": [round(number * LANE_FT * FOOT_M, 4) for number in range(lanes + 1)],
-            "columns_missing": ["accel_mps2", "headway_recorded_m"],
-        },
-        use_recorded_headway=False,
-        files=files,
     )
 
 
@@ -317,26 +366,13 @@ def find_lanes(strips: pl.DataFrame) -> tuple[int, float, int]:
     return side, first * LANE_FT, int((main - first == pl.Series(range(main.len()))).sum())
 
 
-def _derive_rate(column: str) -> pl.Expr:
-    """Differentiate a position over the neighbouring frames: on one side at ends of tracks, over a gap where needed."""
-    value, frame, vehicle = pl.col(column), pl.col("frame"), pl.col("vehicle")
-    slopes = [
-        pl.when(vehicle.shift(step) == vehicle).then((value.shift(step) - value) / (frame.shift(step) - frame))
-        for step in (-1, 1)
-    ]
-    near = [
-        pl.when((frame.shift(step) - frame).abs() == 1).then(slope) for step, slope in zip((-1, 1), slopes, strict=True)
-    ]
-    return pl.coalesce(pl.mean_horizontal(near), *slopes) * RATE_HZ
-
-
 I24 = Source(
     name="i24",
     title="I-24 MOTION trajectories, INCEPTION release",
     licence="that of the I-24 MOTION project (i24motion.org): free, with citation, no re-identification",
     citation=references.GLOUDEMANS.full,
     signature="I-24 MOTION: a JSON list of trajectories",
-    version=2,
+    version=3,
     detect=detect,
     group=group,
     to_canonical=to_canonical,

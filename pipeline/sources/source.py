@@ -1,7 +1,8 @@
 """A dataset's source: data and a few functions, listed in an explicit registry."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -89,13 +90,16 @@ class Part:
     """One file's share of a recording.
 
     `rows` are spilled rows, None if the source reads the raw file itself; `rejects` are `line`, `reason`, `text` of
-    rejected lines that can only belong to this recording; `totals` are those of `Spilled`.
+    rejected lines that can only belong to this recording; `totals` are those of `Spilled`; `folder` is that of the
+    spilled rows, and `slice_entries` the number of entries that may be held at once where a source can do with that.
     """
 
     file: RawFile
     rows: pl.LazyFrame | None = None
     rejects: pl.DataFrame | None = None
     totals: pl.DataFrame | None = None
+    folder: Path | None = None
+    slice_entries: int = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,34 @@ class Subset:
     tracks: pl.DataFrame
     vehicles: pl.DataFrame
     facts: pl.DataFrame
+
+
+@dataclass(frozen=True)
+class DividedSubset:
+    """One long subset in canonical form, slice by slice: its vehicles and facts are known after the last slice.
+
+    Args:
+        slices: name of each slice and its rows of schemas.TRACKS, in order of time; to be used once.
+        conclude: function that returns the rows of schemas.VEHICLES and the row of schemas.SUBSETS.
+    """
+
+    name: str
+    slices: Iterator[tuple[str, pl.DataFrame]]
+    conclude: Callable[[], tuple[pl.DataFrame, pl.DataFrame]]
+
+    @cached_property
+    def vehicles(self) -> pl.DataFrame:
+        """All rows of schemas.VEHICLES."""
+        return self._concluded[0]
+
+    @cached_property
+    def facts(self) -> pl.DataFrame:
+        """The row of schemas.SUBSETS."""
+        return self._concluded[1]
+
+    @cached_property
+    def _concluded(self) -> tuple[pl.DataFrame, pl.DataFrame]:
+        return self.conclude()
 
 
 @dataclass(frozen=True)
@@ -130,7 +162,7 @@ class Canonical:
     of an instrumented vehicle have drives instead of carriageways.
     """
 
-    subsets: tuple[Subset, ...]
+    subsets: tuple[Subset | DividedSubset, ...]
     log: pl.DataFrame
     rejects: pl.DataFrame
     completeness: pl.DataFrame

@@ -7,7 +7,7 @@ from typing import Any
 
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, verify_files, write_table
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.readers import LakeReader
+from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import (
     INGEST,
@@ -16,7 +16,7 @@ from tracklake.pipeline.stages.stage import (
     Scope,
     Stage,
     StageError,
-    StageResult,
+    list_results,
     make_commit,
     make_job,
 )
@@ -198,16 +198,19 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     info: dict[str, Any] = {}
     notes: list[str] = []
     for reader in _open_readers(stage, root, manifest, job, settings):
+        if isinstance(reader, SubsetReader) and stage.bytes_per_entry:
+            reader.require_memory(stage.bytes_per_entry)
         built = stage.build(reader, settings)
         assert not isinstance(built, list)
-        result = built if isinstance(built, StageResult) else StageResult(built)
-        for table, frame in result.tables.items():
-            written = write_table(root, table, frame, reader.partition, job.fingerprint, where=reader.title)
-            files.setdefault(table.name, []).extend(written)
-        for folder, own in result.files.items():
-            files.setdefault(folder, []).extend(own)
-        info |= result.info
-        notes += result.notes
+        for result in list_results(built):
+            name = "-".join(filter(None, [job.fingerprint, result.part]))
+            for table, frame in result.tables.items():
+                written = write_table(root, table, frame, reader.partition, name, where=reader.title)
+                files.setdefault(table.name, []).extend(written)
+            for folder, own in result.files.items():
+                files.setdefault(folder, []).extend(own)
+            info |= result.info
+            notes += result.notes
     return make_commit(job, files, {**info, "notes": notes}, started)
 
 

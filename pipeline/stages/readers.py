@@ -1,17 +1,22 @@
 """What build functions read the lake with: the tables of all recordings, or of one subset."""
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.lake.files import read_partition
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job
+from tracklake.pipeline.stages.stage import Job, StageError
 from tracklake.pipeline.transforms.reconstruction.causal import filter_tracks
 from tracklake.pipeline.transforms.reconstruction.clean_tracks import replace_positions
+from tracklake.pipeline.transforms.slices import Slice, cut_frames
 from tracklake.schemas import FINDINGS, RECONSTRUCTED, RECONSTRUCTED_FINDINGS, SUBSETS, TRACKS, VEHICLES, Table
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
 
@@ -64,17 +69,84 @@ class LakeReader:
 
 @dataclass(frozen=True)
 class SubsetReader(LakeReader):
-    """The live tables of one subset, with the arguments of LakeReader; made by its `open_subset`."""
+    """The live tables of one subset, with the arguments of LakeReader; made by its `open_subset`.
+
+    Args:
+        slice: frames to which `tracks` are restricted, with their context; None for all. Made by `cut`.
+    """
+
+    slice: Slice | None = None
 
     @property
     def subset(self) -> str:
         """Name of the subset."""
         return self.title
 
+    @property
+    def part(self) -> str:
+        """Name of the slice; empty without one."""
+        return "" if self.slice is None else self.slice.name
+
     @cached_property
     def facts(self) -> dict[str, Any]:
         """The subset's row of `subsets`, by column."""
         return self.table(SUBSETS).row(0, named=True)
+
+    def scan(self, table: Table) -> pl.LazyFrame:
+        """Return a table's rows lazily, tracks of the slice alone; raises as for the whole lake."""
+        rows = super().scan(table)
+        return rows if self.slice is None or table is not TRACKS else rows.filter(self.slice.is_read(pl.col("frame")))
+
+    def table(self, table: Table, *columns: str) -> pl.DataFrame:
+        """Return a table's rows, sorted by its key where they are in several files; raises as `scan` does."""
+        files = [read_partition(table, file.path) == self.partition for file in self.manifest.live(table.name)]
+        if sum(files) < 2:
+            return super().table(table, *columns)
+        rows = self.scan(table).select(*dict.fromkeys([*(columns or table.dtypes), *table.key])).sort(table.key)
+        return rows.select(columns or table.dtypes.keys()).collect()
+
+    def is_long(self, settings: Settings) -> bool:
+        """Return whether the subset has more entries than a worker holds at once."""
+        return bool(self.facts["entries"] > settings.slice_entries)
+
+    def require_memory(self, bytes_per_entry: int) -> None:
+        """Refuse work on all of the subset at once that this machine has not the memory for.
+
+        Raises:
+            StageError: saying how much it needs, and what to do.
+        """
+        needed = self.facts["entries"] * bytes_per_entry / 2**30
+        if needed > (has := _measure_memory()):
+            stage = self.job.key.partition("/")[0]
+            raise StageError(
+                f"{stage} works on all of {self.subset} at once: its {self.facts['entries']:,} entries need about "
+                f"{needed:,.0f} GiB of memory, and this machine has {has:,.0f} GiB. Leave the stage out (reconstruct = "
+                "false), make shorter recordings (I-24 MOTION: without --recording), or use a machine with more."
+            )
+
+    def cut(self, settings: Settings, context_s: float) -> Iterator["SubsetReader"]:
+        """Yield readers of slices with their context, in order; the subset itself where it is not long."""
+        if not self.is_long(settings):
+            yield self
+            return
+        counts = self.scan(TRACKS).group_by("frame").agg(rows=pl.len()).sort("frame").collect(engine="streaming")
+        context = ceil(context_s * self.facts["frame_rate_hz"])
+        frames, rows = (counts[name].cast(pl.Int64).to_numpy() for name in ("frame", "rows"))
+        for each in cut_frames(frames, rows, settings.slice_entries, context):
+            yield replace(self, slice=each)
+
+    def read_whole_tracks(self, settings: Settings, *columns: str) -> Iterator[pl.DataFrame]:
+        """Yield columns of the recorded tracks, whole tracks by id, as many at once as a worker holds of entries."""
+        if not self.is_long(settings):
+            yield self.table(TRACKS, *columns)
+            return
+        vehicles = self.table(VEHICLES, "vehicle_id", "entries", "first_frame", "last_frame").sort("vehicle_id")
+        group = pl.col("entries").cast(pl.Int64).cum_sum() // settings.slice_entries
+        for _, some in vehicles.group_by(group, maintain_order=True):
+            # Frames, too: the files of slices are sorted by these.
+            is_own = pl.col("vehicle_id").is_between(some["vehicle_id"].min(), some["vehicle_id"].max())
+            is_own &= pl.col("frame").is_between(some["first_frame"].min(), some["last_frame"].max())
+            yield self.scan(TRACKS).filter(is_own).select(columns).collect().sort("vehicle_id", "frame")
 
     def read_tracks(self, settings: Settings, *columns: str) -> pl.DataFrame:
         """Return some columns of the subset's tracks (all where none is named), from what `tracks_from` says."""
@@ -102,3 +174,11 @@ class SubsetReader(LakeReader):
     def clock(self) -> dict[str, Any]:
         """First frame and frame rate (Hz), as transforms take them."""
         return {name: self.facts[name] for name in ("first_frame", "frame_rate_hz")}
+
+
+def _measure_memory() -> float:
+    """Return this machine's memory in GiB, infinite where the system does not tell it."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    except (AttributeError, ValueError, OSError):  # AttributeError: Windows
+        return float("inf")

@@ -49,5 +49,6 @@ STAGE = Stage(
     after=(INGEST,),
     settings=("reconstruct_noise_m", "reconstruct_lateral_noise_m", "reconstruct_max_gap_s"),
     version=5,
+    bytes_per_entry=800,
     build=build,
 )

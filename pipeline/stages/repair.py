@@ -1,12 +1,14 @@
 """Repair: where tracks should begin, which begin late, and the frames that are missing of those."""
 
+from collections.abc import Iterator
+
 import polars as pl
 
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
 from tracklake.pipeline.stages.stage import INGEST, Stage
 from tracklake.pipeline.transforms.starts.late_starts import classify_starts, estimate_missing_starts
-from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, TRACKS, VEHICLE_STARTS, VEHICLES, Table
+from tracklake.schemas import MISSING_STARTS, START_CUTOFFS, VEHICLE_STARTS, VEHICLES, Table
 
 
 def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]:
@@ -14,7 +16,11 @@ def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]
     on_ramps = settings.on_ramp_lanes.get(reader.facts["site"], reader.facts["on_ramp_lanes"])
     known = {**reader.partition, **reader.clock}
     starts, cutoffs = classify_starts(reader.table(VEHICLES), on_ramp_lanes=tuple(on_ramps), **known)
-    missing = estimate_missing_starts(reader.table(TRACKS), starts, cutoff_m=cutoffs["cutoff_m"][0], **known)
+
+    def read_tracks() -> Iterator[pl.DataFrame]:
+        return reader.read_whole_tracks(settings, "vehicle_id", "frame", "x_m", "lane", "speed_mps")
+
+    missing = estimate_missing_starts(read_tracks, starts, cutoff_m=cutoffs["cutoff_m"][0], **known)
     return {VEHICLE_STARTS: starts, START_CUTOFFS: cutoffs, MISSING_STARTS: missing}
 
 

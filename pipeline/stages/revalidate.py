@@ -30,6 +30,7 @@ STAGE = Stage(
     after=(INGEST, RECONSTRUCTION),
     settings=(describe_rules,),
     version=3,
+    bytes_per_entry=800,
     build=build,
     command=RECONSTRUCTION,
 )

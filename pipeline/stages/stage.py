@@ -1,7 +1,7 @@
 """What a stage is: a declaration, the jobs planned from it, and what its build function returns."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -61,12 +61,18 @@ class StageResult:
         tables: frames by table; they are validated and written by the planner.
         files: files that the build function wrote into the lake itself, by folder (tensors, reports, models).
         info: small facts that later stages and commands read from the manifest.
+        part: name of the slice that the tables are of, where a stage makes several; part of their files' names.
     """
 
     tables: Mapping[Table, pl.DataFrame] = field(default_factory=dict)
     files: Mapping[str, list[LakeFile]] = field(default_factory=dict)
     info: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    part: str = ""
+
+
+Built = StageResult | Mapping[Table, pl.DataFrame] | Iterator[StageResult]
+"""What a build function returns of one reader."""
 
 
 @dataclass(frozen=True)
@@ -84,13 +90,16 @@ class Stage:
             `tracks_from` says (`SubsetReader.read_tracks`), and its result depends on that setting.
         settings: what its result depends on: names of settings, or functions that give values by name.
         version: number to raise when the code makes other results of the same inputs.
-        build: (reader, settings) to frames by table, or a StageResult. The reader is a SubsetReader, once for every
-            subset (or drive) of the recording; a LakeReader for the scope `lake`.
+        build: (reader, settings) to frames by table, or a StageResult, or an iterator of StageResults, one for each
+            slice of a long subset. The reader is a SubsetReader, once for every subset (or drive) of the recording; a
+            LakeReader for the scope `lake`.
         batch_entries: number of entries up to which small recordings are built together: `build` then takes a list of
             LakeReaders and returns a list of StageResults. 0: recordings are built one by one.
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
             (by "" for the scope `lake`).
         command: command that runs the stage, where it is called otherwise.
+        bytes_per_entry: memory that it takes for each entry of a subset where it works on all of one at once, so that
+            it refuses what does not fit into the machine. 0: its memory does not grow with the subset, or is small.
     """
 
     name: str
@@ -98,12 +107,13 @@ class Stage:
     scope: Scope
     after: tuple[str, ...]
     version: int
-    build: Callable[[Any, Settings], StageResult | Mapping[Table, pl.DataFrame] | list[StageResult]]
+    build: Callable[[Any, Settings], Built | list[StageResult]]
     settings: tuple[str | Callable[[Settings], Mapping[str, Any]], ...] = ()
     batch_entries: int = 0
     extra_inputs: Callable[[Path, Manifest, Settings], Mapping[str, Mapping[str, Any]]] | None = None
     after_reconstruction: tuple[str, ...] = ()
     command: str = ""
+    bytes_per_entry: int = 0
 
     def list_inputs(self, settings: Settings) -> tuple[str, ...]:
         """Return the stages whose tables it reads with these settings."""
@@ -120,6 +130,14 @@ class Stage:
         if self.after_reconstruction and settings.tracks_from != RECORDED:
             values["tracks_from"] = settings.tracks_from
         return values
+
+
+def list_results(built: Built) -> Iterator[StageResult]:
+    """Yield the results of a build function, whatever shape they have."""
+    if isinstance(built, Iterator):
+        yield from built
+    else:
+        yield built if isinstance(built, StageResult) else StageResult(built)
 
 
 def make_job(key: str, *, version_of_stage: int, made_of: Mapping[str, Any], inputs: dict[str, Any]) -> Job:

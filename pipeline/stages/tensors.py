@@ -100,6 +100,7 @@ def build_subset(
 ) -> SubsetTensors:
     """Read a subset's tables and build its arrays; see `build_subset_tensors`."""
     protocol = settings.get_protocol()
+    reader.require_memory(200)
     return build_subset_tensors(
         put_on_clock(reader.read_tracks(settings, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
         reader.table(SAMPLES, *SAMPLE_COLUMNS),

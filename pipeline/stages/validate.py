@@ -1,5 +1,7 @@
 """Validate: findings of every rule, scores, and which subsets are excluded."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -7,11 +9,16 @@ import polars as pl
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
 from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
-from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
+from tracklake.quality_reports.rules.evaluate import Judgement, judge, judge_slices, tracks_needed
 from tracklake.quality_reports.rules.findings import judge_subset
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
-from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, find_lacking
+from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, Whole, find_lacking
+from tracklake.quality_reports.rules.surveys import survey
 from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
+
+LONGEST_WINDOW_S = 2.0
+"""Time before and after an entry on which rules depend, in s, besides the stay of `lane_flicker`: reversals of jerk
+look back 1.1 s."""
 
 
 def describe_rules(settings: Settings) -> dict[str, Any]:
@@ -33,8 +40,13 @@ def open_scene(reader: SubsetReader, tracks: pl.DataFrame) -> tuple[Scene, froze
 
 def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Find what breaks rules in a subset, score its vehicles, and judge the subset."""
-    tracks = reader.table(TRACKS, *tracks_needed())
-    judged = judge(*open_scene(reader, tracks), _select(settings))
+    limits = _select(settings)
+    slices = list(reader.cut(settings, LONGEST_WINDOW_S + resolve(RULES, limits)["lane_flicker_s"]))
+    if slices[0].slice is None:
+        tracks = reader.table(TRACKS, *tracks_needed())
+        judged = judge(*open_scene(reader, tracks), limits)
+    else:
+        tracks, judged = _judge_slices(slices, limits)
     status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
     # No NGSIM recording has these, and no arterial a section, so a note about each of them would tell nothing.
     usual = {"lane_markings_m", "length_range_m", "heading_error_rad", *([] if reader.facts["freeway"] else ["lanes"])}
@@ -51,6 +63,32 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
         notes=[unchecked] * bool(lacking)
         + [f"{reader.subset} is excluded from samples and splits: {reason}" for reason in reasons],
     )
+
+
+def _judge_slices(slices: list[SubsetReader], limits: dict[str, float]) -> tuple[pl.DataFrame, Judgement]:
+    """Judge a subset slice by slice, after a look at all of them; also return the least speed of each vehicle."""
+
+    def read(each: SubsetReader, *, context: bool) -> pl.DataFrame:
+        assert each.slice is not None
+        own = each if context else replace(each, slice=replace(each.slice, context=0))
+        return own.table(TRACKS, *tracks_needed())
+
+    def open_one(tracks: pl.DataFrame) -> Scene:
+        return open_scene(slices[0], tracks)[0]
+
+    assert slices[0].slice is not None
+    whole = survey((read(each, context=False) for each in slices), open_one, slices[0].slice.context)
+    lacking = open_scene(slices[0], whole.anchors)[1] | ({"heading_error_rad"} if not whole.has_headings else set())
+
+    def open_all() -> Iterator[Scene]:
+        for each in slices:
+            assert each.slice is not None
+            known = Whole((each.slice.first_frame, each.slice.end_frame), whole.shared_frames, whole.ends_at_bumpers)
+            elsewhere = whole.anchors.filter(~each.slice.is_read(pl.col("frame")))
+            tracks = pl.concat([read(each, context=True), elsewhere]).sort("vehicle_id", "frame")
+            yield replace(open_one(tracks), whole=known)
+
+    return whole.least_speeds, judge_slices(open_all(), lacking, limits)
 
 
 STAGE = Stage(

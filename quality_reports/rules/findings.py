@@ -61,6 +61,30 @@ def _find_runs(tracks: pl.LazyFrame, rule: Rule, limits: Mapping[str, float]) ->
     )
 
 
+def join_runs(findings: pl.DataFrame) -> pl.DataFrame:
+    """Join the runs of one rule and vehicle that follow one another without a frame between them.
+
+    The findings are those of the slices of one subset, in any order; see `find`.
+    """
+    extremes = [rule.name for rule in RULES if rule.extreme == "min"]
+    same = [pl.col(name) == pl.col(name).shift(1) for name in ("rule", "vehicle_id")]
+    goes_on = pl.all_horizontal(*same, pl.col("first_frame") == pl.col("last_frame").shift(1) + 1)
+    worst = pl.col("worst")
+    runs = (
+        findings.lazy()
+        .sort(FINDINGS.key)
+        .with_columns(run=(~goes_on.fill_null(value=False)).cum_sum())
+        .group_by("run")
+        .agg(
+            pl.col("dataset", "subset", "vehicle_id", "rule", "severity", "first_frame").first(),
+            pl.col("last_frame").last(),
+            pl.col("entries").sum(),
+            pl.when(pl.col("rule").first().is_in(extremes)).then(worst.min()).otherwise(worst.max()),
+        )
+    )
+    return FINDINGS.conform(runs).sort(FINDINGS.key).collect()
+
+
 def judge_subset(tracks: pl.DataFrame, *, max_backward_share: float = MAX_BACKWARD_SHARE) -> pl.DataFrame:
     """Decide whether a subset is excluded from samples and splits because its vehicles drive backwards.
 

@@ -23,6 +23,21 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
+class Whole:
+    """What rules need to know of a whole subset to judge a slice of it.
+
+    Args:
+        own_frames: first frame that the slice owns, and the one behind its last; other entries are context.
+        shared_frames: one, other, frames: for how many frames two vehicles share a place, by their ids.
+        ends_at_bumpers: whether recorded headways end at the leader's rear.
+    """
+
+    own_frames: tuple[int, int]
+    shared_frames: pl.DataFrame
+    ends_at_bumpers: bool
+
+
+@dataclass(frozen=True)
 class Scene:
     """Input of a subset's derived columns; it is never changed.
 
@@ -36,6 +51,7 @@ class Scene:
         on_ramp_lanes: lanes that are on-ramps.
         first_frame: the recording's first frame.
         last_frame: the subset's last frame.
+        whole: what is known of the whole subset where the tracks are a slice of it; None where they are all.
         results: what `once` has computed, by function.
     """
 
@@ -47,6 +63,7 @@ class Scene:
     on_ramp_lanes: Sequence[int] = ()
     first_frame: int | None = None
     last_frame: int | None = None
+    whole: "Whole | None" = None
     results: dict[Callable[["Scene"], Any], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, compute: Callable[["Scene"], T]) -> T:

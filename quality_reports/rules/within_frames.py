@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from tracklake.quality_reports.rules.scene import ABSENT, UNITS_PER_M, Scene
@@ -56,14 +57,31 @@ def measure_double_tracks(scene: Scene) -> Floats:
     NaN where the own size is unknown.
     """
     overlaps = scene.once(find_overlaps)
-    same = overlaps.share >= SAME_PLACE_SHARE
-    first, second = overlaps.first[same], overlaps.second[same]
-    tracks = np.sort(scene.track[np.stack([first, second])], axis=0).astype(np.int64)
-    _, pair, frames = np.unique(tracks[0] * len(scene.begins) + tracks[1], return_inverse=True, return_counts=True)
+    rows = _find_same_places(overlaps)
+    shared = count_shared_frames(scene) if scene.whole is None else scene.whole.shared_frames
+    pairs = _name_pairs(scene, rows).join(shared, on=["one", "other"], how="left", maintain_order="left")
     together = np.where(overlaps.known, 0.0, np.nan)
-    for rows in (first, second):
-        np.maximum.at(together, rows, frames[pair] / scene.frame_rate_hz)
+    for each in rows:
+        np.maximum.at(together, each, pairs["frames"].to_numpy() / scene.frame_rate_hz)
     return together
+
+
+def count_shared_frames(scene: Scene) -> pl.DataFrame:
+    """Count the frames in which two vehicles share a place: one, other (ids, the lesser first), frames."""
+    rows = _find_same_places(scene.once(find_overlaps))
+    return _name_pairs(scene, rows).group_by("one", "other").agg(frames=pl.len().cast(pl.Int64))
+
+
+def _find_same_places(overlaps: "Overlaps") -> Integers:
+    """Find the (2, P) rows of entries that share a place."""
+    same = overlaps.share >= SAME_PLACE_SHARE
+    return np.stack([overlaps.first[same], overlaps.second[same]])
+
+
+def _name_pairs(scene: Scene, rows: Integers) -> pl.DataFrame:
+    """Return the vehicles of (2, P) rows, the lesser id of each pair first."""
+    one, other = np.sort(scene.vehicle_id[rows], axis=0)
+    return pl.DataFrame({"one": one, "other": other}, schema={"one": pl.Int32, "other": pl.Int32})
 
 
 @dataclass(frozen=True)
@@ -210,9 +228,19 @@ def measure_recorded_gaps(scene: Scene) -> Floats:
     gap = scene.measurements("gap_m")
     length = scene.trait("length_m")[scene.leader].astype(np.float64)
     as_fronts = headway - length
-    known = ~(np.isnan(as_fronts) | np.isnan(gap))
-    if known.any():
-        fronts, bumpers = (float(np.median(np.abs((each - gap)[known]))) for each in (as_fronts, headway))
-        if bumpers < fronts:
-            as_fronts = np.where(np.isnan(length), np.nan, headway)
+    if scene.whole is None:
+        ends_at_bumpers = reads_bumpers(as_fronts - gap, headway - gap)
+    else:
+        ends_at_bumpers = scene.whole.ends_at_bumpers
+    if ends_at_bumpers:
+        as_fronts = np.where(np.isnan(length), np.nan, headway)
     return np.round(as_fronts, 3)
+
+
+def reads_bumpers(by_fronts: Floats, by_bumpers: Floats) -> bool:
+    """Return whether recorded headways end at the leader's rear, by the differences of both readings from gap_m."""
+    known = ~np.isnan(by_fronts)
+    if not known.any():
+        return False
+    fronts, bumpers = (float(np.median(np.abs(each[known]))) for each in (by_fronts, by_bumpers))
+    return bumpers < fronts

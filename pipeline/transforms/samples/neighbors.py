@@ -122,20 +122,21 @@ def find_neighbors(clock: pl.DataFrame, origins: Flags | None = None, *, cell_m:
     )
 
 
-def count_collisions(clock: pl.DataFrame) -> int:
-    """Count the vehicles whose cell is taken by a nearer one, in the grids of all entries, as published of 4.572 m.
+def count_collisions(clock: pl.DataFrame, origins: Flags | None = None) -> int:
+    """Count the vehicles whose cell is taken by a nearer one, in the grids of all origins, as published of 4.572 m.
 
-    The clock has vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order.
+    The clock has vehicle_id, tick, x_m, lane (without nulls): one row per (vehicle, tick), in any order. `origins` are
+    (N,) flags, None = all.
     """
     if clock.is_empty():
         return 0
     line = _build_line(clock, GRID_CELL_M)
+    at = np.arange(clock.height, dtype=np.int32) if origins is None else line.position[origins]
 
     def count_chunk(start: int) -> int:
-        origins = np.arange(start, min(start + CHUNK_ROWS, clock.height), dtype=np.int32)
-        return int(_find_repeats(_find_pairs(line, origins)).sum())
+        return int(_find_repeats(_find_pairs(line, at[start : start + CHUNK_ROWS])).sum())
 
-    return sum(map_in_threads(count_chunk, range(0, clock.height, CHUNK_ROWS)))
+    return sum(map_in_threads(count_chunk, range(0, at.size, CHUNK_ROWS)))
 
 
 def _build_line(clock: pl.DataFrame, cell_m: float) -> _Line:

@@ -1,6 +1,6 @@
 """Selection of samples: the entries on a protocol's clock that can be prediction origins."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from tracklake.pipeline.transforms.samples.maneuvers import label_maneuvers
 from tracklake.pipeline.transforms.samples.nearest import find_nearest
 from tracklake.pipeline.transforms.samples.neighbors import Neighborhood, count_collisions, find_neighbors
 from tracklake.pipeline.transforms.samples.threads import map_in_threads
+from tracklake.pipeline.transforms.slices import Slice
 from tracklake.pipeline.transforms.starts.late_starts import find_would_be_neighbors
 from tracklake.schemas.arrays import Flags, bound_runs
 from tracklake.schemas.columns import Table
@@ -53,27 +54,37 @@ def draw_samples(
     frame_rate_hz: float,
     excluded: bool,
     last_lane: int | None = None,
+    part: Slice | None = None,
+    has_lanes: bool | None = None,
 ) -> dict[Table, pl.DataFrame]:
     """Keep or drop every entry on the protocol's clock, label the samples and find their neighbors (DESIGN section 7).
 
     `tracks` have TRACK_COLUMNS, sorted by vehicle_id, frame; `vehicle_starts` vehicle_id, early; `findings` vehicle_id,
     severity, first_frame, last_frame, in any order. The protocol's clock, on which `first_frame` is tick 0, may not be
-    faster than the source. For maneuvers and neighbors, lanes above `last_lane` count as it.
+    faster than the source. For maneuvers and neighbors, lanes above `last_lane` count as it. With `part`, the tracks
+    are a slice's with its context, samples and counts those of the ticks in its own frames, and `has_lanes` says
+    whether all entries of the subset have a lane.
     """
     rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     clock = put_on_clock(tracks.select(TRACK_COLUMNS), **rates)
     names = {"protocol": protocol.name, "dataset": dataset, "subset": subset}
-    whole_subset = "excluded_subset" if excluded else "no_lane" if tracks["lane"].null_count() else None
+    own = find_own_ticks(clock, part, first_frame=first_frame, frame_rate_hz=frame_rate_hz, rate_hz=protocol.rate_hz)
+    entries = int(own.sum())
+    if has_lanes is None:
+        has_lanes = not tracks["lane"].null_count()
+    whole_subset = "excluded_subset" if excluded else None if has_lanes else "no_lane"
     lane = pl.col("lane") if last_lane is None else pl.col("lane").clip(upper_bound=last_lane)
-    all_collisions = _count_all_collisions(tracks.with_columns(lane), first_frame, frame_rate_hz)
+    all_collisions = None
+    if has_lanes and frame_rate_hz >= PUBLISHED_HZ:
+        all_collisions = _count_all_collisions(tracks.with_columns(lane), first_frame, frame_rate_hz, part)
     if whole_subset or clock.is_empty():
-        drops = {whole_subset: clock.height} if whole_subset else {}
-        return _build_tables(clock.height, SAMPLES.empty(), drops, NO_NEIGHBORS, all_collisions, names)
+        drops = {whole_subset: entries} if whole_subset else {}
+        return _build_tables(entries, SAMPLES.empty(), drops, NO_NEIGHBORS, all_collisions, names)
 
     early_ids = vehicle_starts.filter("early")["vehicle_id"].implode()
     would_be = find_would_be_neighbors(clock, missing_starts, **rates)
     clock = clock.with_columns(lane)
-    kept = np.ones(clock.height, np.bool_)
+    kept = own
 
     def filter_piece(bounds: tuple[int, int]) -> tuple[pl.DataFrame, dict[str, int]]:
         rows = slice(*bounds)
@@ -95,17 +106,43 @@ def draw_samples(
     samples = samples.with_columns(nearest.alias("nearest"))
     clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
     neighbors = find_neighbors(clock, kept, cell_m=protocol.grid_cell_m)
-    return _build_tables(clock.height, samples, drops, neighbors, all_collisions, names)
+    return _build_tables(entries, samples, drops, neighbors, all_collisions, names)
 
 
-def _count_all_collisions(tracks: pl.DataFrame, first_frame: int, frame_rate_hz: float) -> int | None:
-    """Count the collisions in the grids of all entries at 10 Hz; None without lanes or with a slower camera."""
-    if tracks["lane"].null_count() or frame_rate_hz < PUBLISHED_HZ:
-        return None
-    columns = ("vehicle_id", "frame", "x_m", "lane")
-    return count_collisions(
-        put_on_clock(tracks.select(columns), first_frame=first_frame, frame_rate_hz=frame_rate_hz, rate_hz=PUBLISHED_HZ)
-    )
+def find_own_ticks(
+    clock: pl.DataFrame, part: Slice | None, *, first_frame: int, frame_rate_hz: float, rate_hz: int
+) -> Flags:
+    """Find (N,) flags of the entries on the clock whose tick lies in a slice's own frames; all without one.
+
+    A tick between two frames belongs to the slice that owns the earlier one.
+    """
+    if part is None:
+        return np.ones(clock.height, np.bool_)
+    stride = find_stride(frame_rate_hz=frame_rate_hz, rate_hz=rate_hz)
+    frame = first_frame + clock["tick"].cast(pl.Int64).to_numpy() * stride.numerator // stride.denominator
+    own: Flags = (frame >= part.first_frame) & (frame < part.end_frame)
+    return own
+
+
+def _count_all_collisions(tracks: pl.DataFrame, first_frame: int, frame_rate_hz: float, part: Slice | None) -> int:
+    """Count the collisions in the grids of all entries at 10 Hz."""
+    rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": PUBLISHED_HZ}
+    clock = put_on_clock(tracks.select("vehicle_id", "frame", "x_m", "lane"), **rates)
+    return count_collisions(clock, None if part is None else find_own_ticks(clock, part, **rates))
+
+
+def add_counts(tables: Sequence[Mapping[Table, pl.DataFrame]]) -> dict[Table, pl.DataFrame]:
+    """Add up the counts of a subset's slices: its rows of SAMPLE_DROPS and its row of SAMPLE_COUNTS."""
+    added = {}
+    for table in (SAMPLE_DROPS, SAMPLE_COUNTS):
+        rows = pl.concat([made[table] for made in tables])
+        place = [name for name in rows.columns if rows.schema[name] == pl.String]
+        # A sum of nothing would be 0, where it is not counted.
+        sums = (
+            pl.when(pl.col(name).count() > 0).then(pl.col(name).sum()) for name in rows.columns if name not in place
+        )
+        added[table] = table.conform(rows.lazy().group_by(place).agg(sums).sort(table.key)).collect()
+    return added
 
 
 def _find_short(piece: pl.DataFrame, protocol: Protocol) -> dict[str, Flags]:

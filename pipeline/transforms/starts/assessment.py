@@ -4,7 +4,7 @@ DESIGN section 6, last paragraph. A fully tracked vehicle is treated as if first
 fully tracked vehicles are its references, and its own track gives the truth about the part that was cut off.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,14 @@ import polars as pl
 
 from tracklake.pipeline.transforms.starts.estimators import ESTIMATES, Cut
 from tracklake.pipeline.transforms.starts.references import References
-from tracklake.schemas.arrays import Floats, Integers
+from tracklake.schemas.arrays import Floats, Integers, Singles
 from tracklake.schemas.start_assessments import START_ASSESSMENTS
 
 POSITIONS_M = tuple(20.0 * number for number in range(1, 11))
 """Distances of the cuts from the cut-off, in m. Late starts are known up to 200 m; steps of 20 m show how estimates
 worsen with distance, and are long compared with a vehicle's way in a frame."""
+SPEED_UNITS = 2**30
+"""Whole numbers in 1 m/s, in which speeds are added up: float sums would depend on the order."""
 TRACKS_AT_ONCE = 128
 """Cut tracks compared with all references at once, which limits the memory."""
 
@@ -35,6 +37,52 @@ CUT_SCHEMA = {
 }
 
 
+@dataclass(frozen=True)
+class Totals:
+    """The number of entries of a subset, and the sum of their speeds in SPEED_UNITS."""
+
+    entries: int
+    speeds: int
+
+    @classmethod
+    def of_tracks(cls, tracks: pl.DataFrame) -> "Totals":
+        """Count and add up the entries of some tracks."""
+        return cls(tracks.height, int(_count_units(tracks["speed_mps"].to_numpy()).sum()))
+
+
+def _count_units(speed_mps: Singles | Floats) -> Integers:
+    """Return speeds in SPEED_UNITS, whole numbers whose sums do not depend on their order."""
+    units: Integers = np.rint(speed_mps.astype(np.float64) * SPEED_UNITS).astype(np.int64)
+    return units
+
+
+def keep_beginnings(
+    read_tracks: Callable[[], Iterable[pl.DataFrame]], vehicle_starts: pl.DataFrame, *, cutoff_m: float | None
+) -> tuple[pl.DataFrame, Totals]:
+    """Return what of a long subset's tracks is needed to assess its starts, and its totals.
+
+    These are the fully tracked vehicles' entries up to the first one beyond all cuts. `read_tracks` yields whole tracks
+    of some vehicles at a time, with the columns that `assess_starts` needs.
+    """
+    farthest_m = (cutoff_m or 0.0) + max(POSITIONS_M)
+    wanted = vehicle_starts.filter("fully_tracked").select("vehicle_id")
+    limit_m, entries, speeds = farthest_m, 0, 0
+    for tracks in read_tracks():
+        own = Totals.of_tracks(tracks)
+        entries, speeds = entries + own.entries, speeds + own.speeds
+        beyond = tracks.join(wanted, on="vehicle_id", how="semi").filter(pl.col("x_m") >= farthest_m)
+        firsts = beyond.sort("vehicle_id", "frame").unique("vehicle_id", keep="first", maintain_order=True)
+        limit_m = max([limit_m, *firsts["x_m"].to_list()])
+    before_m = pl.col("x_m").cum_max().shift(1).over("vehicle_id")
+    kept = [
+        tracks.join(wanted, on="vehicle_id", how="semi", maintain_order="left").filter(
+            before_m.is_null() | (before_m < limit_m)
+        )
+        for tracks in read_tracks()
+    ]
+    return pl.concat(kept), Totals(entries, speeds)
+
+
 def assess_starts(
     tracks: pl.DataFrame,
     vehicle_starts: pl.DataFrame,
@@ -44,15 +92,17 @@ def assess_starts(
     cutoff_m: float | None,
     first_frame: int,
     frame_rate_hz: float,
+    totals: Totals | None = None,
 ) -> pl.DataFrame:
     """Measure coverage and excess of each estimator per start position, on tracks cut on purpose.
 
     `tracks` have vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by the first two; `vehicle_starts`
     vehicle_id, fully_tracked. Without a cut-off (that of the whole tracks) there is no assessment. Returns rows of
-    `start_assessments`; a position that no fully tracked vehicle reaches has none.
+    `start_assessments`; a position that no fully tracked vehicle reaches has none. With `totals`, the tracks are what
+    `keep_beginnings` left of them.
     """
     cut = cut_and_estimate(
-        tracks, vehicle_starts, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=frame_rate_hz
+        tracks, vehicle_starts, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=frame_rate_hz, totals=totals
     )
     missing = pl.col("start_frame") - pl.col("first_true_frame")
     covered = pl.col("start_frame") - pl.max_horizontal("first_missing_frame", "first_true_frame")
@@ -89,6 +139,7 @@ def cut_and_estimate(
     cutoff_m: float | None,
     first_frame: int,
     frame_rate_hz: float,
+    totals: Totals | None = None,
 ) -> pl.DataFrame:
     """Cut every fully tracked vehicle's track at each position that it reaches, and estimate the missing start.
 
@@ -108,9 +159,8 @@ def cut_and_estimate(
         cutoff_m,
         first_frame,
         frame_rate_hz,
-        entries=tracks.height,
-        speeds_mps=float(tracks["speed_mps"].to_numpy().sum(dtype=np.float64)),
-        speeds_before_mps=np.concatenate(([0.0], np.cumsum(references.speed_mps)[:-1])),
+        totals=totals or Totals.of_tracks(tracks),
+        speeds_before=np.concatenate(([0], np.cumsum(_count_units(references.speed_mps))[:-1])),
     )
     frames = [
         _estimate_windows(vehicles, cut, beyond_m, whole)
@@ -125,18 +175,16 @@ class _WholeTracks:
     """The tracks of a subset before they are cut.
 
     Args:
-        entries: number of entries of all vehicles of the subset.
-        speeds_mps: sum of the speeds of all entries.
-        speeds_before_mps: sum of the speeds of all earlier rows of the references, for each row.
+        totals: those of all vehicles of the subset.
+        speeds_before: sum of the speeds of all earlier rows of the references in SPEED_UNITS, for each row.
     """
 
     references: References
     cutoff_m: float
     first_frame: int
     frame_rate_hz: float
-    entries: int
-    speeds_mps: float
-    speeds_before_mps: Floats
+    totals: Totals
+    speeds_before: Integers
 
     def cut_tracks(self, x_m: float) -> Iterator[tuple[Integers, Cut]]:
         """Cut the tracks that reach x_m, and yield the vehicles and their cuts, TRACKS_AT_ONCE at a time."""
@@ -176,8 +224,8 @@ class _WholeTracks:
         If that speed is not positive, these are all frames since the recording's first.
         """
         whole = self.references
-        cut_off_mps = self.speeds_before_mps[start] - self.speeds_before_mps[first]
-        mean_mps = (self.speeds_mps - cut_off_mps) / (self.entries - (start - first))
+        cut_off = self.speeds_before[start] - self.speeds_before[first]
+        mean_mps = (self.totals.speeds - cut_off) / SPEED_UNITS / (self.totals.entries - (start - first))
         longest = (whole.frame[start] - self.first_frame).astype(np.float64)
         frames = (whole.x_m[start] - self.cutoff_m) * self.frame_rate_hz
         return np.divide(frames, mean_mps, out=longest, where=mean_mps > 0)

@@ -4,7 +4,7 @@ DESIGN section 6. Positions are never invented: the tables only state where some
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import polars as pl
 
 from tracklake.pipeline.transforms.resample import find_stride
 from tracklake.pipeline.transforms.starts.references import References
-from tracklake.schemas.arrays import Flags, Floats
+from tracklake.schemas.arrays import Flags, Floats, divide_sum, sum_exactly
 from tracklake.schemas.missing_starts import MISSING_STARTS, START_CUTOFFS
 from tracklake.schemas.vehicles import VEHICLE_STARTS
 
@@ -26,6 +26,8 @@ SIGMAS = 2.0
 """Margin of a missing start in standard deviations."""
 REACH_M = 40.0
 """Distance along the road within which a missing vehicle is a would-be neighbor, in m."""
+DRIVES_AT_ONCE = 1 << 22
+"""Drives of references to late starts that are held at once; a longer subset's tracks are read again for the rest."""
 ROUNDING_M = 1e-6
 """Tolerance of inclusive bounds, in m; far below the precision of a position (1 mm)."""
 
@@ -116,7 +118,7 @@ def _find_first_arrival(starts: pl.DataFrame) -> int | None:
 
 
 def estimate_missing_starts(
-    tracks: pl.DataFrame,
+    read_tracks: Callable[[], Iterable[pl.DataFrame]],
     vehicle_starts: pl.DataFrame,
     *,
     dataset: str,
@@ -138,38 +140,59 @@ def estimate_missing_starts(
     speed is not positive, all frames since the recording's first count as missing. If all references have the same
     speed the slope is 0; r2 is null if their frames do not vary.
 
-    `tracks` have vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by the first two; `vehicle_starts`
-    vehicle_id, starts_late, fully_tracked. Without a cut-off there are no late starts. Returns rows of
-    `missing_starts`.
+    `read_tracks` yields vehicle_id, frame, x_m, lane, speed_mps of one subset, sorted by the first two, whole tracks
+    that need not fit into memory together; `vehicle_starts` have vehicle_id, starts_late, fully_tracked. Without a
+    cut-off there are no late starts. Returns rows of `missing_starts`.
     """
     late = vehicle_starts.filter("starts_late").select("vehicle_id")
     if cutoff_m is None or late.is_empty():
         return MISSING_STARTS.empty()
-    first_entries = tracks.join(late, on="vehicle_id", how="semi").sort("vehicle_id", "frame")
-    first_entries = first_entries.unique("vehicle_id", keep="first", maintain_order=True)
-    first_entries = first_entries.select(
+    firsts, speeds, entries = [], 0, 0
+    for tracks in read_tracks():
+        first = tracks.join(late, on="vehicle_id", how="semi").sort("vehicle_id", "frame")
+        firsts.append(first.unique("vehicle_id", keep="first", maintain_order=True))
+        speeds += sum_exactly(tracks["speed_mps"].to_numpy().astype(np.float64))
+        entries += tracks.height
+    first_entries = pl.concat(firsts).select(
         "vehicle_id", "lane", start_x_m="x_m", start_frame="frame", start_speed_mps="speed_mps"
     )
-    references = References.from_tracks(tracks, vehicle_starts, cutoff_m)
-    mean_speed_mps = float(tracks["speed_mps"].to_numpy().mean(dtype=np.float64))
+    mean_speed_mps = divide_sum(speeds, entries)
     rows = []
-    for start in first_entries.iter_rows(named=True):
-        by_mean_speed = (
-            (start["start_x_m"] - cutoff_m) / mean_speed_mps * frame_rate_hz
-            if mean_speed_mps > 0
-            else float(start["start_frame"] - first_frame)
-        )
-        estimate = _estimate_start(references, start, by_mean_speed)
-        margin = SIGMAS * estimate["frames_sigma"]
-        first_missing = math.floor(start["start_frame"] - max(1.0, estimate["frames_estimated"]) - margin)
-        names = {"dataset": dataset, "subset": subset, "cutoff_m": cutoff_m}
-        rows.append({**names, **start, **estimate, "first_missing_frame": max(first_frame, first_missing)})
+    at_once = max(1, DRIVES_AT_ONCE // max(1, int(vehicle_starts["fully_tracked"].sum())))
+    for some in first_entries.iter_slices(at_once):
+        drives = _measure_drives(read_tracks(), vehicle_starts, cutoff_m, some["start_x_m"].to_list())
+        for start, drive in zip(some.iter_rows(named=True), drives, strict=True):
+            by_mean_speed = (
+                (start["start_x_m"] - cutoff_m) / mean_speed_mps * frame_rate_hz
+                if mean_speed_mps > 0
+                else float(start["start_frame"] - first_frame)
+            )
+            estimate = _estimate_start(*drive, start, by_mean_speed)
+            margin = SIGMAS * estimate["frames_sigma"]
+            first_missing = math.floor(start["start_frame"] - max(1.0, estimate["frames_estimated"]) - margin)
+            names = {"dataset": dataset, "subset": subset, "cutoff_m": cutoff_m}
+            rows.append({**names, **start, **estimate, "first_missing_frame": max(first_frame, first_missing)})
     return pl.DataFrame(rows, schema=MISSING_STARTS.dtypes)
 
 
-def _estimate_start(references: References, start: Mapping[str, Any], by_mean_speed: float) -> dict[str, Any]:
-    """Estimate the missing frames of one start: the columns of `missing_starts` from `method` to the fit."""
-    frames, speeds = references.measure_drives(start["start_x_m"])
+def _measure_drives(
+    batches: Iterable[pl.DataFrame], vehicle_starts: pl.DataFrame, cutoff_m: float, places_m: Sequence[float]
+) -> list[tuple[Floats, Floats]]:
+    """Measure for each place the frames from the cut-off to it and the speeds there, of all references."""
+    found: list[list[tuple[Floats, Floats]]] = [[] for _ in places_m]
+    for tracks in batches:
+        references = References.from_tracks(tracks, vehicle_starts, cutoff_m)
+        for drives, place_m in zip(found, places_m, strict=True):
+            drives.append(references.measure_drives(place_m))
+    joined = ([np.concatenate(parts) for parts in zip(*drives, strict=True)] for drives in found)
+    return [(frames, speeds) for frames, speeds in joined]
+
+
+def _estimate_start(frames: Floats, speeds: Floats, start: Mapping[str, Any], by_mean_speed: float) -> dict[str, Any]:
+    """Estimate the missing frames of one start: the columns of `missing_starts` from `method` to the fit.
+
+    `frames` and `speeds` are those of the references' drives to the start.
+    """
     if frames.size >= LEAST_REFERENCES:
         fit = fit_frames(speeds, frames)
         estimate = fit["intercept_frames"] + fit["slope_frames_per_mps"] * start["start_speed_mps"]

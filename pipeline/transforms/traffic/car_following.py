@@ -42,13 +42,14 @@ def find_episodes(scene: Scene, *, min_s: float) -> tuple[pl.DataFrame, dict[str
     first = np.flatnonzero(together & ~goes_on[:-1])
     last = np.flatnonzero(together & ~goes_on[1:])
     seconds = (scene.frames[last] - scene.frames[first]) / scene.rate_hz
-    kept = seconds >= min_s
+    own = scene.own
+    kept = (seconds >= min_s) & own[first]
     skipped = {
-        "no_lane": int((~has_lane).sum()),
-        "no_leader_known": 0 if has_leader.any() else len(together),
-        "leader_absent": int((has_leader & has_lane & ~is_present).sum()),
-        "leader_in_other_lane": int((is_present & has_lane & ~together).sum()),
-        "short_episode": int((~kept).sum()),
+        "no_lane": int((~has_lane & own).sum()),
+        "no_leader_known": 0 if scene.has_leaders else int(own.sum()),
+        "leader_absent": int((has_leader & has_lane & ~is_present & own).sum()),
+        "leader_in_other_lane": int((is_present & has_lane & ~together & own).sum()),
+        "short_episode": int((~kept & own[first]).sum()),
     }
     episodes = pl.DataFrame(
         {

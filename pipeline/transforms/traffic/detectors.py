@@ -1,5 +1,8 @@
 """Virtual loop detectors: counts, speeds and occupancy at cross sections, linear between entries."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import polars as pl
 
@@ -20,15 +23,47 @@ def count_passages(scene: Scene, *, spacing_m: float, interval_s: float) -> tupl
     Returns:
         Columns of `virtual_detectors` without dataset and subset, sorted; and numbers of what is left out, by reason.
     """
+    found, skipped = find_passages(scene, spacing_m=spacing_m)
+    return gather_passages([found], scene.end_s, spacing_m=spacing_m, interval_s=interval_s), skipped
+
+
+@dataclass(frozen=True)
+class Passages:
+    """Fronts that pass cross sections, and the times for which vehicles are above them; None without a road.
+
+    Args:
+        fronts: vehicle_id, detector, lane, time_s, passing_mps, has_length.
+        stays: detector, lane, from_s, to_s.
+    """
+
+    fronts: pl.DataFrame
+    stays: pl.DataFrame
+
+
+def find_passages(scene: Scene, *, spacing_m: float) -> tuple[Passages | None, dict[str, int]]:
+    """Find the passages of own vehicles; also return numbers of what is left out, by reason."""
     skipped = count_unmeasured(scene)
     if scene.road_m is None or not scene.end_s > 0:
-        return pl.DataFrame(), {**skipped, "no_extent": len(scene.ids)}
-    intervals = count_cells(scene.end_s, interval_s)
-    passages = _find_passages(scene, scene.read("x_m"), spacing_m).filter(pl.col("lane") != NO_LANE)
+        return None, {**skipped, "no_extent": int(scene.own.sum())}
+    fronts = _find_passages(scene, scene.read("x_m"), spacing_m).filter(pl.col("lane") != NO_LANE)
+    stays = _find_stays(scene, fronts, spacing_m)
+    return Passages(fronts.drop("piece"), stays), skipped
+
+
+def gather_passages(
+    found: Sequence[Passages | None], end_s: float, *, spacing_m: float, interval_s: float
+) -> pl.DataFrame:
+    """Gather the passages of all scenes of a subset; see `count_passages`."""
+    known = [each for each in found if each is not None]
+    if not known:
+        return pl.DataFrame()
+    intervals = count_cells(end_s, interval_s)
+    # In this order: the last digits of means depend on it.
+    passages = pl.concat(each.fronts for each in known).sort("vehicle_id", "time_s", "detector")
     counted = (
         passages.unique(["vehicle_id", "detector"], keep="first", maintain_order=True)
         .with_columns(_number("time_s", interval_s, intervals).alias("interval"))
-        .group_by(KEY)
+        .group_by(KEY, maintain_order=True)
         .agg(
             pl.len().alias("vehicles"),
             pl.col("passing_mps").mean().alias("time_mean_speed_mps"),
@@ -36,7 +71,7 @@ def count_passages(scene: Scene, *, spacing_m: float, interval_s: float) -> tupl
             pl.col("has_length").all(),
         )
     )
-    covered = _measure_cover(scene, passages, spacing_m, interval_s, intervals)
+    covered = _measure_cover(pl.concat(each.stays for each in known), interval_s, intervals)
     grid = (
         passages.select("detector", "lane")
         .unique()
@@ -50,7 +85,7 @@ def count_passages(scene: Scene, *, spacing_m: float, interval_s: float) -> tupl
             pl.col("vehicles", "covered_s").fill_null(0),
             detector_m=pl.col("detector") * float(spacing_m),
             interval_s=begin_s,
-            seconds=pl.min_horizontal(begin_s + interval_s, scene.end_s) - begin_s,
+            seconds=pl.min_horizontal(begin_s + interval_s, end_s) - begin_s,
         )
         .with_columns(
             flow_vph=3600 * pl.col("vehicles") / pl.col("seconds"),
@@ -58,7 +93,7 @@ def count_passages(scene: Scene, *, spacing_m: float, interval_s: float) -> tupl
                 (pl.col("covered_s") / pl.col("seconds")).clip(0, 1)
             ),
         )
-    ), skipped
+    )
 
 
 def _number(time: str, interval_s: float, intervals: int) -> pl.Expr:
@@ -73,7 +108,7 @@ def _find_passages(scene: Scene, positions_m: Floats, spacing_m: float) -> pl.Da
         vehicle_id, piece, detector, lane (of the entry before), time_s, passing_mps, has_length; in order of pieces.
     """
     furthest = _find_furthest(scene, positions_m)
-    row = np.flatnonzero(scene.follows[:-1] & (furthest > np.roll(furthest, 1)))
+    row = np.flatnonzero(scene.follows[:-1] & scene.own & (furthest > np.roll(furthest, 1)))
     reached = np.floor(furthest / spacing_m)
     reached = np.where(np.isnan(reached), 0, reached).astype(np.int64)
     detector, owner = expand_ranges(reached[row - 1] + 1, reached[row] - reached[row - 1])
@@ -100,10 +135,8 @@ def _find_furthest(scene: Scene, positions_m: Floats) -> Floats:
     return furthest
 
 
-def _measure_cover(
-    scene: Scene, passages: pl.DataFrame, spacing_m: float, interval_s: float, intervals: int
-) -> pl.DataFrame:
-    """Measure the time for which any vehicle is above a detector, by lane and interval: KEY, covered_s.
+def _find_stays(scene: Scene, passages: pl.DataFrame, spacing_m: float) -> pl.DataFrame:
+    """Find the times for which own vehicles are above detectors: detector, lane, from_s, to_s.
 
     A vehicle is above it from its front's passage to its rear's, or as far as its track goes. It counts to the lane in
     which its front passed; to that of its first entry if it stood there already.
@@ -111,23 +144,23 @@ def _measure_cover(
     first = find_run_starts(scene.pieces)
     last = np.append(first[1:], len(scene.pieces)) - 1
     rears_m = scene.read("x_m") - scene.lengths_m
-    known = ~np.isnan(rears_m[first])
+    known = ~np.isnan(rears_m[first]) & scene.own[first]
     first, last = first[known], last[known]
     low = np.floor(rears_m[first] / spacing_m).astype(np.int64)
     high = np.floor(_find_furthest(scene, scene.read("x_m"))[last] / spacing_m).astype(np.int64)
     detector, owner = expand_ranges(low + 1, high - low)
     on = ["piece", "detector"]
-    stays = (
-        pl.DataFrame(
-            {
-                "piece": scene.pieces[first][owner],
-                "detector": detector,
-                "first_lane": scene.lanes[first][owner],
-                "first_s": scene.times_s[first][owner],
-                "last_s": scene.times_s[last][owner],
-            }
-        )
-        .join(passages.select(*on, "lane", from_s="time_s"), on=on, how="left")
+    stays = pl.DataFrame(
+        {
+            "piece": scene.pieces[first][owner],
+            "detector": detector,
+            "first_lane": scene.lanes[first][owner],
+            "first_s": scene.times_s[first][owner],
+            "last_s": scene.times_s[last][owner],
+        }
+    )
+    return (
+        stays.join(passages.select(*on, "lane", from_s="time_s"), on=on, how="left")
         .join(_find_passages(scene, rears_m, spacing_m).select(*on, to_s="time_s"), on=on, how="left")
         .select(
             "detector",
@@ -135,8 +168,12 @@ def _measure_cover(
             from_s=pl.coalesce("from_s", "first_s"),
             to_s=pl.coalesce("to_s", "last_s"),
         )
-        .sort("detector", "lane", "from_s", "to_s")
     )
+
+
+def _measure_cover(stays: pl.DataFrame, interval_s: float, intervals: int) -> pl.DataFrame:
+    """Measure the time for which any vehicle is above a detector, by lane and interval: KEY, covered_s."""
+    stays = stays.sort("detector", "lane", "from_s", "to_s")
     # What another vehicle covers already does not count twice.
     before = pl.col("to_s").cum_max().shift(1).over("detector", "lane")
     alone = stays.with_columns(from_s=pl.max_horizontal("from_s", before)).filter(pl.col("to_s") > pl.col("from_s"))
@@ -146,7 +183,7 @@ def _measure_cover(
         )
         .explode("interval")
         .with_columns(begin_s=pl.col("interval") * float(interval_s))
-        .group_by(KEY)
+        .group_by(KEY, maintain_order=True)
         .agg(
             covered_s=(
                 pl.min_horizontal("to_s", pl.col("begin_s") + interval_s) - pl.max_horizontal("from_s", "begin_s")

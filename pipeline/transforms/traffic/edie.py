@@ -1,6 +1,7 @@
 """Flow, density and speed on a grid of road and time by Edie's definition, exact for straight lines between entries."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import polars as pl
@@ -22,27 +23,43 @@ def measure_cells(scene: Scene, *, cell_m: float, cell_s: float) -> tuple[pl.Dat
     Returns:
         Columns of `edie` without dataset and subset, sorted; and numbers of what is left out, by reason.
     """
+    by_vehicle, skipped = divide_tracks(scene, cell_m=cell_m, cell_s=cell_s)
+    return gather_cells([by_vehicle], scene.road_m, scene.end_s, cell_m=cell_m, cell_s=cell_s), skipped
+
+
+def divide_tracks(scene: Scene, *, cell_m: float, cell_s: float) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Divide the tracks of own vehicles into cells: lane, along, at, vehicle_id, distance_m, time_s.
+
+    Also returns numbers of what is left out, by reason.
+    """
     skipped = count_unmeasured(scene)
     road = scene.road_m
     if road is None or not scene.end_s > 0:
-        return pl.DataFrame(), {**skipped, "no_extent": len(scene.ids)}
+        return pl.DataFrame(), {**skipped, "no_extent": int(scene.own.sum())}
     pieces = _divide_segments(scene, cell_m, cell_s)
     cells_s = count_cells(scene.end_s, cell_s)
     low, high = math.floor(road[0] / cell_m), math.ceil(road[1] / cell_m) - 1
     by_vehicle = (
         pieces.with_columns(pl.col("along").clip(low, high), pl.col("at").clip(0, cells_s - 1))
-        .group_by("lane", "along", "at", "vehicle_id")
+        # In the order of the rows: the last digits of sums depend on it.
+        .group_by("lane", "along", "at", "vehicle_id", maintain_order=True)
         .agg(pl.col("distance_m", "time_s").sum())
-        .sort("lane", "along", "at", "vehicle_id")
     )
-    cells = by_vehicle.group_by("lane", "along", "at").agg(
+    return by_vehicle, skipped
+
+
+def gather_cells(
+    by_vehicle: Sequence[pl.DataFrame], road: tuple[float, float] | None, end_s: float, *, cell_m: float, cell_s: float
+) -> pl.DataFrame:
+    """Gather what the vehicles of all scenes of a subset did in each cell; see `measure_cells` and `divide_tracks`."""
+    if road is None or not end_s > 0:
+        return pl.DataFrame()
+    parts = pl.concat(by_vehicle).sort("lane", "along", "at", "vehicle_id")
+    cells = parts.group_by("lane", "along", "at", maintain_order=True).agg(
         pl.len().alias("vehicles"), pl.col("distance_m", "time_s").sum()
     )
-    grid = (
-        by_vehicle.select("lane", "along")
-        .unique()
-        .join(pl.DataFrame({"at": np.arange(cells_s, dtype=np.int64)}), how="cross")
-    )
+    times = pl.DataFrame({"at": np.arange(count_cells(end_s, cell_s), dtype=np.int64)})
+    grid = parts.select("lane", "along").unique().join(times, how="cross")
     begin_m, begin_s = pl.col("along") * float(cell_m), pl.col("at") * float(cell_s)
     area = pl.col("length_m") * pl.col("seconds")
     return (
@@ -52,14 +69,14 @@ def measure_cells(scene: Scene, *, cell_m: float, cell_s: float) -> tuple[pl.Dat
             from_m=begin_m,
             from_s=begin_s,
             length_m=pl.min_horizontal(begin_m + cell_m, road[1]) - pl.max_horizontal(begin_m, road[0]),
-            seconds=pl.min_horizontal(begin_s + cell_s, scene.end_s) - begin_s,
+            seconds=pl.min_horizontal(begin_s + cell_s, end_s) - begin_s,
         )
         .with_columns(
             flow_vph=3600 * pl.col("distance_m") / area,
             density_vpkm=1000 * pl.col("time_s") / area,
             speed_mps=pl.when(pl.col("time_s") > 0).then(pl.col("distance_m") / pl.col("time_s")),
         )
-    ), skipped
+    )
 
 
 def count_unmeasured(scene: Scene) -> dict[str, int]:
@@ -69,9 +86,9 @@ def count_unmeasured(scene: Scene) -> dict[str, int]:
     alone[1:] &= ~same
     alone[:-1] &= ~same
     return {
-        "one_entry": int(alone.sum()),
-        "frame_gap": int((same & ~scene.follows[1:-1]).sum()),
-        "no_lane": int((scene.lanes == NO_LANE).sum()),
+        "one_entry": int((alone & scene.own).sum()),
+        "frame_gap": int((same & ~scene.follows[1:-1] & scene.own[1:]).sum()),
+        "no_lane": int(((scene.lanes == NO_LANE) & scene.own).sum()),
     }
 
 
@@ -86,7 +103,7 @@ def _divide_segments(scene: Scene, cell_m: float, cell_s: float) -> pl.DataFrame
     `along` and `at` number the cells of road and of time. Lines within one cell come first, summed while the vehicle
     stays in it.
     """
-    end = np.flatnonzero(scene.follows[:-1])
+    end = np.flatnonzero(scene.follows[:-1] & scene.own)
     end = end[scene.lanes[end - 1] != NO_LANE]
     x_m = scene.read("x_m")
     times = scene.times_s

@@ -57,7 +57,7 @@ def find_lane_changes(scene: Scene, *, lateral_mps: float) -> tuple[pl.DataFrame
 
 
 def find_crossings(scene: Scene) -> tuple[Integers, dict[str, int]]:
-    """Find the rows of first entries in a new lane; and numbers of what is left out, by reason.
+    """Find the rows of first entries in a new lane, of own vehicles; and numbers of what is left out, by reason.
 
     A stay of at most FLICKER_S between two stays in one and the same other lane is left out, with the changes into and
     out of it. So where a vehicle wavers between two lanes before it stays in the second, the last crossing counts.
@@ -74,13 +74,14 @@ def find_crossings(scene: Scene) -> tuple[Integers, dict[str, int]]:
     flickers[1:-1] = (own[:-2] == own[2:]) & (lane[:-2] == lane[2:]) & (entries[1:-1] <= FLICKER_S * scene.rate_hz)
     kept = np.flatnonzero(~flickers)
     changes = (own[kept][1:] == own[kept][:-1]) & (lane[kept][1:] != lane[kept][:-1])
-    unseen = (ids[1:] == ids[:-1]) & ~scene.follows[1:-1] & (lanes[1:] != lanes[:-1])
+    unseen = (ids[1:] == ids[:-1]) & ~scene.follows[1:-1] & (lanes[1:] != lanes[:-1]) & scene.own[1:]
     skipped = {
-        "no_lane": int((lanes == NO_LANE).sum()),
-        "lane_flicker": int(flickers.sum()),
+        "no_lane": int(((lanes == NO_LANE) & scene.own).sum()),
+        "lane_flicker": int((flickers & scene.own[starts]).sum()),
         "lane_change_in_gap": int((unseen & (lanes[1:] != NO_LANE) & (lanes[:-1] != NO_LANE)).sum()),
     }
-    return starts[kept[1:][changes]], skipped
+    crossing = starts[kept[1:][changes]]
+    return crossing[scene.own[crossing]], skipped
 
 
 def measure_lateral_speed(scene: Scene, first: Integers, last: Integers) -> Floats:

@@ -1,6 +1,6 @@
 """Surrogate measures of safety: runs of entries beyond a threshold, by follower and leader."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import polars as pl
@@ -35,13 +35,23 @@ def find_exposures(
     gap_m = np.where(used, scene.read("gap_m"), np.nan)
     runs = [_find_runs(scene, name, values, thresholds[name]) for name, values in _measure(scene, used, gap_m).items()]
     runs.append(_find_encroachments(scene, changes, thresholds["pet_s"]))
+    own = scene.own
     skipped = {
-        "no_leader_known": 0 if has_leader.any() else len(row),
-        "leader_absent": int((has_leader & ~is_present).sum()),
-        "leader_in_other_lane": int(elsewhere.sum()),
-        "no_gap": int((used & np.isnan(gap_m)).sum()),
+        "no_leader_known": 0 if scene.has_leaders else int(own.sum()),
+        "leader_absent": int((has_leader & ~is_present & own).sum()),
+        "leader_in_other_lane": int((elsewhere & own).sum()),
+        "no_gap": int((used & np.isnan(gap_m) & own).sum()),
     }
-    return pl.concat(runs).sort("vehicle_id", "leader_id", "measure", "first_frame"), skipped
+    return join_exposures(runs), skipped
+
+
+def join_exposures(runs: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Join the runs of several measures, or of several scenes, each once.
+
+    Two vehicles that change into one lane at one frame are each other's second and first: once is enough.
+    """
+    key = ("vehicle_id", "leader_id", "measure", "first_frame")
+    return pl.concat(runs).sort(*key, "worst").unique(key, keep="first", maintain_order=True)
 
 
 def _measure(scene: Scene, used: Flags, gap_m: Floats) -> dict[str, Floats]:
@@ -64,6 +74,7 @@ def _find_runs(scene: Scene, measure: str, values: Floats, threshold: float) -> 
     beyond = values > threshold if upwards else values < threshold
     goes_on = np.zeros(len(values) + 1, bool)
     goes_on[1:-1] = scene.follows[1:-1] & beyond[1:] & beyond[:-1] & (scene.leaders[1:] == scene.leaders[:-1])
+    beyond &= scene.own
     first, last = np.flatnonzero(beyond & ~goes_on[:-1]), np.flatnonzero(beyond & ~goes_on[1:])
     within = values[beyond]
     starts = np.cumsum(last - first + 1) - (last - first + 1)
@@ -109,9 +120,7 @@ def _find_encroachments(scene: Scene, changes: pl.DataFrame, threshold_s: float)
     seconds = np.concatenate([lag_s[lag], lead_s[lead]])
     second = np.concatenate([behind[lag], own[lead]])
     first = np.concatenate([who[lag], leader[lead]])
-    rows = _make_rows(scene, "pet_s", threshold_s, (first, second, second), seconds)
-    # Two vehicles that change into one lane at one frame are each other's second and first: once is enough.
-    return rows.sort("worst").unique(["vehicle_id", "leader_id", "first_frame"], keep="first", maintain_order=True)
+    return _make_rows(scene, "pet_s", threshold_s, (first, second, second), seconds)
 
 
 def _time_passages(scene: Scene, positions_m: Floats, place_m: Floats, row: Integers, steps: int) -> Floats:

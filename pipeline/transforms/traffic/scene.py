@@ -30,8 +30,25 @@ NO_LANE = -1
 
 
 @dataclass(frozen=True)
+class Whole:
+    """What is known of a whole subset where a scene has some of its vehicles.
+
+    Args:
+        road_m: least and greatest position of all entries; None where they are equal, or there are none.
+        has_leaders: whether any entry has a leader.
+        own: vehicles that the scene is for, sorted; others are their leaders and followers.
+    """
+
+    road_m: tuple[float, float] | None
+    has_leaders: bool
+    own: Integers
+
+
+@dataclass(frozen=True)
 class Scene:
     """The entries of a subset, sorted by vehicle and frame, and its sizes of vehicles.
+
+    Of a long subset these are whole tracks of some vehicles and of all their leaders and followers.
 
     Args:
         tracks: COLUMNS of `tracks`.
@@ -39,6 +56,7 @@ class Scene:
         rate_hz: frame rate.
         first_frame: the recording's first frame, where time is 0.
         end_s: time of the recording's last frame.
+        whole: what is known of the whole subset; None where the scene is that.
     """
 
     tracks: pl.DataFrame
@@ -46,6 +64,7 @@ class Scene:
     rate_hz: float
     first_frame: int
     end_s: float
+    whole: Whole | None = None
 
     def read(self, name: str) -> Floats:
         """Return a column of numbers, NaN where it is null."""
@@ -100,8 +119,23 @@ class Scene:
         return times
 
     @cached_property
+    def own(self) -> Flags:
+        """Whether an entry is of a vehicle that the scene is for."""
+        if self.whole is None:
+            return np.ones(len(self.ids), bool)
+        own: Flags = np.isin(self.ids, self.whole.own)
+        return own
+
+    @cached_property
+    def has_leaders(self) -> bool:
+        """Whether any entry of the subset has a leader."""
+        return bool((self.leaders != NO_LEADER).any()) if self.whole is None else self.whole.has_leaders
+
+    @cached_property
     def road_m(self) -> tuple[float, float] | None:
         """Least and greatest position of all entries; None where they are equal, or there are none."""
+        if self.whole is not None:
+            return self.whole.road_m
         x_m = self.read("x_m")
         return (float(x_m.min()), float(x_m.max())) if x_m.size and x_m.min() < x_m.max() else None
 

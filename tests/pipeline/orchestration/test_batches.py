@@ -37,10 +37,10 @@ def test_the_recordings_of_a_batch_are_one_commit(tmp_path, monkeypatch):
         write_highd(tmp_path / "raw", f"{number:02}")
     build, replace, stored = ingest.build, CommitLog.replace, []
 
-    def refuse_one(root, job):
+    def refuse_one(root, job, *others):
         if job.title == "02":
             raise SourceError("02_tracks.csv, line 7: no good")
-        return build(root, job)
+        return build(root, job, *others)
 
     def count(log, manifest):
         stored.append(len(manifest.commits))

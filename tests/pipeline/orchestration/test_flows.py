@@ -49,9 +49,9 @@ def calls(monkeypatch) -> Counter:
     counted: Counter = Counter()
     real = ingest.build
 
-    def counting(root, job):
+    def counting(root, job, *others):
         counted[job.title] += 1
-        return real(root, job)
+        return real(root, job, *others)
 
     monkeypatch.setattr(ingest, "build", counting)
     return counted
@@ -61,11 +61,11 @@ def test_a_busy_disk_is_tried_again_and_bad_input_is_not(raw, tmp_path, monkeypa
     tries: Counter = Counter()
     real = ingest.build
 
-    def flaky(root, job):
+    def flaky(root, job, *others):
         tries["flaky"] += 1
         if tries["flaky"] == 1:
             raise OSError("the share does not answer")
-        return real(root, job)
+        return real(root, job, *others)
 
     monkeypatch.setattr(ingest, "build", flaky)
     result = flows.ingest_files(str(tmp_path / "one"), str(raw))
@@ -135,10 +135,10 @@ def test_work_that_broke_off_fails_the_run_and_is_returned_to_the_command(raw, t
     write_highd(raw, "05")
     real = ingest.build
 
-    def break_one(root, job):
+    def break_one(root, job, *others):
         if job.title == "05":
             raise RuntimeError("boom")
-        return real(root, job)
+        return real(root, job, *others)
 
     monkeypatch.setattr(ingest, "build", break_one)
     request = run_plan.RunRequest(str(tmp_path / "lake"), ("ingest",), str(raw))

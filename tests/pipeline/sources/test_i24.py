@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from raw_texts import raw_file, write
 
 from tracklake.pipeline.sources import i24_documents
-from tracklake.pipeline.sources.i24 import I24, PERIOD_S, count_strips, detect, find_lanes, put_on_frames
+from tracklake.pipeline.sources.i24 import I24, count_strips, detect, find_lanes
+from tracklake.pipeline.sources.i24_frames import PERIOD_S, put_on_frames
 from tracklake.pipeline.sources.source import Part, RawFile, SourceError
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 

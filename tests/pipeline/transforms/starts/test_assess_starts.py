@@ -69,7 +69,12 @@ def test_the_headline_is_what_repair_makes_of_a_track_that_is_really_cut(seed, v
                 starts_late=pl.col("vehicle_id") == number, fully_tracked=pl.col("vehicle_id") != number
             )
             (repaired,) = estimate_missing_starts(
-                really_cut, starts, **NAMES, cutoff_m=cutoff_m, first_frame=first_frame, frame_rate_hz=RATE_HZ
+                lambda frame=really_cut: [frame],
+                starts,
+                **NAMES,
+                cutoff_m=cutoff_m,
+                first_frame=first_frame,
+                frame_rate_hz=RATE_HZ,
             ).to_dicts()
             begun = next(entry[1] for entry in track if entry[2] >= cutoff_m)
             expected.append((repaired, beyond_m, begun, cross_slowly(track, cutoff_m)[0]))

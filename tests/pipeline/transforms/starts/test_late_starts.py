@@ -177,7 +177,7 @@ def test_without_a_fully_tracked_vehicle_nobody_is_early():
 def estimate(tracks, *, first_frame=0, frame_rate_hz=10.0):
     starts, cutoffs = classify_starts(summarise(tracks), **NAMES, first_frame=first_frame, frame_rate_hz=frame_rate_hz)
     missing = estimate_missing_starts(
-        tracks,
+        lambda: [tracks],
         starts,
         **NAMES,
         cutoff_m=cutoffs["cutoff_m"][0],
@@ -265,7 +265,7 @@ def test_nobody_late():
     tracks = make_tracks(steady(1, 20, 20, 8.0))
     assert estimate(tracks).is_empty()
     starts, _ = classify_starts(summarise(tracks), **NAMES, first_frame=15, frame_rate_hz=10.0)
-    none = estimate_missing_starts(tracks, starts, **NAMES, cutoff_m=None, first_frame=15, frame_rate_hz=10.0)
+    none = estimate_missing_starts(lambda: [tracks], starts, **NAMES, cutoff_m=None, first_frame=15, frame_rate_hz=10.0)
     assert none.is_empty()
 
 

@@ -48,7 +48,7 @@ def repair(tracks, *, first_frame=0, frame_rate_hz=10.0, on_ramp_lanes=()):
     """(vehicle_starts, start_cutoffs row, missing_starts), each as its schema has it."""
     times = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz}
     starts, cutoffs = classify_starts(summarise(tracks), **NAMES, **times, on_ramp_lanes=on_ramp_lanes)
-    missing = estimate_missing_starts(tracks, starts, **NAMES, **times, cutoff_m=cutoffs["cutoff_m"][0])
+    missing = estimate_missing_starts(lambda: [tracks], starts, **NAMES, **times, cutoff_m=cutoffs["cutoff_m"][0])
     VEHICLE_STARTS.validate(starts, where="test")
     START_CUTOFFS.validate(cutoffs, where="test")
     return starts, cutoffs.row(0, named=True), MISSING_STARTS.validate(missing, where="test")

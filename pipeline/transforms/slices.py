@@ -1,0 +1,61 @@
+"""Slices of a long subset: frames that are worked on at once, with the frames around them on which they depend."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from tracklake.schemas.arrays import Integers
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Frames of a subset that are worked on at once.
+
+    Args:
+        first_frame: first frame that the slice owns; every row of a table belongs to the slice that owns its frame.
+        end_frame: frame behind the last one that it owns.
+        context: number of frames on either side that are read as well, so that what is computed of the own ones equals
+            that of the whole subset.
+    """
+
+    first_frame: int
+    end_frame: int
+    context: int
+
+    @property
+    def name(self) -> str:
+        """Name of its files, after the fingerprint."""
+        return f"{self.first_frame}-{self.end_frame}"
+
+    def is_own(self, frame: pl.Expr) -> pl.Expr:
+        """Return whether the slice owns a frame."""
+        return (frame >= self.first_frame) & (frame < self.end_frame)
+
+    def is_read(self, frame: pl.Expr) -> pl.Expr:
+        """Return whether a frame is the slice's own or of its context."""
+        return (frame >= self.first_frame - self.context) & (frame < self.end_frame + self.context)
+
+
+def cut_frames(frames: Integers, rows: Integers, most_rows: int, context: int) -> Iterator[Slice]:
+    """Cut a subset into slices that own all its frames, each of them once.
+
+    With its context a slice holds at most `most_rows` rows, unless it owns no more frames than its context has: a
+    shorter one would read more context than rows of its own.
+
+    Args:
+        frames: (F,) frames with rows, in order.
+        rows: (F,) number of rows of each.
+        most_rows: most rows of a slice with its context.
+        context: number of frames on either side of a slice that it depends on.
+    """
+    before = np.concatenate([[0], np.cumsum(rows)])
+    first, end_of_all = int(frames[0]), int(frames[-1]) + 1
+    while first < end_of_all:
+        read = before[np.searchsorted(frames, first - context)]
+        fitting = int(np.searchsorted(before, read + most_rows, side="right")) - 1
+        end = end_of_all if fitting == len(frames) else int(frames[fitting]) - context
+        end = min(max(end, first + max(context, 1)), end_of_all)
+        yield Slice(first, end, context)
+        first = end

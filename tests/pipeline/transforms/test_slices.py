@@ -1,0 +1,36 @@
+"""Slices: every frame is owned once, and what is read around it is complete and within the bound."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tracklake.pipeline.transforms.slices import cut_frames
+
+COUNTS = st.dictionaries(st.integers(0, 60), st.integers(1, 9), min_size=1)
+
+
+@given(COUNTS, st.integers(1, 120), st.integers(0, 7))
+def test_every_frame_is_owned_once_and_no_slice_is_larger_than_it_may_be(rows, most_rows, context):
+    frames = np.array(sorted(rows))
+    slices = list(cut_frames(frames, np.array([rows[frame] for frame in frames]), most_rows, context))
+    owned = [frame for each in slices for frame in range(each.first_frame, each.end_frame)]
+    assert owned == list(range(frames[0], frames[-1] + 1))
+    for each in slices:
+        read = range(each.first_frame - context, each.end_frame + context)
+        is_least = each.end_frame - each.first_frame <= max(context, 1)
+        assert sum(rows.get(frame, 0) for frame in read) <= most_rows or is_least
+
+
+@given(COUNTS, st.integers(1, 120), st.integers(0, 7))
+def test_a_slice_could_not_be_longer(rows, most_rows, context):
+    frames = np.array(sorted(rows))
+    for each in cut_frames(frames, np.array([rows[frame] for frame in frames]), most_rows, context):
+        read = range(each.first_frame - context, each.end_frame + context + 1)
+        assert sum(rows.get(frame, 0) for frame in read) > most_rows or each.end_frame == frames[-1] + 1
+
+
+def test_cuts_by_hand():
+    """Frames 0 to 9 with one row each, at most six rows, two frames of context."""
+    made = cut_frames(np.arange(10), np.ones(10, np.int64), 6, 2)
+    # 0 to 3 read 0 to 5; then two frames read six: 2 to 7, 4 to 9; the rest is six frames, too: 4 to 9.
+    assert [each.name for each in made] == ["0-4", "4-6", "6-10"]
