@@ -20,6 +20,7 @@ from tracklake.training.models import Reads
 from tracklake.training.models.inputs import read_on_device, read_samples
 from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, restore, save_checkpoint
 from tracklake.training.runs.config import Plan
+from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.progress import Row, TrainingState, open_log
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def _start(plan: Plan, checkpoint: Path, stored: dict[str, Any] | None) -> tuple
     if stored:
         return network, optimizer, restore(checkpoint, stored, network, optimizer, plan.device)
     # On `train`, which shows a leak as well, so that the evaluation part is not read before the end.
-    refuse_future(network, plan.folder, "train", name=plan.entry.name, reads=plan.entry.reads)
+    refuse_future(Forecaster(plan.entry.name, network, plan.entry.reads), plan.folder, "train")
     return network, optimizer, TrainingState()
 
 

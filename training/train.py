@@ -9,11 +9,12 @@ from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.loop import DivergedError, Progress, fit_network
-from tracklake.training.models import Model, Predictor, find_model, require_torch
+from tracklake.training.models import Model, find_model, require_torch
 from tracklake.training.models.fitting import fit_model
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, claim_folder, read_checkpoint
 from tracklake.training.runs.config import TrainConfig, make_plan
+from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.progress import COLUMNS
 from tracklake.training.runs.run_folder import describe_run, refuse_other_run, refuse_replacement, save_run
 
@@ -73,7 +74,7 @@ def train(
             checkpoint.unlink(missing_ok=True)
         try:
             network, metrics = fit_network(plan, run, unfinished, stored, progress)
-            metrics["evaluation"] = _evaluate(network, entry, plan.folder, out.name)
+            metrics["evaluation"] = _evaluate(Forecaster(out.name, network, entry.reads), plan.folder)
             save_run(out, run, metrics, network.cpu(), [unfinished / log for log in COLUMNS])
             checkpoint.unlink()
         except (DivergedError, NotFiniteError, FutureInputError):
@@ -111,13 +112,14 @@ def _write_baseline(
         fit = fit_model(entry, folder, folder.samples_of("train"), parameters)
         parameters, metrics["fit"] = dict(fit.parameters), fit.to_dict()
         metrics["seconds"] = round(time.monotonic() - started, 3)
-    metrics["evaluation"] = _evaluate(entry.build(folder.protocol, **parameters), entry, folder, out.name)
+    predictor = entry.build(folder.protocol, **parameters)
+    metrics["evaluation"] = _evaluate(Forecaster(out.name, predictor, entry.reads), folder)
     save_run(out, describe_run(entry.name, parameters, settings, folder), metrics, None)
     return metrics
 
 
-def _evaluate(predictor: Predictor, entry: Model, folder: TensorFolder, name: str) -> dict[str, Any] | None:
+def _evaluate(model: Forecaster, folder: TensorFolder) -> dict[str, Any] | None:
     """Return the scores on the evaluation part; None where the split has no such part."""
     if len(folder.samples_of("eval")) == 0:
         return None
-    return measure_errors(predictor, folder, "eval", name=name, reads=entry.reads).to_dict()
+    return measure_errors(model, folder, "eval").to_dict()

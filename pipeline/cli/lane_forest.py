@@ -1,7 +1,7 @@
 """`tracklake lane-forest`: lane changes predicted by a random forest, and the grid cells of vehicles ahead."""
 
 import json as json_format
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
@@ -29,10 +29,9 @@ from tracklake.training.lane_changes.scores import (
     evaluate_grid,
     learn_curve,
 )
-from tracklake.training.models import MODELS, Predictor, Reads
 from tracklake.training.onboard.as_published import PublishedScores, score_published
 from tracklake.training.onboard.overhead import require_ticks
-from tracklake.training.runs.forecasters import open_forecaster
+from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 
 FOLDER = "lane-forest"
 """Folder of the forest, among the lake's runs."""
@@ -187,8 +186,8 @@ def _score_forest(
         skipped[name] = why
         terminal.print_problem(f"{name}: {why}", label="skipped")
 
-    predictors, reads = _find_predictors(models, folder, runs, skip)
-    scores = evaluate_grid(folder, predictors, forest, reads=reads, on_skip=skip)
+    opened = list(_open_forecasters(models, folder, runs, skip))
+    scores = evaluate_grid(folder, opened, forest, on_skip=skip)
     show_scores(terminal, folder, scores, forest, published=published)
     features = list(forest.names)
     facts = {"forest": forest.facts, "features": features, **asdict(scores)}
@@ -226,25 +225,18 @@ def _write_scores(file: Path, record: dict[str, Any]) -> None:
     write_file(file, json_format.dumps(record, indent=1, allow_nan=False).encode())
 
 
-def _find_predictors(
+def _open_forecasters(
     models: Path, folder: TensorFolder, runs: list[str], skip: Callable[[str, str], None]
-) -> tuple[dict[str, Predictor], dict[str, Reads]]:
-    """Open models that need no training, and the lake's runs that fit these tensors, with what each reads.
+) -> Iterator[Forecaster]:
+    """Open models that need no training, and the lake's runs that fit these tensors.
 
     A run that cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is skipped, unless
     the user named it.
     """
-    predictors: dict[str, Predictor] = {name: MODELS[name].build(folder.protocol) for name in MODELS_BESIDE}
-    reads = {name: MODELS[name].reads for name in MODELS_BESIDE}
-    for name in runs or [file.parent.name for file in finished_runs(models.parent)]:
-        if name in predictors:
-            continue
+    for name in dict.fromkeys([*MODELS_BESIDE, *(runs or [file.parent.name for file in finished_runs(models.parent)])]):
         try:
-            own = open_forecaster(name, folder, models, frozenset({"eval"}))
+            yield open_forecaster(name, folder, models, frozenset({"eval"}))
         except TracklakeError as refused:
             if runs:
                 raise
             skip(name, str(refused))
-            continue
-        predictors[name], reads[name] = own.predictor, own.reads
-    return predictors, reads

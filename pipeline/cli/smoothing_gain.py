@@ -22,11 +22,10 @@ from tracklake.schemas.arrays import Floats, expand_ranges
 from tracklake.schemas.protocols import FILTERED_TRACKS, RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
 from tracklake.training.data.gathers import locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.scores import find_strata, measure_samples
 from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import Prediction
-from tracklake.training.runs.forecasters import Forecaster
+from tracklake.training.runs.forecasters import BATCH_SIZE, Forecaster
 
 RESAMPLES = 400
 """Number of times that vehicles are drawn, with replacement, for an interval."""
@@ -126,7 +125,7 @@ def _measure_model(model: Forecaster, inputs: GainInputs) -> pl.DataFrame:
             apart = locate_rows(folder, row) - locate_rows(tensors, row)  # of the last positions
             place_m = model.predictor.predict(observed).position_m - apart[:, None]
             measured = measure_samples(Prediction(place_m), truth)
-            np.add.at(squares[kind], own, (measured["longitudinal2"] + measured["lateral2"])[:, at])
+            np.add.at(squares[kind], own, (measured["squared_longitudinal_m2"] + measured["squared_lateral_m2"])[:, at])
     seconds = [tick / folder.protocol.rate_hz for tick in folder.protocol.scored_ticks]
     return _summarise(model.name, seconds, squares, count)
 

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,11 @@ from tracklake.schemas.split_recipes import TIME_BLOCKS
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
-from tracklake.training.evaluation.scores import Score, Tally, find_strata
-from tracklake.training.models import Predictor, Reads
+from tracklake.training.evaluation.scores import Tally, find_strata
 from tracklake.training.models.fitting import Fit
-from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
+from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import NotFiniteError, Prediction
-from tracklake.training.runs.forecasters import open_forecaster
-
-BATCH_SIZE = 256
-"""Number of samples predicted at once; the errors do not depend on it. With 2,048, the largest network's values leave
-the cache, and it takes nearly twice as long."""
+from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 
 LATENCY_MOMENTS = 20
 """Number of moments that the median time is taken of."""
@@ -43,10 +38,10 @@ Observer = Callable[[slice, Prediction, Truth[Any]], None]
 class Evaluation:
     """Scores of a model on one part of a split, and the number of the part's samples and vehicles.
 
-    `nearest` is the largest number of vehicles around the ego in the model's input, None where it reads the grid;
-    `latency` is empty where it was not measured. `data_origin` is of all subsets of the tensors. `vehicle_sums` has the
-    columns of `schemas.comparisons.VEHICLE_ERRORS` but for the first three; `run` is the content of the run's config.
-    `fit` says what was fitted before the evaluation.
+    `scores` are rows of `evaluation.scores.SCORES`. `nearest` is the largest number of vehicles around the ego in the
+    model's input, None where it reads the grid; `latency` is empty where it was not measured. `data_origin` is of all
+    subsets of the tensors. `vehicle_sums` has the columns of `schemas.comparisons.VEHICLE_ERRORS` but for the first
+    three; `run` is the content of the run's config. `fit` says what was fitted before the evaluation.
     """
 
     model: str
@@ -56,7 +51,7 @@ class Evaluation:
     data_origin: DataOrigin
     samples: int
     vehicles: int
-    scores: tuple[Score, ...]
+    scores: pl.DataFrame = field(repr=False, compare=False)
     nearest: int | None = None
     latency: Mapping[str, float] = field(default_factory=dict)
     vehicle_sums: pl.DataFrame = field(default_factory=pl.DataFrame, repr=False, compare=False)
@@ -64,19 +59,17 @@ class Evaluation:
     fit: Fit | None = None
 
     @property
-    def horizons(self) -> tuple[Score, ...]:
-        """Scores over all samples, each counting the same, by increasing seconds."""
-        key = (EVERYTHING, EVERYTHING, "samples")
-        return tuple(own for own in self.scores if (own.dataset, own.group, own.average) == key)
+    def horizons(self) -> pl.DataFrame:
+        """Scores over all samples, each counting the same, by increasing seconds, without the keys they share."""
+        own = self.scores.filter(dataset=EVERYTHING, group=EVERYTHING, average="samples")
+        return own.drop("dataset", "group", "average")
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to plain values for JSON; of the scores `horizons` alone, without the keys they share."""
+        """Convert to plain values for JSON; of the scores `horizons` alone."""
         names = ("model", "part", "split", "protocol", "data_origin", "samples", "vehicles")
         values = {name: getattr(self, name) for name in names}
-        shared = {"dataset", "group", "average"}
-        rows = [{name: value for name, value in asdict(own).items() if name not in shared} for own in self.horizons]
         fit = {"fit": self.fit.to_dict()} if self.fit else {}
-        return values | {"protocol": self.protocol.name, "horizons": rows} | fit
+        return values | {"protocol": self.protocol.name, "horizons": self.horizons.to_dicts()} | fit
 
     def to_table(self) -> pl.DataFrame:
         """Convert to rows of `schemas.evaluations.EVALUATIONS`."""
@@ -86,11 +79,10 @@ class Evaluation:
             "origin": "measured",
             "reference": "",
         }
-        rows = [
-            shared | asdict(own) | (dict(self.latency) if own.dataset == own.group == EVERYTHING else {})
-            for own in self.scores
-        ]
-        return pl.DataFrame(rows, schema=EVALUATIONS.dtypes).sort(EVALUATIONS.key)
+        everything = pl.all_horizontal(pl.col("dataset", "group") == EVERYTHING)
+        timed = {name: pl.when(everything).then(self.latency.get(name)) for name in ("latency_ms", "latency_samples")}
+        rows = self.scores.with_columns(**{name: pl.lit(value) for name, value in shared.items()}, **timed)
+        return EVALUATIONS.conform(rows.lazy()).sort(EVALUATIONS.key).collect()
 
     def to_vehicle_errors(self) -> pl.DataFrame:
         """Convert to rows of `schemas.comparisons.VEHICLE_ERRORS`."""
@@ -126,26 +118,18 @@ def evaluate(
         TracklakeError: see `open_forecaster` and `measure_errors`.
     """
     folder = tensors if isinstance(tensors, TensorFolder) else TensorFolder.open(tensors)
-    own = open_forecaster(name, folder, Path(models), frozenset({part}))
+    model = open_forecaster(name, folder, Path(models), frozenset({part}))
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
-    found = measure_errors(
-        own.predictor, folder, part, name=name, reads=own.reads, nearest=nearest, seconds=seconds, observe=observe
-    )
-    found = replace(found, run=own.config, fit=own.fit)
-    if with_latency:
-        latency = measure_latency(own.predictor, folder, part, reads=own.reads, nearest=nearest)
-        found = replace(found, latency=latency)
-    return found
+    found = measure_errors(model, folder, part, nearest=nearest, seconds=seconds, observe=observe)
+    return replace(found, latency=measure_latency(model, folder, part, nearest)) if with_latency else found
 
 
 def measure_errors(
-    predictor: Predictor,
+    model: Forecaster,
     folder: TensorFolder,
     part: str,
     *,
-    name: str,
-    reads: Reads = "grid",
     nearest: int = NEAREST,
     seconds: Sequence[float] | None = None,
     observe: Observer | None = None,
@@ -171,24 +155,21 @@ def measure_errors(
             f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "
             f"{more}, and run `tracklake run` again"
         )
-    refuse_future(predictor, folder, part, name=name, reads=reads, nearest=nearest)
+    refuse_future(model, folder, part, nearest=nearest)
     strata, protocol = find_strata(folder, samples), folder.protocol
     tally = Tally(strata, protocol.horizon_ticks)
-    for start in range(0, len(samples), BATCH_SIZE):
-        chosen = slice(start, start + BATCH_SIZE)
-        observed, truth = read_samples(folder, samples[chosen], reads, nearest=nearest)
-        prediction, own_truth = predictor.predict(observed), truth_of_ego(truth)
-        tally.add(strata.of_sample[chosen], prediction, own_truth)
+    for chosen, prediction, truth in model.predict(folder, samples, nearest=nearest):
+        tally.add(strata.of_sample[chosen], prediction, truth)
         if observe is not None:
-            observe(chosen, prediction, own_truth)
+            observe(chosen, prediction, truth)
     for what, sums in tally.sums.items():
         if not np.isfinite(sums).all():
-            raise NotFiniteError(name, "densities" if what == "nll" else "positions")
+            raise NotFiniteError(model.name, "densities" if what == "nll_nats" else "positions")
     subset = folder.run_subset[folder.runs_of(folder.sample_row[samples])]
     tally.drop_lateral(strata.of_sample[folder.lane_centred[subset]])
     at = seconds if seconds is not None else [tick / protocol.rate_hz for tick in protocol.scored_ticks]
     return Evaluation(
-        model=name,
+        model=model.name,
         part=part,
         split=folder.split,
         protocol=protocol,
@@ -196,8 +177,10 @@ def measure_errors(
         samples=len(samples),
         vehicles=int(strata.vehicle[-1]) + 1,
         scores=tally.score(at, protocol.rate_hz),
-        nearest=nearest if reads == "scene" else None,
+        nearest=nearest if model.reads == "scene" else None,
         vehicle_sums=_list_vehicle_sums(folder, samples, tally, at),
+        run=model.config,
+        fit=model.fit,
     )
 
 
@@ -207,35 +190,17 @@ def _list_vehicle_sums(folder: TensorFolder, samples: Integers, tally: Tally, se
     first = np.unique(tally.strata.vehicle[tally.strata.of_sample], return_index=True)[1]
     run = folder.runs_of(folder.sample_row[samples[first]])
     subsets = pl.DataFrame(folder.index["subsets"]).select("dataset", "subset")[folder.run_subset[run]]
-    columns = {
-        "squared_longitudinal_m2": "longitudinal2",
-        "squared_lateral_m2": "lateral2",
-        "distance_m": "distance",
-        "nll_nats": "nll",
-    }
     vehicles = subsets.with_columns(pl.Series("vehicle_id", folder.run_vehicle_id[run]))
-    return (
-        pl.concat(
-            vehicles.with_columns(
-                pl.lit(float(ahead)).alias("seconds"),
-                pl.Series("n", sums["n"][:, at], dtype=pl.Int64, strict=False),
-                *(
-                    pl.Series(column, sums[name][:, at])
-                    if name in sums
-                    else pl.lit(None, dtype=pl.Float64).alias(column)
-                    for column, name in columns.items()
-                ),
-            )
-            for at, ahead in enumerate(seconds)
-        )
-        .fill_nan(None)
-        .filter(pl.col("n") > 0)
+    known = {name: own for name, own in sums.items() if name in VEHICLE_ERRORS.columns}
+    rows = (
+        vehicles.with_columns(seconds=float(ahead), **{name: pl.Series(own[:, at]) for name, own in known.items()})
+        for at, ahead in enumerate(seconds)
     )
+    empty = VEHICLE_ERRORS.empty().drop("run", "model", "seed")
+    return pl.concat([empty, *rows], how="diagonal_relaxed").fill_nan(None).filter(pl.col("n") > 0)
 
 
-def measure_latency(
-    predictor: Predictor, folder: TensorFolder, part: str, *, reads: Reads = "grid", nearest: int = NEAREST
-) -> dict[str, float]:
+def measure_latency(model: Forecaster, folder: TensorFolder, part: str, nearest: int) -> dict[str, float]:
     """Measure the median time to predict all samples of a moment on one thread, in ms, and the median number of them.
 
     The moments are evenly spread over the part, which has samples; the time to read them is left out.
@@ -248,11 +213,11 @@ def measure_latency(
             torch.set_num_threads(1)
         for number, scene in enumerate(choose_moments(folder, part, LATENCY_MOMENTS)):
             samples = find_scene_samples(folder, scene)
-            observed, _ = read_samples(folder, samples, reads, nearest=nearest)
+            observed, _ = read_samples(folder, samples, model.reads, nearest=nearest)
             if number == 0:
-                predictor.predict(observed)  # the first call prepares what later ones use
+                model.predictor.predict(observed)  # the first call prepares what later ones use
             start = time.perf_counter()
-            predictor.predict(observed)
+            model.predictor.predict(observed)
             spent.append(time.perf_counter() - start)
             counts.append(len(samples))
     finally:

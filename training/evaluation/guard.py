@@ -29,9 +29,9 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import Prediction
+from tracklake.training.runs.forecasters import Forecaster
 
 MOMENTS = 3
 """Number of moments that are predicted twice."""
@@ -73,9 +73,7 @@ SAMPLE_CHANGES: Mapping[str, Change] = {
 """How those arrays of samples are changed that are made of their futures."""
 
 
-def refuse_future(
-    predictor: Predictor, folder: TensorFolder, part: str, *, name: str, reads: Reads = "grid", nearest: int = NEAREST
-) -> None:
+def refuse_future(model: Forecaster, folder: TensorFolder, part: str, *, nearest: int = NEAREST) -> None:
     """Refuse a model whose predictions of some moments, evenly spread over a part, change with what comes after them.
 
     The folder itself changes meanwhile, so that a model which holds it is found out too; no other thread may read it at
@@ -92,10 +90,10 @@ def refuse_future(
         where, begin, after = _find_later_rows(folder, scene)
 
         def predict(samples: Integers = samples) -> tuple[Arrays, Arrays]:
-            observed, _ = read_samples(folder, samples, reads, nearest=nearest)
+            observed, _ = read_samples(folder, samples, model.reads, nearest=nearest)
             given = {own.name: np.array(getattr(observed, own.name)) for own in fields(observed)}  # before it is used
             # A copy each time: nothing that a model remembers of one prediction goes into the next one.
-            return given, _list_arrays(copy.deepcopy(predictor, {id(folder): folder}).predict(observed))
+            return given, _list_arrays(copy.deepcopy(model.predictor, {id(folder): folder}).predict(observed))
 
         given, predicted = predict()
         for array, change in ROW_CHANGES.items():
@@ -107,18 +105,18 @@ def refuse_future(
         if difference := _find_difference(given, given_then, exactly=True):
             raise FutureInputError(
                 f"what models are shown {where} changes with what comes after: `{difference[0]}` ({difference[2]}); "
-                f"the reader of `{reads}` must stop at the sample's own tick"
+                f"the reader of `{model.reads}` must stop at the sample's own tick"
             )
         if difference := _find_difference(predicted, predicted_then):
             if _find_difference(predicted, predict()[1]):
                 raise TracklakeError(
-                    f"`{name}` predicts differently each time from the same input ({where}): fix its seed, so that its "
-                    "scores mean something and it can be checked that it does not see the future"
+                    f"`{model.name}` predicts differently each time from the same input ({where}): fix its seed, so "
+                    "that its scores mean something and it can be checked that it does not see the future"
                 )
             array, at, apart = difference
             sample = f"sample {samples[at]}" if len(predicted[array]) == len(samples) else f"position {at}"
             raise FutureInputError(
-                f"`{name}` sees the future: its prediction {where} changes with what comes after (`{array}` of "
+                f"`{model.name}` sees the future: its prediction {where} changes with what comes after (`{array}` of "
                 f"{sample}, {apart}). A model may use its input, `training.data.observed`, and nothing else of the "
                 "tensors"
             )

@@ -9,39 +9,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
-from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.schemas.evaluations import AVERAGES, EVERYTHING, FINDING_GROUPS
+from tracklake.schemas.comparisons import COMPARED_FIGURES
+from tracklake.schemas.errors import UsageError
+from tracklake.schemas.evaluations import AVERAGES, EVALUATIONS, EVERYTHING, FIGURES, FINDING_GROUPS
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.prediction import Density, Prediction
 
-
-@dataclass(frozen=True)
-class Score:
-    """One row of figures as `schemas.evaluations` defines them; None where there is nothing to measure."""
-
-    dataset: str
-    group: str
-    average: str
-    seconds: float
-    n: int
-    vehicles: int
-    rmse_m: float | None = None
-    rmse_longitudinal_m: float | None = None
-    rmse_lateral_m: float | None = None
-    mae_m: float | None = None
-    mae_longitudinal_m: float | None = None
-    mae_lateral_m: float | None = None
-    ade_m: float | None = None
-    fde_m: float | None = None
-    nll_nats: float | None = None
-    lateral_accuracy: float | None = None
-    longitudinal_accuracy: float | None = None
-    majority_lateral_share: float | None = None
-    majority_longitudinal_share: float | None = None
+SCORES = {
+    name: EVALUATIONS.dtypes[name] for name in ("dataset", "group", "average", "seconds", "n", "vehicles", *FIGURES)
+}
+"""Columns of scores, as `schemas.evaluations` defines them; figures are null where there is nothing to measure."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +105,7 @@ def find_nll(density: Density, future: Singles) -> Floats:
 
 
 def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Floats]:
-    """Compute the summands of each sample and tick, (B, F) each; 0 where the position is not known.
-
-    Raises:
-        TracklakeError: places are not of the truth's shape.
-    """
-    if prediction.position_m.shape != truth.future.shape:
-        raise TracklakeError(f"expected places of shape {truth.future.shape}, got {prediction.position_m.shape}")
+    """Compute the summands of each sample and tick, (B, F) each; 0 where the position is not known."""
     known = truth.future_mask
     error = np.where(known[..., None], prediction.position_m.astype(np.float64) - truth.future, 0.0)
     squares = error**2
@@ -137,15 +113,15 @@ def measure_samples(prediction: Prediction, truth: Truth[Any]) -> dict[str, Floa
     ticks = np.arange(1, distance.shape[1] + 1)
     sums = {
         "n": known.astype(np.float64),
-        "longitudinal2": squares[..., 0],
-        "lateral2": squares[..., 1],
+        "squared_longitudinal_m2": squares[..., 0],
+        "squared_lateral_m2": squares[..., 1],
         "longitudinal": np.abs(error[..., 0]),
         "lateral": np.abs(error[..., 1]),
-        "distance": distance,
+        "distance_m": distance,
         "average_distance": np.where(known, distance.cumsum(axis=1) / ticks, 0.0),
     }
     if prediction.density is not None:
-        sums["nll"] = np.where(known, find_nll(prediction.density, truth.future), 0.0)
+        sums["nll_nats"] = np.where(known, find_nll(prediction.density, truth.future), 0.0)
     for name in ("lateral", "longitudinal"):
         probability = getattr(prediction, name)
         if probability is not None:
@@ -176,20 +152,20 @@ class Tally:
         for name in LATERAL_SUMS & self.sums.keys():
             self.sums[name][stratum] = np.nan
 
-    def score(self, seconds: Sequence[float], rate_hz: int) -> tuple[Score, ...]:
-        """Compute the figures of every dataset, group and average at some horizons.
+    def score(self, seconds: Sequence[float], rate_hz: int) -> pl.DataFrame:
+        """Compute the figures of every dataset, group and average at some horizons: rows of SCORES.
 
         Raises:
             UsageError: the horizon has no tick at these seconds.
         """
         at = self._find_ticks(seconds, rate_hz)
         sums = {name: total[:, at - 1] for name, total in self.sums.items()}
-        rows: list[Score] = []
+        tables = [pl.DataFrame(schema=SCORES)]
         for dataset, group, members in self.strata.list_groups():
             if group == EVERYTHING:
                 sums |= self._count_majority(members, sums["n"])
-            rows += _score_group(dataset, group, members, sums, self.strata.vehicle, seconds)
-        return tuple(rows)
+            tables += _score_group(dataset, group, members, sums, self.strata.vehicle, seconds)
+        return pl.concat(tables, how="diagonal_relaxed").fill_nan(None).cast(SCORES)
 
     def sum_vehicles(self, seconds: Sequence[float], rate_hz: int) -> dict[str, Floats]:
         """Sum up the samples of each vehicle at some horizons, (V, T) each; errors are those of `score`."""
@@ -216,54 +192,45 @@ class Tally:
         return {f"majority_{name}": n * (code == most[name])[:, None] for name, code in codes.items()}
 
 
-ROOTS = {
-    "rmse_m": ("longitudinal2", "lateral2"),
-    "rmse_longitudinal_m": ("longitudinal2",),
-    "rmse_lateral_m": ("lateral2",),
+SUMMANDS = {
+    **COMPARED_FIGURES,
+    "mae_longitudinal_m": ("longitudinal",),
+    "mae_lateral_m": ("lateral",),
+    "ade_m": ("average_distance",),
+    "fde_m": ("distance_m",),
+    "lateral_accuracy": ("lateral_right",),
+    "longitudinal_accuracy": ("longitudinal_right",),
+    "majority_lateral_share": ("majority_lateral",),
+    "majority_longitudinal_share": ("majority_longitudinal",),
 }
-"""Figures that are roots of means, and the summands behind each."""
-LATERAL_SUMS = frozenset({"lateral2", "lateral", "distance", "average_distance", "nll"})
+"""Figures and the summands behind each; those named rmse are roots of means, the others means."""
+LATERAL_SUMS = frozenset({"squared_lateral_m2", "lateral", "distance_m", "average_distance", "nll_nats"})
 """Summands that depend on lateral positions."""
-MEANS = {
-    "mae_m": "distance",
-    "mae_longitudinal_m": "longitudinal",
-    "mae_lateral_m": "lateral",
-    "ade_m": "average_distance",
-    "fde_m": "distance",
-    "nll_nats": "nll",
-    "lateral_accuracy": "lateral_right",
-    "longitudinal_accuracy": "longitudinal_right",
-    "majority_lateral_share": "majority_lateral",
-    "majority_longitudinal_share": "majority_longitudinal",
-}
-"""Figures that are means, and the summand behind each."""
 
 
 def _score_group(
     dataset: str, group: str, members: Flags, sums: dict[str, Floats], vehicle: Integers, seconds: Sequence[float]
-) -> Iterator[Score]:
-    """Compute the rows of one group, by average and horizon."""
+) -> Iterator[pl.DataFrame]:
+    """Compute the rows of one group, by average and horizon; NaN where there is nothing to measure."""
     starts = np.unique(vehicle[members], return_index=True)[1]
     by_vehicle = {
         name: np.add.reduceat(total[members], starts, axis=0) if len(starts) else total[members]
         for name, total in sums.items()
     }
     n = by_vehicle["n"]
-    total_n, vehicles = n.sum(axis=0), (n > 0).sum(axis=0)
+    counts = {"n": n.sum(axis=0), "vehicles": (n > 0).sum(axis=0)}
     for average in AVERAGES:
         means = {name: _average(total, n, average) for name, total in by_vehicle.items()}
-        for at, ahead in enumerate(seconds):
-            figures: dict[str, float] = {}
-            if total_n[at]:
-                roots = {name: float(np.sqrt(sum(means[own][at] for own in owns))) for name, owns in ROOTS.items()}
-                found = roots | {name: float(means[own][at]) for name, own in MEANS.items() if own in means}
-                figures = {name: value for name, value in found.items() if not np.isnan(value)}
-            yield Score(dataset, group, average, float(ahead), int(total_n[at]), int(vehicles[at]), **figures)
+        known = {name: owns for name, owns in SUMMANDS.items() if all(own in means for own in owns)}
+        figures = {name: np.sum([means[own] for own in owns], axis=0) for name, owns in known.items()}
+        figures |= {name: np.sqrt(values) for name, values in figures.items() if name.startswith("rmse")}
+        yield pl.DataFrame(
+            {"dataset": dataset, "group": group, "average": average, "seconds": seconds, **counts, **figures}
+        )
 
 
 def _average(total: Floats, n: Floats, average: str) -> Floats:
-    """Average sums (V, T) over n (V, T) samples of each vehicle: (T,); 0 where there are none."""
+    """Average sums (V, T) over n (V, T) samples of each vehicle: (T,); NaN where there are none."""
     if average == "vehicles":
         total, n = np.divide(total, n, out=np.zeros_like(total), where=n > 0), (n > 0).astype(np.float64)
-    averaged: Floats = total.sum(axis=0) / np.maximum(n.sum(axis=0), 1.0)
-    return averaged
+    return np.where(n.any(axis=0), total.sum(axis=0) / np.maximum(n.sum(axis=0), 1.0), np.nan)

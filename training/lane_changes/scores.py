@@ -5,7 +5,7 @@ places and labels come from the future: predictions are compared with them and g
 read only what `training.data.observed` holds.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +14,8 @@ import numpy as np
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.observed import FutureInputError, ObservedScene
+from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import BATCH_SIZE
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
@@ -24,7 +23,6 @@ from tracklake.training.lane_changes.examples import (
     LabelledSamples,
     LaneForestSettings,
     Targets,
-    cut_numbers,
     draw_balanced,
     gather_examples,
     label_samples,
@@ -32,10 +30,9 @@ from tracklake.training.lane_changes.examples import (
 )
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
-from tracklake.training.models import Predictor, Reads
 from tracklake.training.models.constant_velocity import ConstantVelocity
-from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import NotFiniteError, Prediction
+from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.run_folder import refuse_leak
 
 COLUMNS = np.array([{"keep": 0, "left": -1, "right": 1}[name] for name in LATERAL_MANEUVERS], dtype=np.int8)
@@ -101,25 +98,24 @@ class GridScores:
     left_out_by_reason: dict[str, int]
 
 
+@dataclass(frozen=True)
 class _ForestPredictor:
     """Forest with the interface of a model, for the guard: all probabilities in one array, and no places."""
 
-    def __init__(self, forest: LaneForest) -> None:
-        self._forest = forest
+    forest: LaneForest
 
     def predict(self, observed: ObservedScene[Any]) -> Prediction:
-        probability = self._forest.predict(observed)
+        probability = self.forest.predict(observed)
         none = np.zeros((len(probability), 0, 2), dtype=np.float32)
         return Prediction(position_m=none, lateral=probability.reshape(len(probability), -1))
 
 
 def evaluate_grid(
     folder: TensorFolder,
-    predictors: Mapping[str, Predictor],
+    models: Iterable[Forecaster],
     forest: LaneForest,
     *,
     part: str = "eval",
-    reads: Mapping[str, Reads] | None = None,
     most: int = MOST,
     seed: int = 0,
     on_skip: Callable[[str, str], None] | None = None,
@@ -127,9 +123,8 @@ def evaluate_grid(
     """Score models by the cells of their predicted places, at every horizon of the forest.
 
     Each model is scored twice: with the columns of its own places, and with the forest's. Samples are those of
-    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn. `reads` holds models'
-    inputs, by default `grid`. `on_skip` is called with the name of a model that cannot be scored, and the reason; where
-    it is None, the first refusal is raised.
+    `examples.label_samples`, with the forest's T_d; of more than `most`, so many are drawn. `on_skip` is called with
+    the name of a model that cannot be scored, and the reason; where it is None, the first refusal is raised.
 
     Raises:
         FutureInputError: the forest or a model sees the future.
@@ -141,53 +136,45 @@ def evaluate_grid(
     found = label_samples(folder, part, forest.settings)
     samples = found.draw(most, seed)
     if len(samples):
-        refuse_future(_ForestPredictor(forest), folder, part, name="lane-forest", reads="scene")
+        refuse_future(Forecaster("lane-forest", _ForestPredictor(forest), "scene"), folder, part)
     targets = read_targets(folder, samples.sample, ticks)
-    straight_m = predict_places(folder, samples.sample, ConstantVelocity(folder.protocol), ticks, "straight")
+    straight = Forecaster("straight", ConstantVelocity(folder.protocol))
+    straight_m = predict_places(straight, folder, samples.sample, ticks)
     true = find_cells(targets.place_m, straight_m, targets)
     decided = decide_classes(forest.predict_proba(targets.feature))  # (S, 1 + T)
     forest_column = COLUMNS[decided[:, 1:]]
     strata = samples.find_strata()
     cells: list[CellScore] = []
-    for name, predictor in predictors.items() if len(samples) else ():
-        kind = (reads or {}).get(name, "grid")
+    for model in models if len(samples) else ():
         try:
-            refuse_future(predictor, folder, part, name=name, reads=kind)
-            place_m = predict_places(folder, samples.sample, predictor, ticks, name, kind)
-        except (TracklakeError, FutureInputError, ValueError) as refused:
+            refuse_future(model, folder, part)
+            place_m = predict_places(model, folder, samples.sample, ticks)
+        except (TracklakeError, ValueError) as refused:
             if on_skip is None:
                 raise
-            on_skip(name, str(refused))
+            on_skip(model.name, str(refused))
             continue
         own = find_cells(place_m, straight_m, targets)
         joined = np.stack([forest_column, own[..., 1]], axis=-1)
         for source, predicted in (("place", own), ("forest", joined)):
-            cells += score_cells(name, source, predicted, true, forest.horizons_s, strata)
+            cells += score_cells(model.name, source, predicted, true, forest.horizons_s, strata)
     maneuvers = [score_maneuvers(name, decided[of, 0], samples.maneuver[of]) for name, of in strata.items()]
     return GridScores(cells, maneuvers, found.left_out, found.reasons)
 
 
-def predict_places(
-    folder: TensorFolder, sample: Integers, predictor: Predictor, ticks: Sequence[int], name: str, reads: Reads = "grid"
-) -> Singles:
+def predict_places(model: Forecaster, folder: TensorFolder, sample: Integers, ticks: Sequence[int]) -> Singles:
     """Predict the places of samples (S,) at some ticks ahead (T,): (S, T, 2).
 
     Raises:
         NotFiniteError: places are not finite numbers.
         TracklakeError: places are not of the horizon's shape.
     """
-    at = np.array(ticks, dtype=np.intp) - 1
-    places = []
-    for numbers in cut_numbers(sample, BATCH_SIZE):
-        observed, truth = read_samples(folder, numbers, reads)
-        place_m = predictor.predict(observed).position_m
-        expected = truth_of_ego(truth).future.shape
-        if place_m.shape != expected:
-            raise TracklakeError(f"`{name}`: expected places of shape {expected}, got {place_m.shape}")
-        if not np.isfinite(place_m).all():
-            raise NotFiniteError(name, "positions")
-        places.append(place_m[:, at])
-    return np.concatenate(places)
+    place_m: Singles = np.empty((len(sample), len(ticks), 2), dtype=np.float32)
+    for chosen, prediction, _ in model.predict(folder, sample):
+        if not np.isfinite(prediction.position_m).all():
+            raise NotFiniteError(model.name, "positions")
+        place_m[chosen] = prediction.position_m[:, np.subtract(ticks, 1)]
+    return place_m
 
 
 def find_cells(place_m: Singles, straight_m: Singles, targets: Targets) -> Codes:

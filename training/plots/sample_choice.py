@@ -8,15 +8,12 @@ from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.runs.forecasters import Forecaster
 
 Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
 
 MOST_SEARCHED = 20_000
 """Most samples searched for the worst; of more, so many are drawn at random."""
-BATCH_SIZE = 2048
-"""Samples predicted at once."""
 
 
 class NoSampleError(TracklakeError):
@@ -110,14 +107,10 @@ def measure_last_distance(folder: TensorFolder, samples: Integers, judge: Foreca
 
     Where lateral positions are lane centres, it is the distance along the road.
     """
-    distances = []
-    centred = folder.lane_centred[folder.run_subset[folder.runs_of(folder.sample_row[samples])]]
-    for start in range(0, len(samples), BATCH_SIZE):
-        observed, everything = read_samples(folder, samples[start : start + BATCH_SIZE], judge.reads)
-        truth = truth_of_ego(everything)
-        position_m = judge.predictor.predict(observed).position_m.astype(np.float64)
+    apart_m = np.empty((len(samples), 2))
+    for chosen, prediction, truth in judge.predict(folder, samples):
         last = truth.future_mask.sum(axis=1) - 1
-        apart = (position_m - truth.future)[np.arange(len(last)), last]
-        across = np.where(centred[start : start + BATCH_SIZE], 0.0, apart[:, 1])
-        distances.append(np.hypot(apart[:, 0], across))
-    return np.concatenate(distances)
+        error_m = prediction.position_m.astype(np.float64) - truth.future
+        apart_m[chosen] = error_m[np.arange(len(last)), last]
+    centred = folder.lane_centred[folder.run_subset[folder.runs_of(folder.sample_row[samples])]]
+    return np.hypot(apart_m[:, 0], np.where(centred, 0.0, apart_m[:, 1]))

@@ -1,16 +1,24 @@
 """Models and runs by name, ready to predict samples of a tensor folder."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tracklake.schemas.errors import UsageError
+from tracklake.schemas.arrays import Integers
+from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.text import find_similar
+from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, Reads, find_model
 from tracklake.training.models.fitting import Fit, fit_model
+from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
+from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
+
+BATCH_SIZE = 256
+"""Number of samples predicted at once; predictions do not depend on it. With 2,048, the largest network's values leave
+the cache, and it takes nearly twice as long."""
 
 
 class UnknownRunError(UsageError):
@@ -27,9 +35,26 @@ class Forecaster:
 
     name: str
     predictor: Predictor
-    reads: Reads
-    config: Mapping[str, Any] = field(default_factory=dict)
+    reads: Reads = "grid"
+    config: Mapping[str, Any] = field(default_factory=dict, repr=False)
     fit: Fit | None = None
+
+    def predict(
+        self, folder: TensorFolder, samples: Integers, *, nearest: int = NEAREST
+    ) -> Iterator[tuple[slice, Prediction, Truth[Any]]]:
+        """Predict samples (S,) in batches: yield which of them, their prediction, and their own truth.
+
+        Raises:
+            TracklakeError: places are not of the truth's shape.
+        """
+        for start in range(0, len(samples), BATCH_SIZE):
+            chosen = slice(start, start + BATCH_SIZE)
+            observed, everything = read_samples(folder, samples[chosen], self.reads, nearest=nearest)
+            prediction, truth = self.predictor.predict(observed), truth_of_ego(everything)
+            wanted, found = truth.future.shape, prediction.position_m.shape
+            if found != wanted:
+                raise TracklakeError(f"`{self.name}`: expected places of shape {wanted}, got {found}")
+            yield chosen, prediction, truth
 
 
 def open_forecaster(name: str, folder: TensorFolder, models: Path, parts: frozenset[str]) -> Forecaster:

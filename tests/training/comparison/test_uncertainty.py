@@ -21,6 +21,7 @@ from tracklake.training.comparison.uncertainty import calibrate, find_radii, fin
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import measure_errors
 from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.runs.forecasters import Forecaster
 
 
 def random_density(draw, *, samples, alternatives, ticks):
@@ -233,7 +234,7 @@ def test_density_of_traffic_and_records_by_hand(tmp_path):
     own = SampleRecord(folder, "eval")
     # Samples by vehicle and tick: 3 and 3, then 2 and 1 vehicles on 1.5 km of lane.
     assert measure_densities(folder, own.samples) == pytest.approx([3 / 1.5, 3 / 1.5, 2 / 1.5, 3 / 1.5])
-    measure_errors(Sure(), folder, "eval", name="sure", observe=own.observe)
+    measure_errors(Forecaster("sure", Sure()), folder, "eval", observe=own.observe)
     assert own.seconds == [1.0, 2.0]
     assert own.known.tolist() == [[True, False], [True, False], [False, False], [True, False]]
     # Vehicle 1 moves 500 m in the second after tick 2, 250 m after tick 3; vehicle 2 moves 100 m.
@@ -247,7 +248,7 @@ def test_lane_centres_have_no_lateral_figures(tmp_path):
     folder = road(tmp_path)
     folder.index["subsets"][1]["lateral_positions"] = "lane centres"
     own = SampleRecord(folder, "eval")
-    measure_errors(Sure(), folder, "eval", name="sure", observe=own.observe)
+    measure_errors(Forecaster("sure", Sure()), folder, "eval", observe=own.observe)
     assert calibrate("sure", own).is_empty()
     (row,) = score_by_density("sure", own, np.full(4, 5.0)).filter(density="all").to_dicts()
     assert (row["rmse_lateral_m"], row["sigma_lateral_m"]) == (None, None)

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -13,15 +14,21 @@ import pytest
 from tensor_tables import CLOCK, TINY, drive, finding, sample_everything, split_row, write
 
 from tracklake.schemas.comparisons import VEHICLE_ERRORS
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import EmptyPartError, evaluate, measure_errors
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
-from tracklake.training.runs.forecasters import UnknownRunError
+from tracklake.training.runs.forecasters import Forecaster, UnknownRunError
 
 BOTH = pl.concat([split_row("a", "train"), split_row("b", "eval")])
+
+
+def list_rows(frame):
+    """The rows of a frame, with the columns as attributes."""
+    return [SimpleNamespace(**row) for row in frame.iter_rows(named=True)]
 
 
 def track(vehicle_id, points):
@@ -67,13 +74,12 @@ def test_lane_centres_leave_errors_along_the_road_alone(tmp_path, stored):
     result = evaluate("constant-velocity", folder, tmp_path / "models")
     known = stored != "lane centres"
     errors = VEHICLE_ERRORS.validate(result.to_vehicle_errors(), where="here")
-    for row in (*result.horizons, *errors.iter_rows(named=True)):
-        figures = row if isinstance(row, dict) else vars(row)
+    for figures in (*result.horizons.to_dicts(), *errors.to_dicts()):
         lateral = {name for name in figures if name.endswith(("_m", "_m2")) and "longitudinal" not in name}
         assert len(lateral) in (2, 6)
         assert {figures[name] is not None for name in lateral} == {known}
-    assert result.horizons[0].rmse_longitudinal_m == pytest.approx(3 / math.sqrt(2), rel=1e-6)
-    assert result.horizons[0].mae_longitudinal_m == pytest.approx(3 / 2, rel=1e-6)
+    assert result.horizons["rmse_longitudinal_m"][0] == pytest.approx(3 / math.sqrt(2), rel=1e-6)
+    assert result.horizons["mae_longitudinal_m"][0] == pytest.approx(3 / 2, rel=1e-6)
     assert errors["squared_longitudinal_m2"].sum() == pytest.approx(3**2, rel=1e-6)
 
 
@@ -89,7 +95,7 @@ def test_lane_centres_of_one_recording_leave_those_of_others(tmp_path):
     folder = TensorFolder.open(write(tmp_path / "tensors", tables, parts))
     folder.index["subsets"][1]["lateral_positions"] = "lane centres"
     both, recorded, centred = (
-        evaluate("constant-velocity", own, tmp_path).horizons[0]
+        list_rows(evaluate("constant-velocity", own, tmp_path).horizons)[0]
         for own in (folder, folder.narrow(recording="b"), folder.narrow(recording="c"))
     )
     assert (both.rmse_m, both.n) == (None, 2)
@@ -101,7 +107,7 @@ def test_lane_centres_of_one_recording_leave_those_of_others(tmp_path):
 def test_errors_of_constant_velocity_by_hand(tmp_path):
     result = evaluate("constant-velocity", two_samples(tmp_path / "tensors"), tmp_path / "models")
     assert (result.model, result.part, result.split, result.samples) == ("constant-velocity", "eval", "mine", 2)
-    after_1_s, after_2_s = result.horizons
+    after_1_s, after_2_s = list_rows(result.horizons)
     assert (after_1_s.seconds, after_1_s.n) == (1, 2)
     assert after_1_s.rmse_m == pytest.approx(math.sqrt((3**2 + 4**2) / 2), rel=1e-6)
     assert after_1_s.rmse_longitudinal_m == pytest.approx(3 / math.sqrt(2), rel=1e-6)
@@ -133,16 +139,16 @@ class Says:
 
 
 def test_errors_equal_a_loop_over_samples(tmp_path, monkeypatch):
-    monkeypatch.setattr("tracklake.training.evaluation.evaluate.BATCH_SIZE", 7)
+    monkeypatch.setattr("tracklake.training.runs.forecasters.BATCH_SIZE", 7)
     draw = np.random.default_rng(3)
     tables = []
     for subset in "ab":
         clock = drive(draw, vehicles=6, ticks=15)
         tables.append((subset, clock, *sample_everything(draw, clock, dataset="highd", subset=subset)))
     folder = TensorFolder.open(write(tmp_path, tables, BOTH))
-    result = measure_errors(Says(), folder, "eval", name="still")
+    result = measure_errors(Forecaster("still", Says()), folder, "eval")
     where = {(v, t): (x, y) for v, t, x, y in tables[1][1].select("vehicle_id", "tick", "x_m", "y_m").iter_rows()}
-    for horizon in result.horizons:
+    for horizon in list_rows(result.horizons):
         errors = []
         for sample in tables[1][2].iter_rows(named=True):
             now = where[sample["vehicle_id"], sample["tick"]]
@@ -185,9 +191,9 @@ def test_rows_of_a_part_by_vehicle_maneuver_findings_and_dataset(tmp_path, sever
             return said
 
     with mock.patch("tracklake.training.evaluation.evaluate.refuse_future"):
-        result = measure_errors(OneThenTheOther(), folder, "eval", name="one")
+        result = measure_errors(Forecaster("one", OneThenTheOther()), folder, "eval")
     assert (result.samples, result.vehicles) == (2, 2), "the same id in two subsets is two vehicles"
-    found = {(row.dataset, row.group, row.average): row for row in result.scores if row.seconds == 1.0}
+    found = {(row.dataset, row.group, row.average): row for row in list_rows(result.scores) if row.seconds == 1.0}
     expected = {
         ("all", "all"): (2, 2.0),
         ("all", "lateral=keep"): (1, 3.0),
@@ -220,9 +226,9 @@ def test_a_vehicle_seen_twice_is_one(tmp_path):
     ).with_columns(frame=1 + 5 * pl.col("tick"))
     samples = pl.concat([sample_at(1, 2, subset="b"), sample_at(1, 8, subset="b")])
     folder = TensorFolder.open(write(tmp_path, [("b", clock, samples, NEIGHBORS.empty())], split_row("b", "eval")))
-    result = measure_errors(Says(), folder, "eval", name="still")
+    result = measure_errors(Forecaster("still", Says()), folder, "eval")
     assert (result.samples, result.vehicles) == (2, 1)
-    assert [(row.n, row.vehicles) for row in result.horizons] == [(2, 1), (0, 0)]
+    assert [(row.n, row.vehicles) for row in list_rows(result.horizons)] == [(2, 1), (0, 0)]
 
 
 def test_the_table_of_an_evaluation(tmp_path):
@@ -258,7 +264,7 @@ def test_density_and_maneuvers_are_scored(tmp_path):
 
     folder = TensorFolder.open(two_samples(tmp_path))
     said = Says(lateral=even, density=wide)
-    after_1_s, after_2_s = measure_errors(said, folder, "eval", name="says").horizons
+    after_1_s, after_2_s = list_rows(measure_errors(Forecaster("says", said), folder, "eval").horizons)
     assert after_1_s.lateral_accuracy == 0.0, "left is said, and both keep their lane"
     assert after_1_s.longitudinal_accuracy is None
     # The samples are at (7, 5) and (4, 1) after 1 s, the first at (8, 2) after 2 s; sigma is 2 m either way.
@@ -274,21 +280,21 @@ def test_a_density_that_is_none_is_refused(tmp_path):
 
     folder = TensorFolder.open(two_samples(tmp_path))
     with pytest.raises(NotFiniteError, match="`flat` predicts densities that are not finite"):
-        measure_errors(Says(density=flat), folder, "eval", name="flat")
+        measure_errors(Forecaster("flat", Says(density=flat)), folder, "eval")
 
 
 def test_other_horizons_can_be_asked_for(tmp_path):
     folder = TensorFolder.open(two_samples(tmp_path))
     model = ConstantVelocity(TINY)
-    result = measure_errors(model, folder, "eval", name="cv", seconds=(0.5, 1.5))
-    assert [(row.seconds, row.n) for row in result.horizons] == [(0.5, 2), (1.5, 1)]
+    result = measure_errors(Forecaster("cv", model), folder, "eval", seconds=(0.5, 1.5))
+    assert [(row.seconds, row.n) for row in list_rows(result.horizons)] == [(0.5, 2), (1.5, 1)]
 
 
 def test_every_tick_of_the_horizon_can_be_asked_for(tmp_path):
     result = evaluate("constant-velocity", two_samples(tmp_path / "tensors"), tmp_path, every_tick=True)
     # After a second the first is 5 m off; otherwise both are where they are said to be, as long as they are known.
     expected = [(0.5, 2, 0.0), (1.0, 2, 2.5), (1.5, 1, 0.0), (2.0, 1, 0.0)]
-    assert [(row.seconds, row.n, pytest.approx(row.mae_m, abs=1e-6)) for row in result.horizons] == expected
+    assert [(row.seconds, row.n, pytest.approx(row.mae_m, abs=1e-6)) for row in list_rows(result.horizons)] == expected
 
 
 def test_a_model_of_scenes_is_scored_by_its_egos(tmp_path):
@@ -302,10 +308,10 @@ def test_a_model_of_scenes_is_scored_by_its_egos(tmp_path):
             step = ego[:, -1] - ego[:, -2]
             return Prediction(step[:, None] * np.arange(1, TINY.horizon_ticks + 1, dtype=np.float32)[:, None])
 
-    by_scene = measure_errors(ByScene(), folder, "eval", name="scene", reads="scene", nearest=3)
-    by_grid = measure_errors(ConstantVelocity(TINY), folder, "eval", name="grid")
-    assert by_scene.horizons == by_grid.horizons
-    assert by_scene.horizons[0].mae_m == pytest.approx(2.5, rel=1e-6)
+    by_scene = measure_errors(Forecaster("scene", ByScene(), "scene"), folder, "eval", nearest=3)
+    by_grid = measure_errors(Forecaster("grid", ConstantVelocity(TINY)), folder, "eval")
+    assert by_scene.horizons.equals(by_grid.horizons)
+    assert by_scene.horizons["mae_m"][0] == pytest.approx(2.5, rel=1e-6)
     assert by_scene.to_table()["nearest"].unique().to_list() == [3]
     assert by_grid.to_table()["nearest"].unique().to_list() == [None], "a model of the grid is shown no more or fewer"
 
@@ -314,7 +320,9 @@ def test_a_horizon_that_no_sample_reaches_has_no_error(tmp_path):
     clock = track(1, [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0)])
     tables = [("b", clock, sample_at(1, 2, subset="b"), NEIGHBORS.empty())]
     result = evaluate("constant-velocity", write(tmp_path, tables, split_row("b", "eval")), tmp_path)
-    assert [(horizon.n, horizon.rmse_m, horizon.mae_m) for horizon in result.horizons] == [(0, None, None)] * 2
+    assert [(horizon.n, horizon.rmse_m, horizon.mae_m) for horizon in list_rows(result.horizons)] == [
+        (0, None, None)
+    ] * 2
 
 
 def test_an_empty_part_is_explained(tmp_path):
@@ -322,10 +330,22 @@ def test_an_empty_part_is_explained(tmp_path):
         evaluate("constant-velocity", two_samples(tmp_path), tmp_path, part="train")
 
 
+def test_a_prediction_of_another_shape_is_refused(tmp_path):
+    """Places of one tick would be broadcast over all of them."""
+
+    class OneTick(Says):
+        def predict(self, observed):
+            return Prediction(super().predict(observed).position_m[:, :1])
+
+    folder = TensorFolder.open(two_samples(tmp_path))
+    with pytest.raises(TracklakeError, match=r"`short`: expected places of shape \(2, 4, 2\), got \(2, 1, 2\)"):
+        measure_errors(Forecaster("short", OneTick()), folder, "eval")
+
+
 def test_predictions_that_are_not_numbers_are_refused(tmp_path):
     folder = TensorFolder.open(two_samples(tmp_path))
     with pytest.raises(NotFiniteError, match="`nan` predicts positions that are not finite"):
-        measure_errors(Says(np.nan), folder, "eval", name="nan")
+        measure_errors(Forecaster("nan", Says(np.nan)), folder, "eval")
 
 
 def test_unknown_and_untrained_models(tmp_path):

@@ -23,6 +23,7 @@ from tracklake.training.evaluation.guard import (
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, Prediction
+from tracklake.training.runs.forecasters import Forecaster
 
 BOTH = pl.concat([split_row("a", "train"), split_row("b", "eval")])
 
@@ -193,7 +194,7 @@ class Nudges(Still):
 @pytest.mark.parametrize("cheat", [AsksForTheFuture, AsksForTheManeuver])
 def test_asking_for_what_comes_is_refused(folder, cheat):
     with pytest.raises(FutureInputError, match="is not known when a model predicts: it sees history, neighbor_history"):
-        measure_errors(cheat(), folder, "eval", name="cheat")
+        measure_errors(Forecaster("cheat", cheat()), folder, "eval")
 
 
 @pytest.mark.parametrize(
@@ -216,14 +217,14 @@ def test_a_model_that_reaches_the_tensors_another_way_is_found_out(folder, cheat
         rf"`cheat` sees the future: its prediction at tick \d+ of highd/b changes .*\(`{array}` of sample \d+, .* apart"
     )
     with pytest.raises(FutureInputError, match=reported):
-        measure_errors(cheat(folder), folder, "eval", name="cheat")
+        measure_errors(Forecaster("cheat", cheat(folder)), folder, "eval")
 
 
 @pytest.mark.parametrize("cheat", [AddsUpLaterSteps, CountsLaterLanes])
 def test_a_model_that_looks_at_differences_between_later_rows_is_found_out(stored, cheat):
     """No two histories of these tracks are the same, so that it looks at later rows of the moment only."""
     with pytest.raises(FutureInputError, match="`cheat` sees the future"):
-        refuse_future(cheat(stored), stored, "eval", name="cheat")
+        refuse_future(Forecaster("cheat", cheat(stored)), stored, "eval")
 
 
 def test_a_model_that_reads_on_in_the_array_behind_its_own_is_found_out(folder, monkeypatch):
@@ -243,9 +244,9 @@ def test_a_model_that_reads_on_in_the_array_behind_its_own_is_found_out(folder, 
 
     monkeypatch.setattr(guard, "read_samples", read_as_views)
     # The first moment: its samples have futures, which follow their histories in the array.
-    refuse_future(Still(), folder, "eval", name="honest")
+    refuse_future(Forecaster("honest", Still()), folder, "eval")
     with pytest.raises(FutureInputError, match="`cheat` sees the future"):
-        refuse_future(ReadsOn(), folder, "eval", name="cheat")
+        refuse_future(Forecaster("cheat", ReadsOn()), folder, "eval")
 
 
 def test_a_reader_that_lets_the_future_through_is_found_out(folder, monkeypatch):
@@ -257,7 +258,7 @@ def test_a_reader_that_lets_the_future_through_is_found_out(folder, monkeypatch)
     with pytest.raises(
         FutureInputError, match=r"what models are shown at tick .* changes .*`history`.* reader of `grid`"
     ):
-        refuse_future(Still(), folder, "eval", name="honest")
+        refuse_future(Forecaster("honest", Still()), folder, "eval")
 
 
 def test_a_model_that_never_says_the_same_cannot_be_checked(folder):
@@ -269,7 +270,7 @@ def test_a_model_that_never_says_the_same_cannot_be_checked(folder):
     with pytest.raises(
         TracklakeError, match=r"`dreams` predicts differently each time from the same input .*fix its seed"
     ):
-        measure_errors(Dreams(), folder, "eval", name="dreams")
+        measure_errors(Forecaster("dreams", Dreams()), folder, "eval")
 
 
 @pytest.mark.parametrize("reads", ["grid", "scene"])
@@ -288,20 +289,20 @@ def test_honest_models_pass_and_the_folder_is_as_it_was(stored, reads, part):
     before = {array.name: getattr(stored, array.name) for array in ARRAYS}
     copies = {name: values.copy() for name, values in before.items()}
     scenes = stored.scene_of_sample
-    refuse_future(AllThatIsGiven(), stored, part, name="honest", reads=reads)
+    refuse_future(Forecaster("honest", AllThatIsGiven(), reads), stored, part)
     assert all(getattr(stored, name) is values for name, values in before.items())
     assert all(
         np.array_equal(copies[name], values, equal_nan=values.dtype.kind == "f") for name, values in before.items()
     )
     assert stored.scene_of_sample is scenes
     if reads == "grid":
-        refuse_future(ConstantVelocity(stored.protocol), stored, part, name="honest")
+        refuse_future(Forecaster("honest", ConstantVelocity(stored.protocol)), stored, part)
 
 
 def test_the_folder_is_as_it_was_after_a_refusal(folder):
     before = dict(vars(folder))
     with pytest.raises(FutureInputError):
-        refuse_future(HoldsTheTruth(folder), folder, "eval", name="cheat")
+        refuse_future(Forecaster("cheat", HoldsTheTruth(folder)), folder, "eval")
     after = dict(vars(folder))
     assert {name: after[name] is values for name, values in before.items()} == dict.fromkeys(before, True)
 

@@ -20,6 +20,7 @@ from tracklake.training.lane_changes.forest import LaneForest, fit_lane_forest
 from tracklake.training.lane_changes.scores import evaluate_grid, learn_curve
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
+from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.run_folder import StaleRunError
 
 LANES = np.array([[[-3.5, 3.0, 1], [0.5, 4.0, 1], [4.5, 4.0, 1]]], np.float32)
@@ -68,6 +69,9 @@ def constant_forest(*codes, horizons_s=(0.5, 1.0, 2.0), start_s=2.0):
     return LaneForest(classifier, ("speed_mps",), 2, horizons_s, facts)
 
 
+STRAIGHT = Forecaster("straight", ConstantVelocity(SHORT))
+
+
 class Says:
     """A model that says the same of everyone: so far along and across at each of the ticks."""
 
@@ -106,8 +110,8 @@ def test_scores_by_hand(one_change):
     Along the road everybody keeps his speed, so that the true row is the middle one. The leader is at 10, 20 and 40 m,
     in rows of 2 m (20 less 18 m/s); the follower at 9, 18 and 36 m, in rows of 1 m, for it has no follower.
     """
-    predictors = {"straight": ConstantVelocity(SHORT), "short": Says([9.2, 17.2, 27, 36], 0.0)}
-    scores = evaluate_grid(one_change, predictors, constant_forest("r", "k", "r", "r"))
+    models = [STRAIGHT, Forecaster("short", Says([9.2, 17.2, 27, 36], 0.0))]
+    scores = evaluate_grid(one_change, models, constant_forest("r", "k", "r", "r"))
     assert scores.left_out == 2 * 3, "ticks 7, 8 and 9"
     assert scores.left_out_by_reason == dict(zip(LEFT_OUT, (0, 6, 0, 0), strict=True))
     assert len(scores.cells) == 2 * 2 * 3 * 5
@@ -143,7 +147,7 @@ def test_a_true_place_outside_is_never_right(tmp_path):
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2] * 11, x_m=x_m)}, parts={"a": "eval"})
     judged = label_samples(folder, "eval", LaneForestSettings(start_s=2.0))
     assert len(judged.sample) == 5
-    scores = evaluate_grid(folder, {"knows": Says([1, 2, 3, 4], 0.0)}, constant_forest("k", "k", "k", "k"))
+    scores = evaluate_grid(folder, [Forecaster("knows", Says([1, 2, 3, 4], 0.0))], constant_forest("k", "k", "k", "k"))
     for seconds in (0.5, 1.0, 2.0):
         row = by_key(scores, model="knows", column="place", seconds=seconds, stratum="all")
         # Of five samples the first is outside; the later ones have 2 m a tick, or one, and are where they are said.
@@ -172,16 +176,16 @@ class Short:
 )
 def test_places_that_are_none_are_refused_or_their_model_is_skipped(one_change, model, message):
     """A cell of NaN would be the middle one."""
-    forest, straight = constant_forest("k", "k", "k", "k"), {"straight": ConstantVelocity(SHORT)}
+    forest, wrong = constant_forest("k", "k", "k", "k"), Forecaster("wrong", model)
     with pytest.raises(TracklakeError, match=message):
-        evaluate_grid(one_change, {"wrong": model}, forest)
+        evaluate_grid(one_change, [wrong], forest)
     reported = []
     scores = evaluate_grid(
-        one_change, {"wrong": model, **straight}, forest, on_skip=lambda name, why: reported.append((name, why))
+        one_change, [wrong, STRAIGHT], forest, on_skip=lambda name, why: reported.append((name, why))
     )
     [(name, why)] = reported
     assert (name, re.search(message, why) is not None) == ("wrong", True)
-    assert scores == evaluate_grid(one_change, straight, forest)
+    assert scores == evaluate_grid(one_change, [STRAIGHT], forest)
 
 
 def test_who_sees_the_future_is_found_out(one_change):
@@ -190,11 +194,13 @@ def test_who_sees_the_future_is_found_out(one_change):
             return Prediction(np.zeros((len(observed.history), 4, 2), np.float32) + one_change.position_m[-1, 0])
 
     reported = {}
-    scores = evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest(*"kkkk"), on_skip=reported.__setitem__)
+    scores = evaluate_grid(
+        one_change, [Forecaster("peeks", Peeks())], constant_forest(*"kkkk"), on_skip=reported.__setitem__
+    )
     assert (scores.cells, list(reported)) == ([], ["peeks"])
     assert "`peeks` sees the future" in reported["peeks"]
     with pytest.raises(FutureInputError, match="`peeks` sees the future"):
-        evaluate_grid(one_change, {"peeks": Peeks()}, constant_forest("k", "k", "k", "k"))
+        evaluate_grid(one_change, [Forecaster("peeks", Peeks())], constant_forest("k", "k", "k", "k"))
 
 
 def test_a_forest_that_sees_the_future_is_found_out(one_change):
@@ -203,20 +209,20 @@ def test_a_forest_that_sees_the_future_is_found_out(one_change):
             return super().predict_proba(described) + np.float32(one_change.position_m[-1, 0])
 
     with pytest.raises(FutureInputError, match="`lane-forest` sees the future"):
-        evaluate_grid(one_change, {}, Peeks(**vars(constant_forest("k", "k", "k", "k"))))
+        evaluate_grid(one_change, [], Peeks(**vars(constant_forest("k", "k", "k", "k"))))
 
 
 def test_a_forest_for_others_is_refused(one_change):
     with pytest.raises(TracklakeError, match=r"fitted at 2 Hz for horizons of \(0.5, 1.0, 3.0\) s; .* Fit it again"):
-        evaluate_grid(one_change, {}, constant_forest("k", "k", "k", "k", horizons_s=(0.5, 1.0, 3.0)))
+        evaluate_grid(one_change, [], constant_forest("k", "k", "k", "k", horizons_s=(0.5, 1.0, 3.0)))
     knows = constant_forest("k", "k", "k", "k")
     knows.facts["train_subsets"] = ["highd/a"]
     with pytest.raises(StaleRunError, match=r"highd/a\) were in its training part"):
-        evaluate_grid(one_change, {}, knows)
+        evaluate_grid(one_change, [], knows)
 
 
 def test_a_part_without_samples_has_no_scores(one_change):
-    scores = evaluate_grid(one_change, {"straight": ConstantVelocity(SHORT)}, constant_forest(*"kkkk"), part="train")
+    scores = evaluate_grid(one_change, [STRAIGHT], constant_forest(*"kkkk"), part="train")
     assert (scores.cells, scores.left_out) == ([], 0)
     assert scores.maneuvers[0].n == 0
     assert scores.maneuvers[0].accuracy is None
@@ -241,8 +247,8 @@ SMALL = LaneForestSettings(start_s=3.0, trees=6, leaf=3)
 
 def test_a_drawn_part_is_scored_in_part(busy):
     forest = fit_lane_forest(busy, 0, SMALL)
-    everything = evaluate_grid(busy, {}, forest)
-    drawn = [evaluate_grid(busy, {}, forest, most=20, seed=seed).maneuvers[0] for seed in (1, 1, 2)]
+    everything = evaluate_grid(busy, [], forest)
+    drawn = [evaluate_grid(busy, [], forest, most=20, seed=seed).maneuvers[0] for seed in (1, 1, 2)]
     assert everything.maneuvers[0].n > 50
     assert [score.n for score in drawn] == [20] * 3
     assert drawn[0] == drawn[1]

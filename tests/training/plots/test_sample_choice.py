@@ -100,7 +100,7 @@ def test_draws_repeat_by_seed_and_are_of_the_part_and_kind(many):
 
 
 def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.sample_choice.BATCH_SIZE", 7)
+    monkeypatch.setattr("tracklake.training.runs.forecasters.BATCH_SIZE", 7)
     folder, tables = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     places = {(v, t): (x, y) for v, t, x, y in tables[1][1].select("vehicle_id", "tick", "x_m", "y_m").rows()}

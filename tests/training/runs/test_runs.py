@@ -144,11 +144,11 @@ def test_a_run_says_what_trained_it_and_is_not_judged_by_it(finished, trained):
     file = finished / "config.json"
     config = json.loads(file.read_text())
     assert config["versions"] == {"tracklake": version("tracklake"), "torch": version("torch")}
-    wanted = evaluate("run", trained / "tensors", finished.parent)
+    wanted = evaluate("run", trained / "tensors", finished.parent).to_dict()
     for versions in ({"versions": {"tracklake": "0.0.1", "torch": None}}, {}):
         rest = {name: value for name, value in config.items() if name != "versions"}
         file.write_text(json.dumps(rest | versions | {"tensors": "0123456789ab"}))
-        assert evaluate("run", trained / "tensors", finished.parent) == wanted
+        assert evaluate("run", trained / "tensors", finished.parent).to_dict() == wanted
 
 
 def test_versions_of_what_is_not_installed_are_none(monkeypatch):
