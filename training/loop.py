@@ -17,7 +17,7 @@ from tracklake.training.data.augmentation import augment
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Reads
-from tracklake.training.models.inputs import read_on_device, read_samples
+from tracklake.training.models.inputs import read_samples
 from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, restore, save_checkpoint
 from tracklake.training.runs.config import Plan
 from tracklake.training.runs.forecasters import Forecaster
@@ -167,7 +167,7 @@ def make_reader(folder: TensorFolder, reads: Reads, device: "torch.device") -> R
 
     if device.type != "cpu":
         copied = DeviceFolder(folder, device)
-        return lambda samples: read_on_device(copied, torch.from_numpy(samples).to(device), reads)
+        return lambda samples: read_samples(copied, torch.from_numpy(samples).to(device), reads)
 
     def read(samples: Integers) -> tuple[Any, Any]:
         observed, truth = read_samples(folder, samples, reads)

@@ -1,18 +1,28 @@
 """Batches of samples and of whole scenes: names, shapes, units and order of their arrays."""
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields
+from typing import Any, ClassVar, Self
 
 Array = Any
 """A NumPy array or a torch tensor; those of one batch or call are all of the same kind."""
 
 
 class Arrays:
-    """Arrays that are found by their names, too: `batch["history"]`, `dict(batch)`."""
+    """Arrays of one kind that are found by their names, too: `batch["history"]`, `dict(batch)`.
+
+    Every subclass is a dataclass.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def keys(self) -> list[str]:
         """Return the names of the arrays; not `absolute`, which is none."""
-        return [own.name for own in fields(self) if own.name != "absolute"]  # type: ignore[arg-type]  # a dataclass
+        return [own.name for own in fields(self) if own.name != "absolute"]
+
+    def each(self, change: Callable[[Any], Any]) -> Self:
+        """Return a copy with every array changed, for instance to a tensor on a device."""
+        return type(self)(**{name: change(self[name]) for name in self.keys()})
 
     def __getitem__(self, name: str) -> Array:
         """Return an array by its name."""

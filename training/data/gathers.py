@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Bytes, Integers, expand_ranges
+from tracklake.schemas.arrays import Bytes, expand_ranges
 from tracklake.training.data.batches import Array, Batch, SceneBatch
 from tracklake.training.data.observed import ObservedScene, Truth
 
@@ -59,11 +59,16 @@ def expand_groups(offset: Array, groups: Array) -> tuple[Array, Array]:
     return count_from(0, len(owner), owner) + (first - before)[owner], owner
 
 
-def check_numbers(numbers: npt.ArrayLike, count: int, what: str) -> Integers:
-    """Return numbers (B,) of samples or scenes as int64; IndexError where one is not 0 to count - 1."""
+def check_numbers(numbers: npt.ArrayLike, of: Array, what: str) -> Array:
+    """Return the numbers (B,) of rows of an array as int64; IndexError where NumPy has no such row.
+
+    Those of rows on a device are tensors there already, and taken as they are.
+    """
+    if not isinstance(of, np.ndarray):
+        return numbers
     checked = np.asarray(numbers, dtype=np.int64)
-    if len(checked) and (checked.min() < 0 or checked.max() >= count):
-        raise IndexError(f"{what}s are numbered 0 to {count - 1}, got {checked.min()} to {checked.max()}")
+    if len(checked) and (checked.min() < 0 or checked.max() >= len(of)):
+        raise IndexError(f"{what}s are numbered 0 to {len(of) - 1}, got {checked.min()} to {checked.max()}")
     return checked
 
 
@@ -119,8 +124,9 @@ def locate_rows(folder: Folder, row: Array) -> Array:
     return to_absolute(folder, folder.position_m[row][:, None], row)[:, 0]
 
 
-def gather_samples(folder: Folder, sample: Array, *, absolute: bool = False) -> Batch:
-    """Read samples by their numbers (B,) int64, in any order; the arrays are of the folder's kind and device."""
+def gather_samples(folder: Folder, samples: npt.ArrayLike, *, absolute: bool = False) -> Batch:
+    """Read samples by their numbers (B,), in any order; the arrays are of the folder's kind and device."""
+    sample = check_numbers(samples, folder.sample_row, "sample")
     row = cast(folder.sample_row[sample], "int64")
     pair, owner = expand_groups(folder.neighbor_offset, sample)
     neighbor_row = cast(folder.neighbor_row[pair], "int64")
@@ -151,8 +157,9 @@ def gather_samples(folder: Folder, sample: Array, *, absolute: bool = False) -> 
     )
 
 
-def gather_scenes(folder: Folder, scene: Integers, *, absolute: bool = False) -> SceneBatch:
-    """Read scenes by their numbers (B,), in any order."""
+def gather_scenes(folder: Folder, scenes: npt.ArrayLike, *, absolute: bool = False) -> SceneBatch:
+    """Read scenes by their numbers (B,), in any order, as NumPy arrays."""
+    scene = check_numbers(scenes, folder.scene_part, "scene")
     member, vehicle_scene = expand_groups(folder.scene_offset, scene)
     row, sample = folder.scene_row[member].astype(np.int64), folder.scene_sample[member]
     run = find_runs(folder, row)
@@ -164,8 +171,8 @@ def gather_scenes(folder: Folder, scene: Integers, *, absolute: bool = False) ->
         stored = folder.position_m[row]
         history, future = to_relative(folder, history, stored), to_relative(folder, future, stored)
     origin, subset = locate_rows(folder, row), folder.run_subset[run]
-    lane, lanes = folder.lane[row], folder.lanes
-    known_lane = np.clip(lane, 0, lanes.centre_m.shape[1] - 1)
+    lane, marked = folder.lane[row], folder.marked_lanes
+    centre_m, width_m = marked[subset, np.clip(lane, 0, marked.shape[1] - 1)].T
     return SceneBatch(
         scene=scene,
         vehicle_scene=vehicle_scene,
@@ -180,10 +187,10 @@ def gather_scenes(folder: Folder, scene: Integers, *, absolute: bool = False) ->
         origin=origin,
         speed_mps=folder.speed_mps[row],
         lane=lane,
-        lane_offset_m=(origin[:, 1] - lanes.centre_m[subset, known_lane]).astype(np.float32),
-        lane_width_m=lanes.lane_width_m[subset, known_lane].astype(np.float32),
+        lane_offset_m=(origin[:, 1] - centre_m).astype(np.float32),
+        lane_width_m=width_m.astype(np.float32),
         has_left=lane > 1,
-        has_right=(lane > 0) & (lane < lanes.last[subset]),
+        has_right=(lane > 0) & (lane < folder.last_lane[subset]),
         absolute=absolute,
     )
 
@@ -204,22 +211,17 @@ class NearestVehicles:
 
 
 def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> tuple[ObservedScene[Any], Truth[Any]]:
-    """Read samples (egos, by their numbers (B,)) with the `nearest` vehicles around them, as NumPy arrays.
+    """Read samples (egos, by their numbers (B,)) with the `nearest` vehicles around them, in any order.
 
     Every vehicle of the scene counts, sample or not: whether it is one depends on its future. The nearest are those
     with the smallest distance between front centres; of two equally far the smaller id comes first.
 
     In the truth, `future` (B, V, F, 2) is relative to the EGO's last position; where masked, the vehicle's last known
-    position again, and zeros where there is no vehicle. IndexError for a number below 0 or not below S, ValueError for
-    a negative `nearest`.
+    position again, and zeros where there is no vehicle. ValueError for a negative `nearest`.
     """
     if nearest < 0:
         raise ValueError(f"cannot gather the {nearest} nearest vehicles: expected 0 or more")
-    return gather_vehicles(folder, check_numbers(samples, len(folder.sample_row), "sample"), nearest)
-
-
-def gather_vehicles(folder: Folder, sample: Array, nearest: int) -> tuple[ObservedScene[Any], Truth[Any]]:
-    """Read samples with the vehicles nearest to them: `gather_nearest` without its checks, on any device."""
+    sample = check_numbers(samples, folder.sample_row, "sample")
     xp = find_namespace(sample)
     vehicles = find_nearest(folder, sample, nearest)
     row, present = vehicles.row, vehicles.present

@@ -1,11 +1,10 @@
 """Samples as a model may see them, and the truth that it predicts, in separate types."""
 
-from collections.abc import Callable
-from dataclasses import Field, dataclass, fields
-from typing import Any, ClassVar, Generic, NoReturn, Self, TypeVar
+from dataclasses import dataclass, fields
+from typing import Any, Generic, NoReturn, TypeVar
 
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.batches import Batch
+from tracklake.training.data.batches import Arrays, Batch
 
 ROWS, COLUMNS, ROW_M = 13, 3, 4.572
 """Rows of the grid along the road, 0 hindmost; its columns: left, own and right lane; and the length of a row, in m."""
@@ -17,24 +16,14 @@ class FutureInputError(TracklakeError, AttributeError):
     """A model reads what is known only after the tick at which it predicts."""
 
 
-class _Arrays:
-    """Arrays of one kind by name; every subclass is a dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    def each(self, change: Callable[[Any], Any]) -> Self:
-        """Return a copy with every array changed, for instance to a tensor on a device."""
-        return type(self)(**{own.name: change(getattr(self, own.name)) for own in fields(self)})
-
-
-class _Blind(_Arrays):
+class _Blind(Arrays):
     """Arrays known at the tick of prediction; reading any other is refused."""
 
     def __getattr__(self, name: str) -> NoReturn:
         """Refuse a name that is no array here, except for Python's own names."""
         if name.startswith("__"):
             raise AttributeError(name)
-        known = ", ".join(own.name for own in fields(self))
+        known = ", ".join(self.keys())
         raise FutureInputError(
             f"`{name}` is not known when a model predicts: it sees {known}. Futures and maneuvers are for `loss` alone"
         )
@@ -77,7 +66,7 @@ class ObservedScene(_Blind, Generic[Array]):
 
 
 @dataclass(frozen=True)
-class Truth(_Arrays, Generic[Array]):
+class Truth(Arrays, Generic[Array]):
     """The true futures and maneuvers: for `loss` and for scores, never for a prediction."""
 
     future: Array  # (B, F, 2) in m, axes and origin as the history's; of scenes (B, V, F, 2)
@@ -91,6 +80,6 @@ def part_batch(batch: Batch) -> tuple[Observed[Any], Truth[Any]]:
     if batch.absolute:
         raise ValueError("models see positions relative to the sample's last one: gather without `absolute`")
     return (
-        Observed(**{own.name: getattr(batch, own.name) for own in fields(Observed)}),
-        Truth(**{own.name: getattr(batch, own.name) for own in fields(Truth)}),
+        Observed(**{own.name: batch[own.name] for own in fields(Observed)}),
+        Truth(**{own.name: batch[own.name] for own in fields(Truth)}),
     )

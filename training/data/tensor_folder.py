@@ -29,15 +29,6 @@ _NO_PART = 255
 
 
 @dataclass(frozen=True)
-class Lanes:
-    """Where the lanes of each subset lie; L is one more than the highest lane of all subsets."""
-
-    last: npt.NDArray[np.int16]  # (subsets,) the rightmost lane
-    centre_m: Floats  # (subsets, L + 1) y of the lanes' centres; NaN where unknown, at lane 0 and at L
-    lane_width_m: Floats  # (subsets, L + 1) widths of the lanes; NaN where the centre is
-
-
-@dataclass(frozen=True)
 class TensorFolder:
     """The arrays of one split, mapped into memory and not read until indexed.
 
@@ -112,18 +103,21 @@ class TensorFolder:
         return size_m
 
     @cached_property
-    def lanes(self) -> Lanes:
-        """Where the lanes of each subset lie."""
-        subsets = self.index["subsets"]
-        most = max((len(subset["lane_markings_m"] or [0]) for subset in subsets), default=1)
-        centre = np.full((len(subsets), most + 1), np.nan)
-        width = centre.copy()
-        for number, subset in enumerate(subsets):
-            if subset["lane_markings_m"]:
-                markings = np.array(subset["lane_markings_m"])
-                centre[number, 1 : len(markings)] = (markings[1:] + markings[:-1]) / 2
-                width[number, 1 : len(markings)] = np.diff(markings)
-        return Lanes(np.array([subset["last_lane"] for subset in subsets], dtype=np.int16), centre, width)
+    def last_lane(self) -> npt.NDArray[np.int16]:
+        """(subsets,) the rightmost lane."""
+        return np.array([subset["last_lane"] for subset in self.index["subsets"]], dtype=np.int16)
+
+    @cached_property
+    def marked_lanes(self) -> Floats:
+        """(subsets, L + 1, 2) y of the centre, and width, of lanes 0 to L; NaN where unknown, at lane 0 and at L.
+
+        L is one more than the highest marked lane of all subsets.
+        """
+        markings = [np.array(subset["lane_markings_m"] or [0.0]) for subset in self.index["subsets"]]
+        lanes = np.full((len(markings), 1 + max(map(len, markings), default=1), 2), np.nan)
+        for number, own in enumerate(markings):
+            lanes[number, 1 : len(own)] = np.stack([(own[1:] + own[:-1]) / 2, np.diff(own)], axis=-1)
+        return lanes
 
     @cached_property
     def all_lanes(self) -> Floats:
@@ -131,15 +125,11 @@ class TensorFolder:
 
         Where a subset has no markings, lanes are NOMINAL_LANE_M wide, from the left edge on.
         """
-        lanes = self.lanes
-        lane = np.arange(1, int(lanes.last.max(initial=0)) + 1)
-        exists = lane <= lanes.last[:, None]
-        known = np.minimum(lane, lanes.centre_m.shape[1] - 1)
-        centre, width = lanes.centre_m[:, known], lanes.lane_width_m[:, known]
-        unmarked = np.isnan(centre)
-        centre = np.where(unmarked, (lane - 0.5) * NOMINAL_LANE_M, centre)
-        width = np.where(unmarked, NOMINAL_LANE_M, width)
-        return np.stack([centre, width, exists], axis=-1) * exists[..., None]
+        lane = np.arange(1, int(self.last_lane.max(initial=0)) + 1)
+        exists = (lane <= self.last_lane[:, None])[..., None]
+        marked = self.marked_lanes[:, np.minimum(lane, self.marked_lanes.shape[1] - 1)]
+        nominal = np.stack([(lane - 0.5) * NOMINAL_LANE_M, np.full(len(lane), NOMINAL_LANE_M)], axis=-1)
+        return np.concatenate([np.where(np.isnan(marked), nominal, marked), exists], axis=-1) * exists
 
     @cached_property
     def adjacent_lanes(self) -> Floats:
@@ -235,7 +225,7 @@ class TensorFolder:
         """
         if severity not in SEVERITIES:
             raise ValueError(f"unknown severity `{severity}`: expected one of {', '.join(SEVERITIES)}")
-        sample = check_numbers(samples, len(self.sample_row), "sample")
+        sample = check_numbers(samples, self.sample_row, "sample")
         row = self.sample_row[sample].astype(np.intp)
         marked = (self.finding > 0) & (self.finding <= 1 + SEVERITIES.index(severity))
         before = np.cumsum(np.concatenate([[False], marked]), dtype=np.int32)
@@ -258,11 +248,11 @@ class TensorFolder:
 
     def gather(self, samples: npt.ArrayLike, *, absolute: bool = False) -> Batch:
         """Read samples by their numbers (B,), in any order; IndexError for one below 0 or not below S."""
-        return gather_samples(self, check_numbers(samples, len(self.sample_row), "sample"), absolute=absolute)
+        return gather_samples(self, samples, absolute=absolute)
 
     def gather_scenes(self, scenes: npt.ArrayLike, *, absolute: bool = False) -> SceneBatch:
         """Read scenes by their numbers (B,), in any order; IndexError for one below 0 or not below C."""
-        return gather_scenes(self, check_numbers(scenes, len(self.scene_part), "scene"), absolute=absolute)
+        return gather_scenes(self, scenes, absolute=absolute)
 
 
 class DeviceFolder:

@@ -91,7 +91,7 @@ def refuse_future(model: Forecaster, folder: TensorFolder, part: str, *, nearest
 
         def predict(samples: Integers = samples) -> tuple[Arrays, Arrays]:
             observed, _ = read_samples(folder, samples, model.reads, nearest=nearest)
-            given = {own.name: np.array(getattr(observed, own.name)) for own in fields(observed)}  # before it is used
+            given = {name: np.array(own) for name, own in dict(observed).items()}  # before it is used
             # A copy each time: nothing that a model remembers of one prediction goes into the next one.
             return given, _list_arrays(copy.deepcopy(model.predictor, {id(folder): folder}).predict(observed))
 

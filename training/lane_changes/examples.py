@@ -281,8 +281,8 @@ def find_labelled(folder: TensorFolder, row: npt.NDArray[np.integer], *, start_s
 
 def _find_offsets(folder: TensorFolder, row: Integers) -> Floats:
     """Measure how far each row's vehicle is right of its lane's centre: (B,), m."""
-    subset, lane, lanes = folder.run_subset[folder.runs_of(row)], folder.lane[row].astype(np.intp), folder.lanes
-    centre = lanes.centre_m[subset, np.minimum(lane, lanes.centre_m.shape[1] - 1)]
+    subset, lane, marked = folder.run_subset[folder.runs_of(row)], folder.lane[row].astype(np.intp), folder.marked_lanes
+    centre = marked[subset, np.minimum(lane, marked.shape[1] - 1), 0]
     centre = np.where(np.isnan(centre), (lane - 0.5) * NOMINAL_LANE_M, centre)
     offset: Floats = locate_rows(folder, row)[:, 1].astype(np.float64) - centre
     return offset

@@ -4,10 +4,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tracklake.training.data.batches import Array
-from tracklake.training.data.gathers import gather_nearest, gather_samples, gather_vehicles
+from tracklake.training.data.gathers import Folder, gather_nearest, gather_samples
 from tracklake.training.data.observed import Observed, ObservedScene, Truth, part_batch
-from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.models import Reads
 
 NEAREST = 10
@@ -15,17 +13,15 @@ NEAREST = 10
 Inputs = tuple[Observed[Any] | ObservedScene[Any], Truth[Any]]
 
 
-def read_samples(folder: TensorFolder, samples: npt.ArrayLike, reads: Reads, *, nearest: int = NEAREST) -> Inputs:
-    """Read samples by their numbers (B,) in any order, 0 <= number < S (else IndexError), as NumPy arrays.
+def read_samples(folder: Folder, samples: npt.ArrayLike, reads: Reads, *, nearest: int = NEAREST) -> Inputs:
+    """Read samples by their numbers (B,) in any order, as arrays of the folder's kind and device.
 
-    A scene has V = 1 + nearest vehicles.
+    Of a mapped folder they are 0 <= number < S (else IndexError), of a device's copy int64 tensors there. A scene has
+    V = 1 + nearest vehicles.
     """
-    return part_batch(folder.gather(samples)) if reads == "grid" else gather_nearest(folder, samples, nearest=nearest)
-
-
-def read_on_device(folder: DeviceFolder, samples: Array, reads: Reads) -> Inputs:
-    """Read samples by their numbers (B,) int64 on a device, as tensors there; otherwise as `read_samples`."""
-    return part_batch(gather_samples(folder, samples)) if reads == "grid" else gather_vehicles(folder, samples, NEAREST)
+    if reads == "grid":
+        return part_batch(gather_samples(folder, samples))
+    return gather_nearest(folder, samples, nearest=nearest)
 
 
 def truth_of_ego(truth: Truth[Any]) -> Truth[Any]:

@@ -174,8 +174,7 @@ def take_picture(folder: TensorFolder, sample: int, forecasts: Mapping[int, Sequ
     Raises:
         IndexError: no sample has the number.
     """
-    if not 0 <= sample < len(folder.sample_row):
-        raise IndexError(f"samples are numbered 0 to {len(folder.sample_row) - 1:,}, got {sample}")
+    check_numbers([sample], folder.sample_row, "sample")
     batch = folder.gather_scenes([int(folder.scene_of_sample[sample])], absolute=True)
     members, _ = expand_groups(folder.scene_offset, batch.scene)
     pairs, _ = expand_groups(folder.neighbor_offset, np.asarray([sample]))
@@ -244,7 +243,7 @@ def forecast_scene(folder: TensorFolder, sample: int, models: Sequence[Forecaste
         IndexError: no sample has the number.
         NotFiniteError: a predicted position is not a finite number.
     """
-    scene = int(folder.scene_of_sample[check_numbers([sample], len(folder.sample_row), "sample")[0]])
+    scene = int(folder.scene_of_sample[check_numbers([sample], folder.sample_row, "sample")[0]])
     members = slice(int(folder.scene_offset[scene]), int(folder.scene_offset[scene + 1]))
     samples = folder.scene_sample[members]
     ids = folder.run_vehicle_id[folder.runs_of(folder.scene_row[members])].tolist()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, random_tables
 from tensor_tables import write
 
-from tracklake.training.data.gathers import gather_nearest, gather_samples, gather_vehicles
+from tracklake.training.data.gathers import gather_nearest, gather_samples
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 
 CPU = torch.device("cpu")
@@ -66,7 +66,7 @@ def test_vehicles_on_a_device_equal_the_mapped_ones(tmp_path_factory, seed, spli
     written = write(tmp_path_factory.mktemp("tensors"), random_tables(seed), kept, markings=markings, storage=storage)
     folder = TensorFolder.open(written)
     numbers = draw_numbers(order, folder)
-    got = gather_vehicles(DeviceFolder(folder, CPU), torch.from_numpy(numbers), nearest)
+    got = gather_nearest(DeviceFolder(folder, CPU), torch.from_numpy(numbers), nearest=nearest)
     for ours, theirs in zip(got, gather_nearest(folder, numbers, nearest=nearest), strict=True):
         assert_equals(ours, theirs)
 
@@ -74,10 +74,12 @@ def test_vehicles_on_a_device_equal_the_mapped_ones(tmp_path_factory, seed, spli
 def test_changing_a_batch_does_not_change_the_next_one(tmp_path):
     folder = TensorFolder.open(write(tmp_path, random_tables(3), UNDIVIDED))
     device, numbers = DeviceFolder(folder, CPU), np.array([1, 0])
-    for part in gather_vehicles(device, torch.from_numpy(numbers), 2):
+    for part in gather_nearest(device, torch.from_numpy(numbers), nearest=2):
         part.each(lambda tensor: tensor.zero_())
     for ours, theirs in zip(
-        gather_vehicles(device, torch.from_numpy(numbers), 2), gather_nearest(folder, numbers, nearest=2), strict=True
+        gather_nearest(device, torch.from_numpy(numbers), nearest=2),
+        gather_nearest(folder, numbers, nearest=2),
+        strict=True,
     ):
         assert_equals(ours, theirs)
 

@@ -11,7 +11,7 @@ from tiny_network import read_log, register, write_tiny
 import tracklake.training.loop
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
-from tracklake.training.models.inputs import read_on_device
+from tracklake.training.models.inputs import read_samples
 from tracklake.training.train import TrainConfig, train
 
 
@@ -78,7 +78,7 @@ def test_an_epoch_with_two_losses_is_told_by_its_last(tensors, tmp_path, monkeyp
 def test_a_device_reader_reads_the_same(tensors):
     folder = TensorFolder.open(tensors)
     samples = folder.samples_of("train")[[5, 0, 7]]
-    observed, truth = read_on_device(DeviceFolder(folder, torch.device("cpu")), torch.from_numpy(samples), "grid")
+    observed, truth = read_samples(DeviceFolder(folder, torch.device("cpu")), torch.from_numpy(samples), "grid")
     batch = folder.gather(samples)
     for got in (observed, truth):
         for own in fields(got):
@@ -88,7 +88,7 @@ def test_a_device_reader_reads_the_same(tensors):
 def test_a_device_reader_of_scenes_reads_the_same(tensors):
     folder = TensorFolder.open(tensors)
     samples = folder.samples_of("train")[[5, 0, 7]]
-    observed, truth = read_on_device(DeviceFolder(folder, torch.device("cpu")), torch.from_numpy(samples), "scene")
+    observed, truth = read_samples(DeviceFolder(folder, torch.device("cpu")), torch.from_numpy(samples), "scene")
     wanted, came = gather_nearest(folder, samples, nearest=10)
     for got, want in ((observed, wanted), (truth, came)):
         for own in fields(got):
