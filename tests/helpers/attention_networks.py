@@ -1,5 +1,7 @@
 """Attention networks of drawn weights, and comparisons with what they predict."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 
@@ -16,6 +18,17 @@ def build(heads=4, protocol=CSP, *, seed=0, wild=True, **parameters):
             torch.nn.init.normal_(network.out[-1].weight, std=0.1)
             torch.nn.init.normal_(network.out[-1].bias, std=0.3)
     return network
+
+
+def forecast(network, observed):
+    """Means and covariances of all vehicles (B, V) of scenes, and which are there."""
+    mean, sigma, rho = (part.numpy() for part in network.infer(observed, network))
+    covariance = sigma[..., :, None] * sigma[..., None, :]
+    covariance[..., 0, 1] *= rho
+    covariance[..., 1, 0] *= rho
+    present = network.limit(observed).vehicle_mask
+    assert np.array_equal(network.predict_vehicles(observed).position_m, mean[present])
+    return SimpleNamespace(mean_m=mean, covariance_m2=covariance, vehicle_mask=present)
 
 
 def to_tensors(arrays):

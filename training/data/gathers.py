@@ -1,6 +1,5 @@
 """Samples, whole scenes and the vehicles nearest to samples, gathered by indexing NumPy arrays or torch tensors."""
 
-from dataclasses import dataclass
 from math import inf
 from typing import Any, Protocol
 
@@ -202,14 +201,6 @@ def _read_maneuvers(values: Bytes, sample: npt.NDArray[np.int32]) -> npt.NDArray
     return found
 
 
-@dataclass(frozen=True)
-class NearestVehicles:
-    """The vehicles nearest to B samples."""
-
-    row: Array  # (B, V) rows of the folder: the ego, the others by distance and, where there are fewer, the ego again
-    present: Array  # (B, V) True where there is a vehicle
-
-
 def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> tuple[ObservedScene[Any], Truth[Any]]:
     """Read samples (egos, by their numbers (B,)) with the `nearest` vehicles around them, in any order.
 
@@ -223,8 +214,7 @@ def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> t
         raise ValueError(f"cannot gather the {nearest} nearest vehicles: expected 0 or more")
     sample = check_numbers(samples, folder.sample_row, "sample")
     xp = find_namespace(sample)
-    vehicles = find_nearest(folder, sample, nearest)
-    row, present = vehicles.row, vehicles.present
+    row, present = find_nearest(folder, sample, nearest)
     run = find_runs(folder, row)
     history, history_mask = read_history(folder, row, folder.run_first_row[run])
     future, future_mask = read_future(folder, row, folder.run_first_row[run + 1] - 1)
@@ -248,8 +238,13 @@ def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> t
     return observed, truth
 
 
-def find_nearest(folder: Folder, sample: Array, nearest: int) -> NearestVehicles:
-    """Find the egos of samples (B,) int64 and the vehicles nearest to them; equal distances are ordered by id."""
+def find_nearest(folder: Folder, sample: Array, nearest: int) -> tuple[Array, Array]:
+    """Find the egos of samples (B,) int64 and the vehicles nearest to them; equal distances are ordered by id.
+
+    Returns:
+        (B, V) rows of the folder: the ego, the others by distance and, where there are fewer, the ego again; and (B, V)
+        whether there is a vehicle.
+    """
     xp = find_namespace(sample)
     scene = cast(folder.scene_of_sample[sample], "int64")
     begin = folder.scene_offset[scene]
@@ -266,7 +261,7 @@ def find_nearest(folder: Folder, sample: Array, nearest: int) -> NearestVehicles
     squared = xp.where(row == ego, -1.0, apart[..., 0] + apart[..., 1])  # m2; the ego first
     order = xp.argsort(xp.where(absent, inf, squared), axis=1, stable=True)[:, : 1 + nearest]
     present = ~take_columns(absent, order)
-    return NearestVehicles(xp.where(present, take_columns(row, order), ego), present)
+    return xp.where(present, take_columns(row, order), ego), present
 
 
 def _describe_lanes(folder: Folder, row: Array) -> tuple[Array, Array]:

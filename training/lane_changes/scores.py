@@ -200,25 +200,22 @@ def score_cells(
 ) -> Iterator[CellScore]:
     """Score predicted columns and rows (S, T, 2): one score for each horizon and stratum."""
     true_cell, own_cell = (number_cells(codes[..., 0], codes[..., 1]) for codes in (true, own))
-    against_rest = compare_with_rest(own_cell, true_cell)
     right = (own == true) & (np.abs(true) < OUTSIDE)
-    clipped = (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1)
+    figures = {
+        "cell": right.all(axis=-1),
+        "row": right[..., 1],
+        "lane": right[..., 0],
+        "cell_clipped": (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1),
+        "one_against_rest": compare_with_rest(own_cell, true_cell),
+        "own_lane": true[..., 0] == 0,
+        "outside": true_cell < 0,
+    }
     for horizon, seconds in enumerate(horizons_s):
         for stratum, of in strata.items():
             cells = true_cell[of, horizon]
-            inside = np.bincount(cells[cells >= 0], minlength=9)
-            key = (model, source, seconds, stratum, len(cells))
-            yield CellScore(
-                *key,
-                cell=_mean(right[of, horizon].all(axis=-1)),
-                row=_mean(right[of, horizon, 1]),
-                lane=_mean(right[of, horizon, 0]),
-                cell_clipped=_mean(clipped[of, horizon]),
-                one_against_rest=float(against_rest[of, horizon].mean()) if len(cells) else None,
-                majority=int(inside.max()) / len(cells) if len(cells) else None,
-                own_lane=_mean(true[of, horizon, 0] == 0),
-                outside=_mean(cells < 0),
-            )
+            majority = int(np.bincount(cells[cells >= 0], minlength=9).max()) / len(cells) if len(cells) else None
+            shares = {name: _mean(values[of, horizon]) for name, values in figures.items()}
+            yield CellScore(model, source, seconds, stratum, len(cells), majority=majority, **shares)
 
 
 def compare_with_rest(own: Codes, true: Codes) -> Floats:
@@ -227,9 +224,9 @@ def compare_with_rest(own: Codes, true: Codes) -> Floats:
     return 1 - wrong / 9
 
 
-def _mean(flags: Flags) -> float | None:
-    """Compute the share of flags that are set; None where there are none."""
-    return float(flags.mean()) if len(flags) else None
+def _mean(values: Flags | Floats) -> float | None:
+    """Compute the mean of values, of flags the share that is set; None where there are none."""
+    return float(values.mean()) if len(values) else None
 
 
 def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:

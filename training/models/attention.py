@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tracklake.schemas.arrays import Flags, Singles
+from tracklake.schemas.arrays import Singles
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene, Truth
@@ -46,21 +46,6 @@ class Attention:
     vehicles: Singles
     lanes: Singles
     decoder: Singles
-
-
-@dataclass(frozen=True)
-class SceneForecast:
-    """Densities of the position of every vehicle of B scenes at F ticks, relative to the ego's last position.
-
-    Args:
-        mean_m: (B, V, F, 2) 0 where there is no vehicle.
-        covariance_m2: (B, V, F, 2, 2) the unit matrix where there is no vehicle.
-        vehicle_mask: (B, V) True where there is a vehicle.
-    """
-
-    mean_m: Singles
-    covariance_m2: Singles
-    vehicle_mask: Flags
 
 
 class Vehicles(NamedTuple):
@@ -224,13 +209,11 @@ class SceneAttention(Network):
         mean, sigma, rho = (part[:, 0] for part in self(observed))
         return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
 
-    def predict_scene(self, observed: ObservedScene[Any]) -> SceneForecast:
-        """Return means and covariances of all vehicles of scenes of NumPy arrays."""
-        mean, sigma, rho = self.infer(observed, self)
-        covariance = sigma[..., :, None] * sigma[..., None, :]  # (B, V, F, 2, 2)
-        covariance[..., 0, 1] *= rho
-        covariance[..., 1, 0] *= rho
-        return SceneForecast(to_numpy(mean), to_numpy(covariance), np.asarray(self.limit(observed).vehicle_mask))
+    def predict_vehicles(self, observed: ObservedScene[Any]) -> Prediction:
+        """Predict all vehicles that `limit` leaves of scenes of NumPy arrays, scene by scene."""
+        present = torch.from_numpy(self.limit(observed).vehicle_mask)
+        mean, sigma, rho = (part.cpu()[present] for part in self.infer(observed, self))
+        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
 
     def read_attention(self, observed: ObservedScene[Any]) -> Attention:
         """Return the attention weights for scenes of NumPy arrays."""

@@ -132,7 +132,7 @@ def map_attention(
     observed, _ = gather_nearest(folder, numbers, nearest=nearest)
     weights, lanes = network.read_attention(observed), network.choose_lanes(observed)
     names = tuple(map(str, range(1, lanes.shape[1] + 1))) if network.lanes == "all" else LANES
-    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, numbers, nearest).row)]
+    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, numbers, nearest)[0])]
     maps = []
     for row, (sample, present) in enumerate(zip(numbers.tolist(), observed.vehicle_mask.sum(axis=1), strict=True)):
         there = slice(int(present))  # padding comes last

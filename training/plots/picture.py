@@ -264,16 +264,10 @@ def _forecast_together(folder: TensorFolder, sample: int, model: Forecaster, oth
     number = np.asarray([sample], dtype=np.int64)
     observed, _ = gather_nearest(folder, number, nearest=others)
     network: Any = model.predictor  # a network with attention
-    scene = network.predict_scene(observed)
-    ids = folder.run_vehicle_id[folder.runs_of(find_nearest(folder, number, others).row[0])].tolist()
-    origin = _find_origins(folder, number)[0]
-    sigma = np.sqrt(np.diagonal(scene.covariance_m2[0], axis1=-2, axis2=-1))  # (V, F, 2)
-    correlation = scene.covariance_m2[0, ..., 0, 1] / sigma.prod(axis=-1)
-    weight = np.ones((len(ids), 1), dtype=sigma.dtype)
-    density = Density(weight, scene.mean_m[0, :, None], sigma[:, None], correlation[:, None])
-    prediction = Prediction(scene.mean_m[0], density)
-    present = np.flatnonzero(scene.vehicle_mask[0]).tolist()
-    return {ids[row]: _place_forecast(model.name, prediction, row, origin) for row in present}
+    prediction, origin = network.predict_vehicles(observed), _find_origins(folder, number)[0]
+    rows = find_nearest(folder, number, others)[0][network.limit(observed).vehicle_mask]
+    ids = folder.run_vehicle_id[folder.runs_of(rows)].tolist()
+    return {vehicle: _place_forecast(model.name, prediction, row, origin) for row, vehicle in enumerate(ids)}
 
 
 def _find_origins(folder: TensorFolder, samples: Integers) -> Floats:

@@ -11,34 +11,17 @@ from typing import Any
 Row = dict[str, float | int | str | None]
 
 COLUMNS = {
-    "course.csv": {
-        "step": "optimiser steps done",
-        "epoch": "epoch of the last of them, from 0",
-        "phase": "the recipe's loss",
-        "seconds": "time since the training began, without interruptions",
-        "loss": "mean over the steps since the row before",
-        "learning_rate": "learning rate of the last step",
-        "samples_per_s": "samples a second over the steps since the row before",
-        "data_share": "share of the time of those steps that reading batches took",
-    },
-    "epochs.csv": {
-        "epoch": "from 0; the last one may be shorter than the others",
-        "step": "optimiser steps done by its end",
-        "phase": "the recipe's loss in its last step",
-        "seconds": "as in course.csv, before validating",
-        "loss": "mean over its steps of that phase",
-        "validation_loss": "the same loss over the part `val`; empty where it is not measured",
-        "best": "1 where that is the smallest of its phase so far, else 0; empty where it is not measured",
-    },
+    "course.csv": ("step", "epoch", "phase", "seconds", "loss", "learning_rate", "samples_per_s", "data_share"),
+    "epochs.csv": ("epoch", "step", "phase", "seconds", "loss", "validation_loss", "best"),
 }
-"""Columns of each log and their meanings."""
+"""Columns of each log; docs/training.md has their meanings."""
 
 
 @contextmanager
 def open_log(path: Path, rows: list[Row]) -> Iterator[Callable[[Row], None]]:
     """Write known rows to a log and yield a function that adds one to the file, at once, and to `rows`."""
     with path.open("w", encoding="utf-8", newline="", buffering=1) as stream:
-        writer = csv.DictWriter(stream, list(COLUMNS[path.name]), lineterminator="\n")
+        writer = csv.DictWriter(stream, COLUMNS[path.name], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from attention_networks import build, close, to_tensors
+from attention_networks import build, close, forecast, to_tensors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
@@ -74,7 +74,7 @@ def test_equals_a_slow_restatement(heads, hidden, residual, protocol):
         residual=residual,
     )
     said, looks, predicted = (
-        network.predict_scene(observed),
+        forecast(network, observed),
         network.read_attention(observed),
         network.predict(observed),
     )
@@ -92,7 +92,7 @@ def test_equals_a_slow_restatement(heads, hidden, residual, protocol):
 def test_anchoring_adds_constant_velocity_on_its_axes_to_every_vehicle():
     observed, _ = wander(3, 3, 5)
     free, both, *one = (
-        build(2, anchoring=anchoring).predict_scene(observed).mean_m
+        forecast(build(2, anchoring=anchoring), observed).mean_m
         for anchoring in ("none", "both", "longitudinal", "lateral")
     )
     assert np.abs(both - free).max() > 5
@@ -107,7 +107,7 @@ def test_the_order_of_vehicles_does_not_matter(seed, vehicles, order_seed):
     observed, truth = wander(seed, 2, vehicles)
     order = np.random.default_rng(order_seed).permutation(vehicles)
     network = build(seed=seed % 7)
-    said, again = network.predict_scene(observed), network.predict_scene(reorder(observed, order))
+    said, again = forecast(network, observed), forecast(network, reorder(observed, order))
     close(again.mean_m, said.mean_m[:, order])
     close(again.covariance_m2, said.covariance_m2[:, order])
     looks, shuffled = network.read_attention(observed), network.read_attention(reorder(observed, order))
@@ -131,7 +131,7 @@ def test_vehicles_that_are_not_there_change_nothing(seed, vehicles, rows, fillin
     observed, truth = wander(seed, 2, vehicles)
     network = build(seed=seed % 7).eval()
     padded = pad(observed, rows, filling)
-    said, again = network.predict_scene(observed), network.predict_scene(padded)
+    said, again = forecast(network, observed), forecast(network, padded)
     close(again.mean_m[:, :vehicles], said.mean_m)
     close(again.covariance_m2[:, :vehicles], said.covariance_m2)
     absent = ~padded.vehicle_mask
@@ -162,7 +162,7 @@ def test_ticks_and_lanes_that_are_unknown_change_nothing(seed, filling, protocol
     lanes[observed.lanes[..., 2] == 0, :2] = filling
     future[~truth.future_mask] = filling
     other = change(observed, history=history, lanes=lanes)
-    assert np.array_equal(network.predict_scene(other).mean_m, network.predict_scene(observed).mean_m)
+    assert np.array_equal(forecast(network, other).mean_m, forecast(network, observed).mean_m)
     first = network.loss(to_tensors(observed), to_tensors(truth), "both")
     second = network.loss(to_tensors(other), to_tensors(change(truth, future=future)), "both")
     assert first.item() == second.item()
@@ -175,7 +175,7 @@ def test_any_number_of_vehicles_is_predicted(scenes, vehicles):
     network = build(8)
     said, all_of_them, looks = (
         network.predict(observed),
-        network.predict_scene(observed),
+        forecast(network, observed),
         network.read_attention(observed),
     )
     assert said.position_m.shape == (scenes, F, 2)
@@ -195,7 +195,7 @@ def test_any_number_of_vehicles_is_predicted(scenes, vehicles):
 def test_the_ego_is_told_as_in_the_whole_scene():
     observed, _ = wander(4, 5, 6)
     network = build()
-    said, all_of_them = network.predict(observed), network.predict_scene(observed)
+    said, all_of_them = network.predict(observed), forecast(network, observed)
     along, across = said.density.sigma_m[:, 0, :, 0], said.density.sigma_m[:, 0, :, 1]
     assert np.array_equal(said.position_m, all_of_them.mean_m[:, 0])
     assert np.array_equal(said.density.mean_m[:, 0], said.position_m)
@@ -226,7 +226,7 @@ def test_attention_goes_to_what_is_there_and_sums_to_one(seed, vehicles, heads):
 
 def test_an_untrained_network_predicts_constant_velocity_of_every_vehicle():
     observed, _ = wander(8, 6, 5, present=1.0)
-    mean = build(wild=False).predict_scene(observed).mean_m
+    mean = forecast(build(wild=False), observed).mean_m
     step = observed.history[:, :, -1] - observed.history[:, :, -2]
     has = observed.history_mask[:, :, -2]
     assert not has.all()
@@ -260,7 +260,7 @@ def test_velocities_are_taken_from_known_ticks():
 def test_loss_equals_scipy_and_the_plain_distance():
     observed, truth = wander(3, 4, 5)
     network = build(nll_weight=0.7, distance_weight=2.5).eval()
-    said = network.predict_scene(observed)
+    said = forecast(network, observed)
     densities, distances = [], []
     for scene, v, tick in np.argwhere(truth.future_mask):
         place, mean = truth.future[scene, v, tick].astype(float), said.mean_m[scene, v, tick].astype(float)
@@ -273,7 +273,7 @@ def test_loss_equals_scipy_and_the_plain_distance():
 def test_gradients_are_finite_where_a_prediction_hits_and_where_nothing_is_known():
     observed, truth = wander(5, 2, 3)
     network = build(wild=False)
-    hit = change(truth, future=network.predict_scene(observed).mean_m)
+    hit = change(truth, future=forecast(network, observed).mean_m)
     for known in (truth.future_mask, np.zeros_like(truth.future_mask)):
         network.zero_grad()
         loss = network.loss(to_tensors(observed), to_tensors(change(hit, future_mask=known)), "both")
@@ -320,7 +320,7 @@ def test_training_on_a_few_scenes_reduces_the_loss_and_repeats(name):
 def test_predicting_leaves_training_as_it_was():
     observed, _ = wander(2, 2, 3)
     network = build().train()
-    for ask in (network.predict, network.predict_scene, network.read_attention):
+    for ask in (network.predict, network.predict_vehicles, network.read_attention):
         ask(observed)
         assert network.training
     assert np.array_equal(network.predict(observed).position_m, network.predict(observed).position_m)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from attention_networks import build, close, to_tensors
+from attention_networks import build, close, forecast, to_tensors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from slow_attention import restate
@@ -18,7 +18,7 @@ def test_raw_positions_equal_a_slow_restatement():
     network = build(2, inputs="positions", residual=False)
     weights = {name: value.double().numpy() for name, value in network.state_dict().items()}
     slow = restate(weights, observed, 2, ticks=1, rate_hz=5, horizon_ticks=F, residual=False, positions=True)
-    said = network.predict_scene(observed)
+    said = forecast(network, observed)
     assert not observed.history_mask.all()
     for scene, (there, means, covariances, _) in enumerate(slow):
         close(said.mean_m[scene, there], means)
@@ -53,13 +53,13 @@ def test_an_ablation_is_the_network_that_is_shown_less(parameters, shown):
     observed, _ = wander(12, 4, 7)
     same = shown(observed)
     ablated, network = build(**parameters), build()
-    said, expected = ablated.predict_scene(observed), network.predict_scene(same)
+    said, expected = forecast(ablated, observed), forecast(network, same)
     assert np.array_equal(said.vehicle_mask, same.vehicle_mask)
     close(said.mean_m, expected.mean_m)
     close(said.covariance_m2, expected.covariance_m2)
     close(ablated.read_attention(observed).lanes, network.read_attention(same).lanes)
     if same is not observed:
-        assert np.abs(said.mean_m[:, 0] - network.predict_scene(observed).mean_m[:, 0]).max() > 1e-3
+        assert np.abs(said.mean_m[:, 0] - forecast(network, observed).mean_m[:, 0]).max() > 1e-3
 
 
 @settings(max_examples=20)

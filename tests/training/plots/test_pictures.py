@@ -1,7 +1,6 @@
 """Pictures against numbers known by hand; and what models get before the future is read."""
 
 import json
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M
 from lane_tracks import open_tracks, track
 
 from tracklake.training.data.observed import FutureInputError, ObservedScene
-from tracklake.training.models.prediction import NotFiniteError, Prediction
+from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.plots.picture import forecast_samples, forecast_scene, take_picture
 from tracklake.training.plots.picture_drawing import describe_marks, draw_picture
 from tracklake.training.plots.picture_rows import choose_view, list_errors
@@ -125,20 +124,18 @@ class SceneModel:
     def __init__(self):
         self.seen = []
 
-    def predict_scene(self, observed):
+    def limit(self, observed):
+        return observed
+
+    def predict_vehicles(self, observed):
         assert type(observed) is ObservedScene
         self.seen.append(observed)
-        moved = np.zeros((*observed.vehicle_mask.shape, 4, 2), np.float32)
+        last = observed.history[observed.vehicle_mask][:, -1:]
+        moved = np.zeros((len(last), 4, 2), np.float32)
         moved[..., 0] = 7 * np.arange(1, 5)
-        covariance = np.broadcast_to(np.float32([[4, 3], [3, 9]]), (*moved.shape, 2))
-        return SceneForecast(observed.history[:, :, -1:] + moved, covariance, observed.vehicle_mask)
-
-
-@dataclass
-class SceneForecast:
-    mean_m: np.ndarray
-    covariance_m2: np.ndarray
-    vehicle_mask: np.ndarray
+        sigma = np.broadcast_to(np.float32([2, 3]), (len(last), 1, 4, 2))
+        density = Density(np.ones((len(last), 1)), (last + moved)[:, None], sigma, np.full((len(last), 1, 4), 0.5))
+        return Prediction(last + moved, density)
 
 
 def test_a_model_of_scenes_predicts_all_vehicles_at_once(folder):
