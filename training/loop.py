@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.data.augmentation import augment
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.models import Reads
@@ -146,6 +145,8 @@ def _take_step(
 def _load_batches(plan: Plan, read: Read, step: int) -> Batches:
     """Yield the batches from a step on, without end."""
     import torch
+
+    from tracklake.training.data.augmentation import augment
 
     size = plan.recipe.batch_size
     epoch, done = divmod(step, plan.epoch_steps)

@@ -24,6 +24,9 @@ ANCHORING, RESIDUAL = "anchoring", "residual"
 """Parameter that names the axes on which a network's outputs are counted from constant velocity, and its former name:
 `residual` true stands for `both`, false for `none`."""
 
+OptimizerName = Literal["adam", "adamw"]
+ScheduleName = Literal["constant", "cosine"]
+AugmentationName = Literal["none", "mirror", "shift", "both"]
 Reads = Literal["grid", "scene"]
 """Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
@@ -62,10 +65,10 @@ class Recipe:
     phases: tuple[Phase, ...]
     batch_size: int = 128
     learning_rate: float = 1e-3
-    optimizer: Literal["adam", "adamw"] = "adam"
-    schedule: Literal["constant", "cosine"] = "constant"
+    optimizer: OptimizerName = "adam"
+    schedule: ScheduleName = "constant"
     max_gradient_norm: float = 10.0
-    augmentation: Literal["none", "mirror", "shift", "both"] = "none"
+    augmentation: AugmentationName = "none"
 
     @property
     def epochs(self) -> int:

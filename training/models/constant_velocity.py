@@ -122,21 +122,10 @@ class KalmanConstantVelocity:
         **{f"acceleration_{axis}_m2ps3": ACCELERATION_RANGE_M2PS3 for axis in AXES},
     }
 
-    def __init__(
-        self,
-        protocol: Protocol,
-        *,
-        measurement_longitudinal_m: float,
-        measurement_lateral_m: float,
-        acceleration_longitudinal_m2ps3: float,
-        acceleration_lateral_m2ps3: float,
-    ) -> None:
-        sigma_m = {"measurement_longitudinal_m": measurement_longitudinal_m}
-        sigma_m["measurement_lateral_m"] = measurement_lateral_m
-        density = {"acceleration_longitudinal_m2ps3": acceleration_longitudinal_m2ps3}
-        density["acceleration_lateral_m2ps3"] = acceleration_lateral_m2ps3
-        _require_positive(**sigma_m, **density)
-        weights, variance = _filter(protocol, np.array([*sigma_m.values()]), np.array([*density.values()]))
+    def __init__(self, protocol: Protocol, **noise: float) -> None:
+        _require_positive(**noise)
+        sigma_m, density = np.array([noise[name] for name in self.bounds]).reshape(2, 2)
+        weights, variance = _filter(protocol, sigma_m, density)
         self.weights: Floats = weights  # (2, F, H)
         self.sigma_m: Floats = np.sqrt(variance).T  # (F, 2)
 

@@ -3,22 +3,19 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Model, Recipe
+from tracklake.training.models import AugmentationName, Model, OptimizerName, Recipe, ScheduleName
 
 if TYPE_CHECKING:
     import torch
 
-OptimizerName = Literal["adam", "adamw"]
-ScheduleName = Literal["constant", "cosine"]
-AugmentationName = Literal["none", "mirror", "shift", "both"]
-RECIPE_SETTINGS = ("batch_size", "learning_rate", "optimizer", "schedule", "max_gradient_norm", "augmentation")
+RECIPE_SETTINGS = tuple(own.name for own in fields(Recipe) if own.name != "phases")
 """Settings of a model's recipe that a training may change."""
 BUDGETS = ("seconds", "steps", "epochs")
 """Settings that end a training; one of them at most is given."""

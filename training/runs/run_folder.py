@@ -192,15 +192,11 @@ def refuse_replacement(out: Path, run: dict[str, Any]) -> None:
     except (StaleRunError, OSError):
         return
     names = there.keys() & asked.keys() if there["model"] == asked["model"] else {"model"}
-    differing = [
-        f"{name} {show_setting(there[name])} there, {show_setting(asked[name])} asked for"
-        for name in sorted(names)
-        if there[name] != asked[name]
-    ]
+    differing = list_differences(*({name: own[name] for name in names} for own in (there, asked)), "there", "asked for")
     if differing:
         raise UsageError(
-            f"{out}: there is a run of this name, and another one was asked for: {'; '.join(differing)}. Give the new "
-            "one another name (`--name`), or replace the old one (`--anew`)"
+            f"{out}: there is a run of this name, and another one was asked for: {differing}. Give the new one another "
+            "name (`--name`), or replace the old one (`--anew`)"
         )
 
 
@@ -216,6 +212,17 @@ def select_settings(run: dict[str, Any]) -> dict[str, Any]:
     return {**settings, "model": run["model"], "protocol": run["protocol"]["name"]}
 
 
+def list_differences(one: dict[str, Any], other: dict[str, Any], here: str, there: str) -> str:
+    """List settings of two runs that differ, with the words that tell which value is whose."""
+    return "; ".join(
+        f"other {name}"
+        if isinstance(one.get(name), list)
+        else f"{name} {show_setting(one.get(name))} {here}, {show_setting(other.get(name))} {there}"
+        for name in sorted(one.keys() | other.keys())
+        if one.get(name) != other.get(name)
+    )
+
+
 def show_setting(value: object) -> str:
     """Show a setting in a message."""
     if isinstance(value, dict):
@@ -225,16 +232,11 @@ def show_setting(value: object) -> str:
 
 def refuse_other_run(path: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
     """Raise UnfinishedError where settings or data differ from those that a checkpoint's training was started with."""
-    old, new = _flatten(then), _flatten(now)
-    differing = [
-        f"other {name}" if isinstance(old.get(name), list) else f"{name} {old.get(name)} then, {new.get(name)} now"
-        for name in sorted(old.keys() | new.keys())
-        if old.get(name) != new.get(name)
-    ]
+    differing = list_differences(_flatten(then), _flatten(now), "then", "now")
     if differing:
         raise UnfinishedError(
-            f"{path}: this training was started with other settings or data: {'; '.join(differing)}. Resume with the "
-            f"same (`--resume` alone takes the settings from the checkpoint), or {RESTART}"
+            f"{path}: this training was started with other settings or data: {differing}. Resume with the same "
+            f"(`--resume` alone takes the settings from the checkpoint), or {RESTART}"
         )
 
 

@@ -48,6 +48,12 @@ def draw_changes(draw, samples):
     return draw.random(samples) < 0.5, draw.integers(-2, 3, samples)
 
 
+def augment_arrays(observed, truth, mirrored, rows):
+    tensors = (own.each(torch.from_numpy) for own in (observed, truth))
+    changed = augment(*tensors, torch.from_numpy(mirrored), torch.from_numpy(rows))
+    return tuple(own.each(torch.Tensor.numpy) for own in changed)
+
+
 def mirror_maneuver(code):
     return LATERAL_MANEUVERS.index(OPPOSITE[LATERAL_MANEUVERS[code]])
 
@@ -59,7 +65,7 @@ def test_grids_equal_a_loop_over_samples_and_neighbors(seed, samples):
     observed, truth = draw_grid(draw, samples)
     truth = type(truth)(**{**vars(truth), "lateral": draw.integers(0, 3, samples).astype(np.uint8)})
     mirrored, rows = draw_changes(draw, samples)
-    found, came = augment(observed, truth, mirrored, rows)
+    found, came = augment_arrays(observed, truth, mirrored, rows)
     expected = []
     for number in range(samples):
         side = MIRROR if mirrored[number] else np.ones(2, dtype=np.float32)
@@ -95,7 +101,7 @@ def test_scenes_equal_a_loop_over_samples_and_vehicles(seed, scenes):
         lanes[scene, : scene + 1] = [(3.5 * lane - 5, 3.5 + lane / 10, 1) for lane in range(scene + 1)]
     observed = type(observed)(**{**vars(observed), "all_lanes": lanes})
     mirrored, rows = draw_changes(draw, scenes)
-    found, came = augment(observed, truth, mirrored, rows)
+    found, came = augment_arrays(observed, truth, mirrored, rows)
     for scene in range(scenes):
         side = MIRROR if mirrored[scene] else np.ones(2, dtype=np.float32)
         for vehicle in range(4):
@@ -117,20 +123,17 @@ def test_scenes_equal_a_loop_over_samples_and_vehicles(seed, scenes):
 
 
 @pytest.mark.parametrize("kind", ["grid", "scene"])
-def test_tensors_are_changed_as_arrays_are_and_a_mirrored_mirror_image_is_the_original(kind):
+def test_dtypes_stay_and_a_mirrored_mirror_image_is_the_original(kind):
     draw = np.random.default_rng(4)
     observed, truth = draw_grid(draw, 6) if kind == "grid" else wander_together(4, 6, 4)
     mirrored, rows = draw_changes(draw, 6)
-    arrays = augment(observed, truth, mirrored, rows)
-    given_tensors = (own.each(torch.from_numpy) for own in (observed, truth))
-    tensors = augment(*given_tensors, torch.from_numpy(mirrored), torch.from_numpy(rows))
     still = np.zeros(6, dtype=np.int64)
-    twice = augment(*augment(observed, truth, mirrored, still), mirrored, still)
-    for own, changed, again, original in zip(arrays, tensors, twice, (observed, truth), strict=True):
-        for name, values in vars(own).items():
-            np.testing.assert_array_equal(getattr(changed, name).numpy(), values, err_msg=name)
-            assert values.dtype == getattr(changed, name).numpy().dtype == getattr(original, name).dtype, name
-            np.testing.assert_array_equal(getattr(again, name), getattr(original, name), err_msg=name)
+    once = augment_arrays(observed, truth, mirrored, rows)
+    twice = augment_arrays(*augment_arrays(observed, truth, mirrored, still), mirrored, still)
+    for own, again, original in zip(once, twice, (observed, truth), strict=True):
+        for name, values in vars(original).items():
+            assert getattr(own, name).dtype == getattr(again, name).dtype == values.dtype, name
+            np.testing.assert_array_equal(getattr(again, name), values, err_msg=name)
 
 
 # Training

@@ -266,8 +266,14 @@ def test_two_processes_do_not_train_one_run(tensors, tmp_path):
     ("config", "reported"),
     [
         (replace(CONFIG, seed=5), "training.seed 4 then, 5 now"),
-        (replace(CONFIG, epochs=4, patience=None), "training.epochs 3 then, 4 now; training.patience 5 then, None now"),
-        (replace(CONFIG, parameters={"hidden": 9}), "parameters.hidden 8 then, 9 now; training.parameters.hidden None"),
+        (
+            replace(CONFIG, epochs=4, patience=None),
+            "training.epochs 3 then, 4 now; training.patience 5 then, not set now",
+        ),
+        (
+            replace(CONFIG, parameters={"hidden": 9}),
+            "parameters.hidden 8 then, 9 now; training.parameters.hidden not set",
+        ),
     ],
 )
 def test_a_training_does_not_go_on_otherwise_than_it_began(config, reported, interrupted, tensors, undisturbed):
