@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from tracklake.pipeline.settings.fields import DeclaredSettings
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.files import SETTINGS_FILE
 from tracklake.schemas.text import suggest_name
+from tracklake.schemas.validation import BOUNDS, describe_fault
 
 PREFIX = "TRACKLAKE_"
 """Beginning of the names of environment variables that are settings."""
@@ -20,9 +20,6 @@ DEBUG = "TRACKLAKE_DEBUG"
 """Environment variable: if set to 1, every error shows its traceback, as with the option --debug."""
 ENVIRONMENT, OPTION = "environment", "option"
 """Names of the sources of values that are variables, and that are given to a command or function."""
-KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "string": "a text"}
-KINDS |= {"path": "a path", "list": "a list", "dict": "a table"}
-"""Words for kinds of values, by pydantic's names."""
 
 Key = tuple[str, ...]
 """Name of a setting, and with a table of settings such as `thresholds` the name in it."""
@@ -199,18 +196,13 @@ def describe_problem(problem: Any) -> str:  # noqa: ANN401  (a TypedDict that py
     """Return what was expected where pydantic found something else."""
     if problem["type"] == "extra_forbidden":
         return f"unknown setting; {suggest_name(str(problem['loc'][0]), DeclaredSettings.model_fields)}"
-    words = {"ge": "{:g} or more", "gt": "more than {:g}", "le": "{:g} or less"}
-    if {*problem.get("ctx", {})} & {*words}:
-        declared = DeclaredSettings.model_fields[problem["loc"][0]].metadata
-        limits = {name: getattr(each, name) for each in declared for name in words if hasattr(each, name)}
-        bounds = [words[name].format(limit) for name, limit in (limits or problem["ctx"]).items()]
-        return f"expected {' and '.join(bounds)}"
-    kind = problem["type"]
-    if kind == "string_pattern_mismatch":
+    if problem["type"] == "string_pattern_mismatch":
         return "expected letters, digits, `.`, `_` and `-`"
-    if kind in ("int_from_float", *(f"{name}_{what}" for name in KINDS for what in ("type", "parsing"))):
-        return f"expected {KINDS[kind.partition('_')[0]]}"
-    return re.sub("^Input should be ", "expected ", problem["msg"].removeprefix("Value error, "))
+    if {*problem.get("ctx", {})} & {*BOUNDS}:  # pydantic tells one bound; both are shown
+        declared = DeclaredSettings.model_fields[problem["loc"][0]].metadata
+        limits = {name: getattr(each, name) for each in declared for name in BOUNDS if hasattr(each, name)}
+        return describe_fault({**problem, "ctx": limits or problem["ctx"]})
+    return describe_fault(problem)
 
 
 def make_error(problems: Sequence[tuple[Key, str, object]], sources: Sequence[SettingSource]) -> SettingError:

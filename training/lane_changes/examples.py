@@ -3,18 +3,20 @@
 Labels use rows after the labelled one: they are for training and for scores, never for a prediction.
 """
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
+from tracklake.schemas.validation import explain_faults
 from tracklake.training.data.gathers import gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
@@ -42,11 +44,13 @@ LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
 speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
 READ_SAMPLES = 4096
 """Number of samples read at once; their scenes take about 20 MB."""
-AUGMENTATIONS = ("mirror", "shift")
-"""Copies of all examples that a fit can add: on a mirrored road, or with the ego at another distance."""
 
 
-@dataclass(frozen=True)
+Count = Annotated[int, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+@checked_dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid"))
 class LaneForestSettings:
     """How examples are labelled, drawn and learned from; stored with the forest.
 
@@ -55,7 +59,7 @@ class LaneForestSettings:
         measured_start: whether a maneuver starts where the vehicle leaves its lane's centre, not T_d before the end.
         tolerance_m: distance from a lane's centre at which the vehicle has reached it, m.
         examples: largest number drawn from the training part, before augmentation.
-        augmentation: names from AUGMENTATIONS.
+        augmentation: copies of all examples that are added: on a mirrored road, or with the ego at another distance.
         shift_m: largest shift of an ego along the road, either way, m.
         trees: number of trees.
         leaf: smallest number of examples in a leaf.
@@ -63,47 +67,22 @@ class LaneForestSettings:
         most_correlation: largest correlation between two features; the one closer to the classes stays.
     """
 
-    start_s: float = START_S
+    start_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = START_S
     measured_start: bool = False
-    tolerance_m: float = TOLERANCE_M
-    examples: int = 10_000
-    augmentation: tuple[str, ...] = AUGMENTATIONS
-    shift_m: float = 5.0
-    trees: int = 100
-    leaf: int = 20
-    least_correlation: float = 0.05
-    most_correlation: float = 0.95
+    tolerance_m: NotNegative = TOLERANCE_M
+    examples: Count = 10_000
+    augmentation: Annotated[tuple[Literal["mirror", "shift"], ...], Field(strict=False)] = ("mirror", "shift")
+    shift_m: NotNegative = 5.0
+    trees: Count = 100
+    leaf: Count = 20
+    least_correlation: NotNegative = 0.05
+    most_correlation: NotNegative = 0.95
 
-    def __post_init__(self) -> None:
-        """Raise a UsageError where a value is out of range or an augmentation is unknown."""
-        unknown = sorted(set(self.augmentation) - set(AUGMENTATIONS))
-        if unknown:
-            raise UsageError(f"augmentation: expected {', '.join(AUGMENTATIONS)}; got {', '.join(unknown)}")
-        for name in ("start_s", "examples", "trees", "leaf"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise UsageError(f"{name}: expected more than 0, got {getattr(self, name)}")
-        for name in ("tolerance_m", "shift_m", "least_correlation", "most_correlation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-
+    @model_validator(mode="wrap")
     @classmethod
-    def read(cls, stored: Mapping[str, Any]) -> Self:
-        """Read settings from plain values; a missing setting takes its default.
-
-        Raises:
-            UsageError: a setting is unknown, of another type, or out of range.
-        """
-        defaults = {own.name: own.default for own in fields(cls)}
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()
-        }
-        for name, value in values.items():
-            kind = type(defaults.get(name))
-            if name not in defaults or not (type(value) is kind or (type(value), kind) == (int, float)):
-                raise UsageError(
-                    f"expected settings {', '.join(defaults)}, typed as their defaults; got {name} = {value!r}"
-                )
-        return cls(**values)
+    def _explain(cls, values: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401  (pydantic's own)
+        with explain_faults():
+            return validate(values)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class LaneForest:
     @property
     def settings(self) -> LaneForestSettings:
         """Settings it was fitted with."""
-        return LaneForestSettings.read(self.facts["settings"])
+        return LaneForestSettings(**self.facts["settings"])
 
     def predict(self, observed: ObservedScene[Any]) -> Singles:
         """Predict B targets from what is observed of them: (B, 1 + T, 3), see `predict_proba`."""
@@ -209,7 +209,7 @@ def _check_header(header: Any) -> None:  # noqa: ANN401  (whatever JSON a file h
     lacking = [name for name, kind in FACTS.items() if not isinstance(held.get(name), kind)]
     if lacking:
         raise ValueError(f"expected facts with {', '.join(FACTS)}, got no {', '.join(lacking)}")
-    LaneForestSettings.read(held["settings"])
+    LaneForestSettings(**held["settings"])
 
 
 def _check_classifier(forest: LaneForest) -> None:

@@ -3,12 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.validation import explain_faults
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import AugmentationName, Model, OptimizerName, Recipe, ScheduleName
 
@@ -19,13 +22,13 @@ RECIPE_SETTINGS = tuple(own.name for own in fields(Recipe) if own.name != "phase
 """Settings of a model's recipe that a training may change."""
 BUDGETS = ("seconds", "steps", "epochs")
 """Settings that end a training; one of them at most is given."""
-WHOLE_NUMBERS = ("steps", "epochs", "samples_per_epoch", "patience", "batch_size", "seed", "threads", "log_steps")
 MAX_NUMBER, MAX_THREADS = 2**63 - 1, 1024
 """Largest numbers in general, as torch takes seeds, and of threads."""
-NUMBERS = ("seconds", "learning_rate", "max_gradient_norm", "checkpoint_s")
+Count = Annotated[int, Field(gt=0, le=MAX_NUMBER)]
+Amount = Annotated[float, Field(gt=0)]
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid"))
 class TrainConfig:
     """Settings of a training; those left out are the model's recipe (`training.models.Recipe`).
 
@@ -34,54 +37,41 @@ class TrainConfig:
     threads. On `cuda`, threads add up some sums in any order: there the seed does not decide the weights bit for bit.
     """
 
-    seconds: float | None = None  # time budget of the loop with all its work; the learning rate follows the time
-    steps: int | None = None  # optimiser steps
-    epochs: int | None = None  # epochs of all phases together; none of the three = the recipe's epochs
-    samples_per_epoch: int = 200_000  # most samples of an epoch; each epoch draws its own
+    seconds: Amount | None = None  # time budget of the loop with all its work; the learning rate follows the time
+    steps: Count | None = None  # optimiser steps
+    epochs: Count | None = None  # epochs of all phases together; none of the three = the recipe's epochs
+    samples_per_epoch: Count = 200_000  # most samples of an epoch; each epoch draws its own
     # Epochs without a smaller loss on the part `val` after which the last phase ends; the weights with the smallest
     # loss are kept. Earlier phases run their length: their loss does not judge a model.
-    patience: int | None = None
-    batch_size: int | None = None  # samples per step
-    learning_rate: float | None = None  # highest one of the optimiser
+    patience: Count | None = None
+    batch_size: Count | None = None  # samples per step
+    learning_rate: Amount | None = None  # highest one of the optimiser
     optimizer: OptimizerName | None = None
     schedule: ScheduleName | None = None  # cosine: warms up over the first 2 % and decays to 0
-    max_gradient_norm: float | None = None  # larger gradients are scaled down
+    max_gradient_norm: Amount | None = None  # larger gradients are scaled down
     augmentation: AugmentationName | None = None  # mirrors samples, or moves them among their neighbors
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of the model
     dataset: str | None = None  # trains, validates and evaluates on this dataset alone
     recording: str | None = None  # on this recording or subset alone
-    seed: int = 0  # of the weights, of the order of samples, and of dropout
+    seed: Annotated[int, Field(ge=0, le=MAX_NUMBER)] = 0  # of the weights, of the order of samples, and of dropout
     # Threads of torch; None = its own choice. For networks this small more gain little on an idle machine, and wait for
     # each other on a busy one: a step takes ten times as long.
-    threads: int | None = 1
+    threads: Annotated[int, Field(gt=0, le=MAX_THREADS)] | None = 1
     device: str = "cpu"  # or `cuda`, with all tensors there
-    log_steps: int = 20  # between two rows of course.csv
-    checkpoint_s: float = 60.0  # most between two checkpoints; one is also at the end of an epoch that took a while
+    log_steps: Count = 20  # between two rows of course.csv
+    checkpoint_s: Amount = 60.0  # most between two checkpoints; one is also at the end of an epoch that took a while
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explain(cls, values: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401  (pydantic's own)
+        with explain_faults("training"):
+            return validate(values)
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a value that cannot train anything."""
-        for own in fields(self):
-            value = getattr(self, own.name)
-            if own.name in WHOLE_NUMBERS and value is not None and type(value) is not int:
-                raise UsageError(f"training: expected a whole number for `{own.name}`, got {value!r}")
-            if own.name in NUMBERS and not isinstance(value, int | float | None):
-                raise UsageError(f"training: expected a number for `{own.name}`, got {value!r}")
-            if own.name != "seed" and isinstance(value, int | float) and not value > 0:
-                raise UsageError(f"training: expected `{own.name}` above 0, got {value}")
-            most = MAX_THREADS if own.name == "threads" else MAX_NUMBER
-            if isinstance(value, int) and value > most:
-                raise UsageError(f"training: expected `{own.name}` of at most {most:,}, got {value}")
-        if not isinstance(self.parameters, Mapping):
-            raise UsageError(f"training: expected `parameters` by name, got {self.parameters!r}")
-        if self.seed < 0:
-            raise UsageError(f"training: expected `seed` 0 or above, got {self.seed}")
+        """Raise UsageError where several budgets are given."""
         given = [f"{name} {getattr(self, name)}" for name in BUDGETS if getattr(self, name) is not None]
         if len(given) > 1:
             raise UsageError(f"training: expected one of {', '.join(BUDGETS)} at most, got {' and '.join(given)}")
-        choices = {"optimizer": OptimizerName, "schedule": ScheduleName, "augmentation": AugmentationName}
-        for name, known in ((name, get_args(choice)) for name, choice in choices.items()):
-            if getattr(self, name) not in (None, *known):
-                raise UsageError(f"training: expected `{name}` {' or '.join(known)}, got {getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)

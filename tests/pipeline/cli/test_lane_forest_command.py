@@ -147,7 +147,7 @@ def test_settings_are_the_forests(command, copied, kept):
         (["--set", "depth=3"], "the forest has start_s, measured_start, tolerance_m, shift_m, trees, leaf,"),
         (["--set", "examples=3"], "got 'examples=3'"),
         (["--set", "trees=many"], "--set trees=many: expected int like 100"),
-        (["--set", "trees=0"], "trees: expected more than 0, got 0"),
+        (["--set", "trees=0"], "`trees`: expected more than 0, got 0"),
         (["--use", "--seed", "0"], "--use scores a forest as it is"),
         (["--use", "--set", "trees=3"], "--use scores a forest as it is"),
     ],

@@ -141,7 +141,7 @@ def test_an_interrupted_training_is_gone_on_with(command, lake, models, monkeypa
         (("lstm", "--set", "hidden"), "lstm has batch_size"),
         (("lstm", "--set", "hidden=wide"), "hidden=wide: expected int like 48"),
         (("lstm", "--set", "hidden=true"), "hidden=true: expected int like 48"),
-        (("lstm", "--set", "batch_size=0"), "expected `batch_size` above 0"),
+        (("lstm", "--set", "batch_size=0"), "`batch_size`: expected more than 0"),
     ],
 )
 def test_words_that_mean_nothing_here_are_usage_errors(arguments, reported, command, lake):

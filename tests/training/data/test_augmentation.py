@@ -178,5 +178,5 @@ def test_the_run_says_how_its_samples_were_augmented(tensors, tmp_path):
     train("lstm", tensors, tmp_path / "run", TrainConfig(steps=2, augmentation="mirror"))
     assert json.loads((tmp_path / "run" / "config.json").read_text())["recipe"]["augmentation"] == "mirror"
     assert TensorFolder.open(tensors).protocol == TINY
-    with pytest.raises(UsageError, match="expected `augmentation` none or mirror or shift or both, got 'flip'"):
+    with pytest.raises(UsageError, match="`augmentation`: expected 'none', 'mirror', 'shift' or 'both', got 'flip'"):
         TrainConfig(augmentation="flip")

@@ -347,10 +347,10 @@ def seal(header, content):
         (
             {"run": {"training": {"steps": 3, "pace": 2, "gait": 1}}},
             {},
-            "no checkpoint .*'pace'.*; resume with the one that started the training",
+            "no checkpoint .*`pace`: unknown setting, got 2; .*resume with the one that started the training",
         ),
-        ({"run": {"training": {"seed": "x"}}}, {}, "no checkpoint .*`seed`, got 'x'"),
-        ({"run": {"training": {"steps": 0}}}, {}, "no checkpoint .*`steps` above 0"),
+        ({"run": {"training": {"seed": "x"}}}, {}, "no checkpoint .*`seed`: expected a whole number, got 'x'"),
+        ({"run": {"training": {"steps": 0}}}, {}, "no checkpoint .*`steps`: expected more than 0"),
         ({}, {"network": {}}, 'not the weights of this model .*Missing key.* "first.weight"'),
         ({}, {"optimizer": {}}, "not the weights of this model"),
         ({}, {"random": torch.zeros(3)}, "not the weights of this model"),
