@@ -4,10 +4,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import measure_errors
+from tracklake.training.evaluation.evaluate import measure_errors, require_samples
 from tracklake.training.loop import DivergedError, Progress, fit_network
 from tracklake.training.models import Model, find_model, require_torch
 from tracklake.training.models.fitting import fit_model
@@ -63,7 +62,7 @@ def train(
         stored, started_with = read_checkpoint(checkpoint) if resume else (None, TrainConfig())
         plan = make_plan(entry, folder, config or started_with)
         if not without_evaluation:
-            _require_evaluation(plan.folder)
+            require_samples(plan.folder, "eval", ", or give `--no-evaluation`")
         settings = vars(plan.config) | {"parameters": dict(plan.config.parameters)}
         run = describe_run(model, plan.parameters, settings, plan.folder, plan.recipe)
         if resume is None:
@@ -85,16 +84,6 @@ def train(
                 raise
             raise TrainingInterruptedError(f"interrupted; the checkpoint is {checkpoint}") from None
     return metrics
-
-
-def _require_evaluation(folder: TensorFolder) -> None:
-    """Raise TracklakeError where there is nothing to score a model on."""
-    if len(folder.samples_of("eval")) == 0:
-        raise TracklakeError(
-            f"{folder.path}: the split `{folder.split}` has no samples in `eval` to score the model on. Add "
-            'recordings, or set split = "time-blocks" or a shorter `split_block_s`, and run again; or give '
-            "`--no-evaluation`."
-        )
 
 
 def _write_baseline(

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from tracklake.schemas.arrays import Integers
+from tracklake.schemas.columns import PARTS
 from tracklake.schemas.comparisons import VEHICLE_ERRORS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
@@ -144,17 +145,7 @@ def measure_errors(
         NotFiniteError: a prediction is not a finite number.
         TracklakeError: a prediction is not of the horizon's shape.
     """
-    samples = folder.samples_of(part)
-    if len(samples) == 0:
-        counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in ("train", "val", "eval"))
-        more = "add recordings" if part != "val" else "set validation_part = true (TRACKLAKE_VALIDATION_PART)"
-        if folder.split != TIME_BLOCKS:
-            more += f', or set split = "{TIME_BLOCKS}" to divide each recording'
-        kept = "" if folder.kept is None else f" of {', '.join(folder.origins)}"
-        raise EmptyPartError(
-            f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "
-            f"{more}, and run `tracklake run` again"
-        )
+    samples = require_samples(folder, part)
     refuse_future(model, folder, part, nearest=nearest)
     strata, protocol = find_strata(folder, samples), folder.protocol
     tally = Tally(strata, protocol.horizon_ticks)
@@ -182,6 +173,22 @@ def measure_errors(
         run=model.config,
         fit=model.fit,
     )
+
+
+def require_samples(folder: TensorFolder, part: str, otherwise: str = "") -> Integers:
+    """Return the numbers of a part's samples; raises EmptyPartError, with the counts and what to do, without any."""
+    samples = folder.samples_of(part)
+    if len(samples) == 0:
+        counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in PARTS)
+        more = "add recordings" if part != "val" else "set validation_part = true (TRACKLAKE_VALIDATION_PART)"
+        if folder.split != TIME_BLOCKS:
+            more += f', or set split = "{TIME_BLOCKS}" to divide each recording'
+        kept = "" if folder.kept is None else f" of {', '.join(folder.origins)}"
+        raise EmptyPartError(
+            f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "
+            f"{more}, and run `tracklake run` again{otherwise}"
+        )
+    return samples
 
 
 def _list_vehicle_sums(folder: TensorFolder, samples: Integers, tally: Tally, seconds: Sequence[float]) -> pl.DataFrame:

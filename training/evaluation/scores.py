@@ -165,7 +165,7 @@ class Tally:
             if group == EVERYTHING:
                 sums |= self._count_majority(members, sums["n"])
             tables += _score_group(dataset, group, members, sums, self.strata.vehicle, seconds)
-        return pl.concat(tables, how="diagonal_relaxed").fill_nan(None).cast(SCORES)
+        return pl.concat(tables, how="diagonal_relaxed").fill_nan(None).cast(pl.Schema(SCORES))
 
     def sum_vehicles(self, seconds: Sequence[float], rate_hz: int) -> dict[str, Floats]:
         """Sum up the samples of each vehicle at some horizons, (V, T) each; errors are those of `score`."""

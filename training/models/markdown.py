@@ -33,29 +33,11 @@ improving.
 | model | ours | as published | what differs even then |
 | --- | --- | --- | --- |"""
 
-_ABLATIONS = """
-## Ablations of attention
-
-| setting | the network |
-| --- | --- |
-| `ego_only=true` | learns from the positions of the sample alone, as networks that read the grid do |
-| `sizes=false` | is not given lengths and widths of vehicles |
-| `lanes=none` | is not given lanes; `lanes=all` gives all of the carriageway |
-| `nearest=2` | is trained with the two nearest vehicles around the ego; `0` to `10`, which is the default |
-| `range_m=27.432` | sees no vehicle that is as far as this ahead or behind, which is the reach of the grid; `0`: any |
-
-Social pooling sees farther where cells of the grid are longer: `TRACKLAKE_GRID_CELL_M=9.144 tracklake run SOURCE` makes
-samples and tensors with cells of 30 ft; the grid then reaches 54.9 m. The protocol has another digest: give it a lake
-of its own.
-
-`metrics.json` of a run counts the positions that its loss covered (`supervised_positions`).
-"""
-
 
 def write_models() -> str:
     """Return the page as Markdown."""
     compared = [_compare(model) for model in MODELS.values() if model.published]
-    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values()), _PUBLISHED, *compared, _ABLATIONS])
+    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values()), _PUBLISHED, *compared])
 
 
 def _compare(model: Model) -> str:

@@ -192,7 +192,8 @@ def refuse_replacement(out: Path, run: dict[str, Any]) -> None:
     except (StaleRunError, OSError):
         return
     names = there.keys() & asked.keys() if there["model"] == asked["model"] else {"model"}
-    differing = list_differences(*({name: own[name] for name in names} for own in (there, asked)), "there", "asked for")
+    there, asked = ({name: own[name] for name in names} for own in (there, asked))
+    differing = list_differences(there, asked, "there", "asked for")
     if differing:
         raise UsageError(
             f"{out}: there is a run of this name, and another one was asked for: {differing}. Give the new one another "
