@@ -24,12 +24,16 @@ class Arrays:
         """Return a copy with every array changed, for instance to a tensor on a device."""
         return type(self)(**{name: change(self[name]) for name in self.keys()})
 
+    def select(self, which: Any) -> Self:  # noqa: ANN401  (positions, flags or a slice)
+        """Select rows of every array."""
+        return self.each(lambda array: array[which])
+
     def __getitem__(self, name: str) -> Array:
         """Return an array by its name."""
         return getattr(self, name)
 
     def __len__(self) -> int:
-        """Return the number of samples or scenes, B."""
+        """Return the number of rows: of samples or scenes, B."""
         return len(self[self.keys()[0]])
 
 

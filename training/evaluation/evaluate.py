@@ -181,8 +181,8 @@ def require_samples(folder: TensorFolder, part: str, otherwise: str = "") -> Int
     if len(samples) == 0:
         counts = ", ".join(f"{own} {len(folder.samples_of(own))}" for own in PARTS)
         more = "add recordings" if part != "val" else "set validation_part = true (TRACKLAKE_VALIDATION_PART)"
-        if folder.split != TIME_BLOCKS:
-            more += f', or set split = "{TIME_BLOCKS}" to divide each recording'
+        blocks = f'split = "{TIME_BLOCKS}" to divide each recording'
+        more += f", or set {'a shorter `split_block_s`' if folder.split == TIME_BLOCKS else blocks}"
         kept = "" if folder.kept is None else f" of {', '.join(folder.origins)}"
         raise EmptyPartError(
             f"{folder.path}: the split `{folder.split}` has no samples{kept} in `{part}` (samples: {counts}); "

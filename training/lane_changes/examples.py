@@ -4,7 +4,7 @@ Labels use rows after the labelled one: they are for training and for scores, ne
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -17,6 +17,7 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.schemas.validation import explain_faults
+from tracklake.training.data.batches import Arrays
 from tracklake.training.data.gathers import gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
@@ -129,7 +130,7 @@ class LabelledSamples:
 
 
 @dataclass(frozen=True)
-class Examples:
+class Examples(Arrays):
     """Features (B, features), maneuvers (B,), and lanes (B, T) at each horizon, that a forest learns from.
 
     Lanes are relative to the lane now, in codes of LATERAL_MANEUVERS; two lanes away counts as one.
@@ -139,14 +140,6 @@ class Examples:
     maneuver: Bytes
     ahead: Bytes
 
-    def __len__(self) -> int:
-        """Return the number of examples."""
-        return len(self.feature)
-
-    def select(self, which: npt.NDArray[np.integer]) -> "Examples":
-        """Select examples by their positions."""
-        return Examples(self.feature[which], self.maneuver[which], self.ahead[which])
-
     def augment(self, settings: LaneForestSettings, random: np.random.Generator) -> "Examples":
         """Append a mirrored and a shifted copy of all examples, as set."""
         copies = [self]
@@ -155,8 +148,7 @@ class Examples:
         if "shift" in settings.augmentation:
             shift_m = random.uniform(-settings.shift_m, settings.shift_m, len(self)).astype(np.float32)
             copies.append(replace(self, feature=shift_targets(self.feature, shift_m)))
-        names = (own.name for own in fields(self))
-        return Examples(*(np.concatenate([getattr(copy, name) for copy in copies]) for name in names))
+        return Examples(*(np.concatenate([copy[name] for copy in copies]) for name in self.keys()))
 
 
 class Targets(NamedTuple):

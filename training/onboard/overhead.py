@@ -69,9 +69,7 @@ def build_overhead(folder: TensorFolder, labelled: LabelledSamples) -> OverheadS
     """Build the samples of a drive from labelled samples of overhead tracks that have a vehicle behind."""
     require_ticks(folder)
     pieces = [_read_piece(folder, labelled.select(at)) for at in cut_numbers(np.arange(len(labelled)), READ_SAMPLES)]
-    samples = Samples(
-        *(np.concatenate([getattr(own.samples, name) for own in pieces]) for name in Samples.__dataclass_fields__)
-    )
+    samples = Samples(*(np.concatenate([own.samples[name] for own in pieces]) for name in dict(pieces[0].samples)))
     return OverheadSamples(
         samples,
         np.concatenate([own.number for own in pieces]),

@@ -4,7 +4,7 @@ Features are causal columns of `surrounding`. Futures are those of `surrounding_
 they are the same for every way to perceive; else the smoothed columns of `surrounding`. Gaps are never bridged.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from tracklake.schemas.hashing import hash_values
 from tracklake.schemas.perception import FIRST_LIDAR_ID
 from tracklake.schemas.protocols import V2V, DriveProtocol
 from tracklake.schemas.tensors import NOMINAL_LANE_M
+from tracklake.training.data.batches import Arrays
 from tracklake.training.lane_changes.examples import KEEP, LEFT, MIRRORED, RIGHT
 
 FEATURES = (
@@ -42,7 +43,7 @@ TRACK = ("subset", "vehicle_id")
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Arrays):
     """B samples, in the order of drive, vehicle and tick; every field has one row per sample.
 
     Args:
@@ -74,10 +75,6 @@ class Samples:
     vehicle: npt.NDArray[np.str_]
     tick: Integers
 
-    def __len__(self) -> int:
-        """Return the number of samples."""
-        return len(self.feature)
-
     @property
     def stratum(self) -> Bytes:
         """Group of each sample, as a position in `lane_changes.examples.STRATA`."""
@@ -89,10 +86,6 @@ class Samples:
         """Number of each sample's trajectory, one vehicle of one drive: (B,), from 0."""
         keys = pl.DataFrame({"subset": self.subset, "vehicle_id": self.vehicle_id})
         return keys.to_struct().rank("dense").cast(pl.Int64).to_numpy() - 1
-
-    def select(self, which: npt.NDArray[np.integer] | Flags) -> "Samples":
-        """Select samples by position or flag."""
-        return Samples(*(getattr(self, own.name)[which] for own in fields(self)))
 
 
 class BuiltSamples(NamedTuple):
@@ -314,5 +307,5 @@ def augment_samples(samples: Samples, random: np.random.Generator) -> Samples:
     feature[:, :, [FEATURE_NUMBER[name] for name in ALONG]] += shift_m[:, None, None]
     place_m[..., 0] += shift_m[:, None]
     copies: list[dict[str, npt.NDArray[Any]]] = [{}, mirrored, {"feature": feature, "place_m": place_m}]
-    names = [own.name for own in fields(samples)]
-    return Samples(*(np.concatenate([copy.get(name, getattr(samples, name)) for copy in copies]) for name in names))
+    joined = {name: np.concatenate([copy.get(name, own) for copy in copies]) for name, own in dict(samples).items()}
+    return Samples(**joined)
