@@ -121,7 +121,7 @@ def test_training_on_one_recording_is_training_on_a_folder_that_holds_it_alone(t
         train("forgetful", every, tmp_path / "none", replace(config, recording="02"))
     with pytest.raises(UsageError, match=r"expected the dataset of `01` \(highd\), got `ngsim`"):
         train("forgetful", every, tmp_path / "none", replace(config, recording="01", dataset="ngsim"))
-    with pytest.raises(TracklakeError, match="no samples in `eval`"):
+    with pytest.raises(TracklakeError, match="no samples of highd/011 in `eval`"):
         train("forgetful", every, tmp_path / "none", TrainConfig(epochs=1, recording="011"))
     assert not any("none" in path.name for path in tmp_path.iterdir())
 
