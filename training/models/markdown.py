@@ -37,7 +37,7 @@ improving.
 def write_models() -> str:
     """Return the page as Markdown."""
     compared = [_compare(model) for model in MODELS.values() if model.published]
-    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values()), _PUBLISHED, *compared])
+    return "\n".join([_HEAD, *(_describe(model) for model in MODELS.values()), _PUBLISHED, *compared, ""])
 
 
 def _compare(model: Model) -> str:
