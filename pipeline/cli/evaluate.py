@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Annotated
@@ -43,7 +44,7 @@ from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
 from tracklake.training.evaluation.published import published_rows
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.forecasters import open_forecaster
+from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
 
 FOLDER = "evaluations"
@@ -152,18 +153,16 @@ def evaluate(
         if compare and len(names) < 2:
             raise typer.BadParameter(f"--compare needs two runs or models; got {', '.join(names)} alone")
         records = {name: SampleRecord(tensors, part) for name in names} if calibration else {}
-        found = _evaluate_all(
+        opened, found = _evaluate_all(
             terminal, names, tensors, root / MODELS, part, around, records, every_tick=every_tick, strict=bool(runs)
         )
         comparable = print_comparability(terminal, root, tensors, published=published)
         table = _tabulate(found, settings.get_protocol().name, comparable)
-        scored = [own.model for own in found]
         if found:
             _show_scores(terminal, found, table, by or [])
         wanted = gain if gain is not None else tensors.protocol.tracks_from == RECONSTRUCTED_TRACKS
-        gains = _compare_histories(terminal, settings, scored, tensors, part, around) if wanted and found else None
-        opened = scored if feasibility else []
-        joint = [open_forecaster(name, tensors, root / MODELS, frozenset({part})) for name in opened]
+        gains = _compare_histories(terminal, settings, opened, tensors, part, around) if wanted and found else None
+        joint = opened if feasibility else []
         tables = show_evidence(terminal, tensors, found, records, joint, compare=compare, out=evidence)
         if vehicle_errors is not None:
             _write_vehicle_errors(terminal, vehicle_errors, found)
@@ -236,33 +235,26 @@ def _evaluate_all(
     *,
     every_tick: bool,
     strict: bool,
-) -> list[Evaluation]:
-    """Score runs and models; a run that does not fit the tensors is skipped, or refused with `strict`."""
-    found = []
+) -> tuple[list[Forecaster], list[Evaluation]]:
+    """Open and score runs and models; a run that does not fit the tensors is skipped, or refused with `strict`."""
+    opened, found = [], []
+    score = partial(evaluate_model, nearest=nearest, with_latency=True, every_tick=every_tick)
     for name in names:
         observe = records[name].observe if name in records else None
         try:
-            found.append(
-                evaluate_model(
-                    name,
-                    tensors,
-                    models,
-                    part,
-                    nearest=nearest,
-                    with_latency=True,
-                    every_tick=every_tick,
-                    observe=observe,
-                )
-            )
+            model = open_forecaster(name, tensors, models, frozenset({part}))
+            found.append(score(model, tensors, models, part, observe=observe))
         except (StaleRunError, NotFiniteError, MissingExtraError) as error:
             if strict:
                 raise
             terminal.print_problem(str(error), label="skipped")
-    return found
+        else:
+            opened.append(model)
+    return opened, found
 
 
 def _compare_histories(
-    terminal: Terminal, settings: Settings, names: Iterable[str], folder: TensorFolder, part: str, nearest: int
+    terminal: Terminal, settings: Settings, models: list[Forecaster], folder: TensorFolder, part: str, nearest: int
 ) -> pl.DataFrame | None:
     """Score models with histories of every kind of tracks, and show what smoothing gains; None on lane centres."""
     if folder.lane_centred_subsets:
@@ -270,7 +262,6 @@ def _compare_histories(
         return None
     reader = LakeReader(settings.lake, load(settings.lake))
     inputs = open_histories(settings, reader, folder, part, nearest)
-    models = [open_forecaster(name, folder, settings.lake / MODELS, frozenset({part})) for name in names]
     gains = measure_gain(models, inputs)
     show_gain(terminal, gains, inputs)
     return gains

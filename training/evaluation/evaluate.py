@@ -98,7 +98,7 @@ class EmptyPartError(TracklakeError):
 
 
 def evaluate(
-    name: str,
+    model: str | Forecaster,
     tensors: str | Path | TensorFolder,
     models: str | Path,
     part: str = "eval",
@@ -110,16 +110,18 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a trained run, or a model that is no network.
 
-    `name` is a run's folder in `models`, or a model that is no network; `tensors` their folder, or the folder opened
-    (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles around the ego in a scene.
-    Scores are of the protocol's seconds, or of every tick of the horizon. `observe` is called with every batch.
+    `model` is a run's folder in `models`, or a model that is no network, by name or opened; `tensors` their folder, or
+    the folder opened (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles around the
+    ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon. `observe` is called with
+    every batch.
 
     Raises:
         TensorError: the tensors are missing or damaged.
         TracklakeError: see `open_forecaster` and `measure_errors`.
     """
     folder = tensors if isinstance(tensors, TensorFolder) else TensorFolder.open(tensors)
-    model = open_forecaster(name, folder, Path(models), frozenset({part}))
+    if isinstance(model, str):
+        model = open_forecaster(model, folder, Path(models), frozenset({part}))
     ticks = range(1, folder.protocol.horizon_ticks + 1)
     seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
     found = measure_errors(model, folder, part, nearest=nearest, seconds=seconds, observe=observe)
