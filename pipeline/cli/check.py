@@ -28,6 +28,7 @@ from tracklake.pipeline.lake import (
     refuse_lake,
 )
 from tracklake.pipeline.lake.live_folders import find_false_copies
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.quality_reports.gates.gate import parse_gate
 from tracklake.schemas.text import quote_shell
 
@@ -51,6 +52,8 @@ def check(
     json: JsonOption = False,
 ) -> None:
     """Compare every file with its checksum, and judge quality gates such as "error_share > 0.05".
+
+    On an object store, sizes are compared; contents are when they are received.
 
     Damaged files are made again by the next run. Catalog and folders are brought up to date where they are not.
 
@@ -117,7 +120,8 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
     elif left:
         terminal.print_problem(f"{len(left)} copies are damaged: run `tracklake check` again later")
     else:
-        terminal.print_line(f"{len(files):,} files ({size / 1e6:,.1f} MB): all as they were written")
+        state = "all as they were written" if find_origin(root) is None else "all there, with their sizes"
+        terminal.print_line(f"{len(files):,} files ({size / 1e6:,.1f} MB): {state}")
     return [*damaged, *left]
 
 
@@ -140,4 +144,6 @@ def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), c
 def _advise(root: Path, manifest: Manifest) -> str:
     """Return the command that makes damaged files again."""
     source = quote_shell(manifest.ingested_from[-1]) if manifest.ingested_from else "SOURCE"
-    return f"They are made again by `tracklake run {source} --lake {quote_shell(root)}`."
+    origin = find_origin(root)
+    lake = quote_shell(root if origin is None else origin.address)
+    return f"They are made again by `tracklake run {source} --lake {lake}`."

@@ -15,6 +15,7 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.logs import LOG, open_log
 from tracklake.pipeline.lake import follow_move
 from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.working_copy import locate_origin, refresh_copy
 from tracklake.pipeline.settings import DEBUG, Settings, find_unknown_variables, read_sources
 from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
 from tracklake.schemas.text import make_visible
@@ -107,9 +108,17 @@ def read_settings(
 ) -> Settings:
     """Read the settings from files and environment, flags on top; a moved lake gets its catalog again.
 
+    Args:
+        lake: the lake; this and the next ones are options of the command line.
+        workers: recordings worked on at once.
+        protocol: name of the protocol.
+        columns: mapping of columns.
+        recording: name of the recording.
+        in_folder: whether the lake must be in a folder; of one on an object store, its copy is brought up to date.
+
     Raises:
         SettingError: a setting is unknown, out of its bounds or cannot be read.
-        UsageError: the lake is on an object store, and the command needs one in a folder (`in_folder`).
+        LakeError: no lake is at the address.
     """
     flags: dict[str, Any] = {"lake": lake, "workers": workers, "protocol": protocol}
     # Absolute, so that a worker in another folder finds the same file.
@@ -119,11 +128,24 @@ def read_settings(
     for source in read_sources(given) if LOG.isEnabledFor(logging.DEBUG) else ():
         if source.values:
             LOG.debug("settings from %s: %s", source.name, source.values)
+    if in_folder and find_address(settings.lake) is not None:
+        origin = locate_origin(settings.lake, settings.cache, settings.cache_gb)
+        assert origin is not None
+        return settings.model_copy(update={"lake": refresh_copy(origin)})
+    follow_move(settings.lake)
+    return settings
+
+
+def refuse_address(settings: Settings) -> Path:
+    """Return the folder of a lake.
+
+    Raises:
+        UsageError: it is on an object store.
+    """
     address = find_address(settings.lake)
-    if address is not None and in_folder:
+    if address is not None:
         raise UsageError(
             f"{address}: this command works on a lake in a folder. Copy the lake to one by `tracklake fetch {address} "
             "--lake DIR`, name it by --lake DIR here, and send the result back by `tracklake publish store`."
         )
-    follow_move(settings.lake)
-    return settings
+    return settings.lake

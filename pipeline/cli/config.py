@@ -33,7 +33,7 @@ def config(
     """
     with command(json=json) as terminal:
         given = {"lake": lake, "protocol": protocol, "workers": workers}
-        settings = read_settings(lake=lake, protocol=protocol, workers=workers)
+        settings = read_settings(lake=lake, protocol=protocol, workers=workers, in_folder=False)
         rows = _list_settings(settings, {name: value for name, value in given.items() if value is not None})
         files = list_files(settings.lake)
         terminal.print_line(

@@ -10,7 +10,7 @@ from typing import Any
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.drives import list_drives, print_drives
-from tracklake.pipeline.cli.options import AnyLakeOption, JsonOption, ProtocolOption
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.ingest.staleness import StageState, describe_stages
 from tracklake.pipeline.lake import Manifest, connect, load
@@ -29,7 +29,7 @@ MAX_REASONS = 3
 """Most reasons of one stage that are printed; --json has all."""
 
 
-def info(lake: AnyLakeOption = None, protocol: ProtocolOption = None, json: JsonOption = False) -> None:
+def info(lake: LakeOption = None, protocol: ProtocolOption = None, json: JsonOption = False) -> None:
     """Show a lake's recordings, stages, what is stale and why, and sizes on disk.
 
     Stages are compared with the settings in force. Raw files are compared by size and time of change.

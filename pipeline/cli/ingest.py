@@ -6,10 +6,10 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import (
-    AnyLakeOption,
     ColumnsOption,
     DatasetOption,
     JsonOption,
+    LakeOption,
     PruneOption,
     QuietOption,
     RebuildOption,
@@ -22,7 +22,7 @@ from tracklake.pipeline.cli.session import report_result, run_steps, work_in_fol
 
 def ingest(
     source: Annotated[str, typer.Argument(metavar="SOURCE", help="A raw file, or a folder of any mix of them.")],
-    lake: AnyLakeOption = None,
+    lake: LakeOption = None,
     dataset: DatasetOption = None,
     columns: ColumnsOption = None,
     recording: RecordingOption = None,

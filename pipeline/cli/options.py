@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-LakeOption = Annotated[
+FolderOption = Annotated[
     Path | None, typer.Option("--lake", metavar="DIR", help="Folder of the lake (or TRACKLAKE_LAKE; default: lake).")
 ]
-AnyLakeOption = Annotated[
+LakeOption = Annotated[
     Path | None,
     typer.Option(
         "--lake",

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.command import command, read_settings, refuse_address
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
+from tracklake.pipeline.cli.options import FolderOption, JsonOption, QuietOption
 from tracklake.pipeline.lake.ducklake import publish_ducklake
 from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.lake.publication import Transfer, fetch_lake, publish_lake
@@ -31,7 +31,7 @@ AddressArgument = Annotated[str, typer.Argument(metavar="ADDRESS", help="For ins
 @publish.command()
 def store(
     address: AddressArgument,
-    lake: LakeOption = None,
+    lake: FolderOption = None,
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace another lake there, or results that this one lacks.")
     ] = False,
@@ -44,20 +44,20 @@ def store(
     """
     with command(quiet=quiet, json=json) as terminal:
         place = require_address(address)
-        root = read_settings(lake=lake).lake
+        root = refuse_address(read_settings(lake=lake, in_folder=False))
         done = publish_lake(root, place, replace_other=replace)
         _show_transfer(terminal, "published", done, root, place)
 
 
 @publish.command()
-def ducklake(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOption = False) -> None:
+def ducklake(lake: FolderOption = None, quiet: QuietOption = False, json: JsonOption = False) -> None:
     """Write catalog.ducklake beside the lake's files: a frozen DuckLake catalog of the tables as they are now.
 
     Any DuckDB reads it by ATTACH 'ducklake:LAKE/catalog.ducklake' (READ_ONLY), as long as the lake keeps the generation
     that it shows (setting kept_generations). It names files by their full path: write it again after moving the lake.
     """
     with command(quiet=quiet, json=json) as terminal:
-        done = publish_ducklake(read_settings(lake=lake).lake)
+        done = publish_ducklake(refuse_address(read_settings(lake=lake, in_folder=False)))
         terminal.print_line(
             f"{done.path}: generation {done.generation}, {done.tables} tables with rows in {done.files:,} files"
         )
@@ -66,7 +66,7 @@ def ducklake(lake: LakeOption = None, quiet: QuietOption = False, json: JsonOpti
 
 def fetch(
     address: AddressArgument,
-    lake: LakeOption = None,
+    lake: FolderOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -76,7 +76,7 @@ def fetch(
     """
     with command(quiet=quiet, json=json) as terminal:
         place = require_address(address)
-        root = read_settings(lake=lake).lake
+        root = refuse_address(read_settings(lake=lake, in_folder=False))
         _show_transfer(terminal, "fetched", fetch_lake(place, root), root, place)
 
 

@@ -7,6 +7,7 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
+from tracklake.pipeline.cli.session import work_in_folder
 from tracklake.pipeline.ingest.removal import describe_sizes, remove_recordings
 
 
@@ -18,8 +19,9 @@ def remove(
 ) -> None:
     """Take recordings out of the lake, with all that was made of them; raw files stay."""
     with command(quiet=quiet, json=json) as terminal:
-        root = read_settings(lake=lake).lake
-        removed, outdated = remove_recordings(root, recordings)
+        named = read_settings(lake=lake, in_folder=False)
+        with work_in_folder(terminal, named) as settings:
+            removed, outdated = remove_recordings(settings.lake, recordings)
         for recording in removed:
             terminal.print_line(
                 f"removed {recording.name}: {', '.join(recording.subsets)}; {describe_sizes([recording])}"
@@ -33,5 +35,5 @@ def remove(
                 f"note: {', '.join(outdated)} were made of it and are removed, too; `tracklake run` makes them again"
             )
         terminal.print_json(
-            {"lake": root, "removed": [asdict(recording) for recording in removed], "outdated": outdated}
+            {"lake": named.lake, "removed": [asdict(recording) for recording in removed], "outdated": outdated}
         )

@@ -6,7 +6,7 @@ import typer
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption, WorkersOption
-from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 
 
 def repair(
@@ -20,6 +20,6 @@ def repair(
 ) -> None:
     """Find late starts and estimate what is missing of them."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers)
         steps = ("repair", "assess", "report") if assess else ("repair",)
-        report_result(terminal, settings, run_steps(terminal, settings, steps), headline=False, assess=assess)
+        with work_in_folder(terminal, read_settings(lake=lake, workers=workers, in_folder=False)) as settings:
+            report_result(terminal, settings, run_steps(terminal, settings, steps), headline=False, assess=assess)

@@ -7,10 +7,10 @@ import typer
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.generated_sample import provide_sample, refuse_mixing
 from tracklake.pipeline.cli.options import (
-    AnyLakeOption,
     ColumnsOption,
     DatasetOption,
     JsonOption,
+    LakeOption,
     MinutesOption,
     ProtocolOption,
     PruneOption,
@@ -30,7 +30,7 @@ def run(
     source: Annotated[
         str | None, typer.Argument(metavar="[SOURCE]", help="A raw file or a folder of them; none: a generated sample.")
     ] = None,
-    lake: AnyLakeOption = None,
+    lake: LakeOption = None,
     dataset: DatasetOption = None,
     columns: ColumnsOption = None,
     recording: RecordingOption = None,

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from tracklake.pipeline.cli.command import command, read_settings
-from tracklake.pipeline.cli.options import LakeOption
+from tracklake.pipeline.cli.command import command, read_settings, refuse_address
+from tracklake.pipeline.cli.options import FolderOption
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 
 MIN_INTERVAL_S = 1.0
@@ -18,7 +18,7 @@ def serve(
     source: Annotated[
         Path | None, typer.Argument(metavar="[SOURCE]", help="A raw file, or a folder to watch with a schedule.")
     ] = None,
-    lake: LakeOption = None,
+    lake: FolderOption = None,
     cron: Annotated[
         str | None, typer.Option("--cron", help="When to run the pipeline on SOURCE, such as '0 3 * * *'.")
     ] = None,
@@ -33,7 +33,7 @@ def serve(
             raise typer.BadParameter("give --cron or --interval, not both")
         if source is None and (cron is not None or interval is not None):
             raise typer.BadParameter("--cron and --interval need SOURCE, the file or folder to run on")
-        settings = read_settings(lake=lake)
+        place = refuse_address(read_settings(lake=lake, in_folder=False))
         import_flows()
         deployments = import_module("tracklake.pipeline.orchestration.deployments")
-        deployments.serve_deployments(settings.lake, source, cron, interval)
+        deployments.serve_deployments(place, source, cron, interval)

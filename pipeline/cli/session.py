@@ -15,10 +15,11 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import require_choice
 from tracklake.pipeline.cli.summary import show_assessment, show_headline, show_result
 from tracklake.pipeline.ingest.discovery import Discovery
-from tracklake.pipeline.lake import LakeError, load, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake import LakeError, LakeFile, load, refuse_foreign, refuse_if_busy
 from tracklake.pipeline.lake.files import REPORTS
-from tracklake.pipeline.lake.object_store import find_address
-from tracklake.pipeline.lake.working_copy import WorkingCopy, name_copy
+from tracklake.pipeline.lake.origin import Origin
+from tracklake.pipeline.lake.transfers import fetch_files
+from tracklake.pipeline.lake.working_copy import hold_copy, list_report, locate_origin
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult, conclude_idle, plan_run, survey_source
 from tracklake.pipeline.settings import Settings, list_files
@@ -91,31 +92,36 @@ def run_steps(
 
 @contextmanager
 def work_in_folder(terminal: Terminal, settings: Settings, *, rebuild: bool = False) -> Iterator[Settings]:
-    """Yield settings with the lake in a folder; of a lake on an object store its copy, which is published at the end.
+    """Yield settings with the lake in a folder; of a lake on an object store its copy, while no other works on it.
 
-    After Ctrl-C or an error nothing is published, and the same command goes on with what the copy holds by then.
+    What is made there is committed at the store as it is made. After Ctrl-C or an error the same command goes on.
     """
-    address = find_address(settings.lake)
-    if address is None:
+    origin = locate_origin(settings.lake, settings.cache, settings.cache_gb)
+    if origin is None or settings.lake == origin.copy:
         yield settings
         return
-    copy = WorkingCopy(address, name_copy(address, settings.cache))
-    terminal.print_line(f"working in {copy.folder}, a copy of {address}", style="dim")
-    with terminal.hold_json(), copy.hold(is_rebuild=rebuild) as received:
-        if received is not None and received.files:
-            terminal.print_line(f"fetched {received.files:,} files, {received.bytes / 1e6:,.1f} MB", style="dim")
+    terminal.print_line(f"working in {origin.copy}, a copy of {origin.address}", style="dim")
+    with terminal.hold_json(), hold_copy(origin, is_rebuild=rebuild) as folder:
+        before = _list_files(folder)
         try:
-            yield settings.model_copy(update={"lake": copy.folder})
+            yield settings.model_copy(update={"lake": folder})
         except typer.Exit:  # some files were refused, or a stage failed: what is done counts, as in a folder
-            _publish(terminal, copy, rebuild)
+            _show_sent(terminal, origin, before)
             raise
-        _publish(terminal, copy, rebuild)
+        _show_sent(terminal, origin, before)
 
 
-def _publish(terminal: Terminal, copy: WorkingCopy, rebuilt: bool) -> None:
-    sent = copy.publish(rebuilt=rebuilt)
-    if sent is not None:
-        terminal.print_line(f"published {copy.address}: {sent.files:,} files, {sent.bytes / 1e6:,.1f} MB")
+def _list_files(lake: Path) -> set[LakeFile]:
+    with suppress(LakeError):
+        return {file for commit in load(lake).commits.values() for file in commit.all_files}
+    return set()
+
+
+def _show_sent(terminal: Terminal, origin: Origin, before: set[LakeFile]) -> None:
+    sent = _list_files(origin.copy) - before
+    terminal.print_line(
+        f"published {origin.address}: {len(sent):,} files, {sum(file.bytes for file in sent) / 1e6:,.1f} MB"
+    )
 
 
 @contextmanager
@@ -181,8 +187,10 @@ def report_result(
     show_result(terminal, result)
     reports = settings.lake / REPORTS
     record: dict[str, Any] = {"lake": settings.lake, **asdict(result)}
-    usable = bool(load(settings.lake).of_stage("ingest"))
+    manifest = load(settings.lake)
+    usable = bool(manifest.of_stage("ingest"))
     if usable and headline and (reports / DOCUMENT).exists():
+        fetch_files(settings.lake, list_report(manifest))
         quality = read_quality(settings.lake)
         show_headline(terminal, quality, reports / PAGE, settings.lake)
         record |= {"report": (reports / PAGE).resolve(), **{key: quality[key] for key in ("headline", "model_scores")}}

@@ -17,7 +17,7 @@ from tracklake.pipeline.cli.options import (
     WorkersOption,
     require_choice,
 )
-from tracklake.pipeline.cli.session import report_result, run_steps
+from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 from tracklake.pipeline.cli.tables import print_table
 from tracklake.pipeline.ingest.discovery import recognise
 from tracklake.pipeline.lake import refuse_lake
@@ -78,11 +78,12 @@ def split(
 ) -> None:
     """Divide the subsets into train and eval."""
     with command(quiet=quiet, json=json) as terminal:
-        settings = read_settings(lake=lake, workers=workers, protocol=protocol)
+        settings = read_settings(lake=lake, workers=workers, protocol=protocol, in_folder=False)
         if plan is None:
             if exclude or published or out is not None or format != "table":
                 raise typer.BadParameter("--exclude, --published, --format and --out go with --plan FOLDER")
-            report_result(terminal, settings, run_steps(terminal, settings, ("split",)), headline=False)
+            with work_in_folder(terminal, settings) as found:
+                report_result(terminal, found, run_steps(terminal, found, ("split",)), headline=False)
             return
         require_choice("--format", format, FORMATS)
         if published is not None:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO, TypeVar, cast
 import polars as pl
 import typer
 
-from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.command import command, read_settings, refuse_address
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import AnyLakeOption, require_choice
+from tracklake.pipeline.cli.options import LakeOption, require_choice
 from tracklake.pipeline.cli.tables import GAP, cut_text, print_table
 from tracklake.pipeline.lake import LakeResult, connect, refuse_lake
 from tracklake.pipeline.lake import query as run_query
@@ -63,7 +63,7 @@ def sql(
     query: Annotated[
         str | None, typer.Argument(help="One SELECT; `-` reads it from standard input. With --list: a name.")
     ] = None,
-    lake: AnyLakeOption = None,
+    lake: LakeOption = None,
     format: Annotated[
         str | None,
         typer.Option(
@@ -93,7 +93,7 @@ def sql(
             return
         refuse_lake(out)
         if query is None and out is not None and out.suffix == DATABASE:
-            root = read_settings(lake=lake).lake
+            root = refuse_address(read_settings(lake=lake, in_folder=False))
             write_output(out, build_catalog(root, load_as_of(root, as_of)))
             return
         if query is None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.console import Terminal
-from tracklake.pipeline.cli.options import AnyLakeOption, JsonOption, ProtocolOption, QuietOption, WorkersOption
+from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
 from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 from tracklake.pipeline.cli.summary import show_reconstruction
 from tracklake.pipeline.stages.registry import STAGES
@@ -18,7 +18,7 @@ def _make_command(name: str, *others: str, show: Callable[[Terminal, Path], None
     """
 
     def run_stage(
-        lake: AnyLakeOption = None,
+        lake: LakeOption = None,
         protocol: ProtocolOption = None,
         workers: WorkersOption = None,
         quiet: QuietOption = False,

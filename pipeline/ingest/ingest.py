@@ -16,6 +16,7 @@ from tracklake.pipeline.ingest.memory_budget import MemoryBudget
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_table
 from tracklake.pipeline.lake.catalog import ADDED
 from tracklake.pipeline.lake.files import STAGING
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.sources import SOURCES, RawFile, Source, SourceError
 from tracklake.pipeline.sources.accounting import account_rows
 from tracklake.pipeline.sources.csv import measure_unpacked
@@ -61,8 +62,12 @@ def _find_contents(source: Source, file: RawFile, manifest: Manifest) -> dict[st
 
 
 def locate_spill(root: Path, file: RawFile) -> Path:
-    """Return the folder where a file's rows wait, by recording, for the length of a writing session."""
-    return root / STAGING / "spilled" / file.sha256
+    """Return the folder where a file's rows wait, by recording, for the length of a writing session.
+
+    Of a lake on an object store it is one that all workers of a machine share.
+    """
+    origin = find_origin(root)
+    return (root / STAGING if origin is None else origin.staging) / "spilled" / file.sha256
 
 
 def read_file(root: Path, dataset: str, file: RawFile) -> dict[str, Any]:
@@ -218,10 +223,13 @@ def build(root: Path, job: Job, slice_entries: int = 2_000_000) -> Commit:
         SourceError, schemas.StructureError: the recording cannot be used.
     """
     started = time.perf_counter()
-    recording, files = job.inputs["recording"], list_files(job)
+    recording, files, spilled = job.inputs["recording"], list_files(job), list_spilled(job)
+    for file in spilled:
+        if not locate_spill(root, file).exists():  # a worker on another machine has read it
+            read_file(root, job.inputs["dataset"], file)
     if recording is None:
         tables, info = _build_unassigned(root, job, files[0])
-    elif spilled := list_spilled(job):
+    elif spilled:
         parts = [_open_spilled(root, file, recording) if file in spilled else Part(file) for file in files]
         parts = [replace(part, slice_entries=slice_entries) for part in parts]
         tables, info = _build_recording(root, job, parts)

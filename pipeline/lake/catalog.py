@@ -7,7 +7,7 @@ stored in it. A lake that was moved or copied gets another catalog when tracklak
 
 import re
 import tempfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,8 +19,10 @@ from tracklake.pipeline.lake.errors import LakeError
 from tracklake.pipeline.lake.files import STAGING, read_partition
 from tracklake.pipeline.lake.macros import MACROS
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest
-from tracklake.pipeline.lake.object_access import FileLocations, quote
+from tracklake.pipeline.lake.object_access import READABLE, FileLocations, admit_place, quote
+from tracklake.pipeline.lake.origin import Origin, find_origin
 from tracklake.pipeline.lake.places import LakePlace
+from tracklake.pipeline.lake.transfers import fetch_objects
 from tracklake.schemas import SUBSET_STATUS, SUBSETS, TABLES, VEHICLE_STARTS, VEHICLES, Table
 from tracklake.schemas.columns import Column
 from tracklake.schemas.files import write_file
@@ -155,12 +157,26 @@ def create_views(connection: "duckdb.DuckDBPyConnection", place: LakePlace, mani
     Raises:
         LakeError: a live file is missing or unreadable.
     """
+    if isinstance(place, Path) and (origin := find_origin(place)) is not None:
+        _admit_origin(connection, place, origin, [file for table in TABLES for file in manifest.live(table.name)])
     connection.begin()
     for name, select in _write_selects(place, manifest).items():
         _create(connection, place, name, f'CREATE VIEW "{name}" AS {select}')
     for macro in MACROS:
         connection.execute(macro.statement)
     connection.commit()
+
+
+def _admit_origin(
+    connection: "duckdb.DuckDBPyConnection", root: Path, origin: Origin, files: Sequence[LakeFile]
+) -> None:
+    """Let a connection read the files that a folder with a part of a lake lacks, where they are."""
+    locations = FileLocations(root)
+    lacking = [file for file in files if locations.find(file).startswith(origin.address)]
+    if lacking and origin.address.startswith(READABLE):
+        admit_place(connection, origin.address)
+    else:
+        fetch_objects(origin, lacking)
 
 
 def describe_views(connection: "duckdb.DuckDBPyConnection") -> None:

@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 from tracklake.pipeline.lake.errors import DamagedFileError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest
+from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.origin import find_origin
+from tracklake.pipeline.lake.places import open_store
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.text import quote_shell
 
@@ -45,10 +48,13 @@ def forget_checksums() -> None:
 
 
 def verify_files(root: Path, files: Iterable[LakeFile]) -> None:
-    """Refuse files whose content is not what was committed; each is read once per process."""
+    """Refuse files whose content is not what was committed; each is read once per process.
+
+    Those that a folder with a part of a lake lacks are compared when they are received.
+    """
     for file in files:
         reason = find_damage(root, file)
-        if reason is not None:
+        if reason is not None and ((root / file.path).exists() or find_origin(root) is None):
             lake = quote_shell(root)
             raise DamagedFileError(
                 f"{root / file.path}: damaged ({reason}). `tracklake check --lake {lake}` finds all such files; then "
@@ -71,7 +77,22 @@ def find_damage(root: Path, file: LakeFile, *, again: bool = False) -> str | Non
 
 
 def find_damaged_files(root: Path, manifest: Manifest) -> list[DamagedFile]:
-    """Return every live file that is damaged; all with a checksum are read, whatever was read before."""
+    """Return every live file that is damaged; all with a checksum are read, whatever was read before.
+
+    Of a lake on an object store, objects are looked for: they are compared with their checksums when they are received.
+    """
+    if (origin := find_origin(root)) is not None:
+        return _find_damaged_objects(origin.address, manifest)
     live = ((commit.key, file) for commit in manifest.commits.values() for file in commit.all_files if file.sha256)
     found = ((key, file.path, find_damage(root, file, again=True)) for key, file in live)
     return sorted(DamagedFile(key, path, reason) for key, path, reason in found if reason is not None)
+
+
+def _find_damaged_objects(address: str, manifest: Manifest) -> list[DamagedFile]:
+    there = {item.path: item.bytes for item in open_store(address).list()}
+    live = ((commit.key, file, name_object(file)) for commit in manifest.commits.values() for file in commit.all_files)
+    return sorted(
+        DamagedFile(key, name, f"expected {file.bytes:,} bytes, got {there.get(name, 'no object')}")
+        for key, file, name in live
+        if there.get(name) != file.bytes
+    )

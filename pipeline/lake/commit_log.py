@@ -66,7 +66,12 @@ class CommitLog:
             try:
                 self._swap(manifest)
             except SwapConflictError:
-                manifest = self._rebase(manifest)
+                known = {**vars(self)}
+                try:
+                    manifest = self._rebase(manifest)
+                except LakeError:  # what others did is no part of what the caller knows: it must not undo it later
+                    vars(self).update(known)
+                    raise
             else:
                 return manifest
         raise LakeError(

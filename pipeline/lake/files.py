@@ -17,7 +17,9 @@ from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.errors import DamagedFileError, LakeMissingError
 from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.pipeline.lake.object_access import FileLocations, get_polars_options
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.places import LakePlace
+from tracklake.pipeline.lake.transfers import fetch_objects
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import sync
@@ -269,19 +271,20 @@ def scan(place: LakePlace, manifest: Manifest, table: Table, **values: str) -> p
     if others:
         raise ValueError(f"{table.name} has no partition {', '.join(sorted(others))}; filter its rows instead")
     # Not by the reader's hive option: that takes `name=value` folders above the lake for partitions, too.
+    stated = {file: read_partition(table, file.path) for file in manifest.live(table.name)}
+    stated = {file: own for file, own in stated.items() if values.items() <= own.items()}
+    if isinstance(place, Path) and (origin := find_origin(place)) is not None:
+        fetch_objects(origin, [file for file in stated if not (place / file.path).exists()])
     locations = FileLocations(place)
     by_values: dict[tuple[tuple[str, str], ...], list[str]] = {}
-    for file in manifest.live(table.name):
-        stated = read_partition(table, file.path)
-        if values.items() <= stated.items():
-            content = locations.find(file)
-            if isinstance(place, Path) and not Path(content).is_file():
-                raise DamagedFileError(
-                    f"{content}: a live file of the lake is missing; `tracklake run SOURCE --lake "
-                    f"{quote_shell(place)}` on "
-                    "the raw files makes it again"
-                )
-            by_values.setdefault(tuple(stated.items()), []).append(content)
+    for file, own in stated.items():
+        content = locations.find(file)
+        if isinstance(place, Path) and not Path(content).is_file():
+            raise DamagedFileError(
+                f"{content}: a live file of the lake is missing; `tracklake run SOURCE --lake {quote_shell(place)}` on "
+                "the raw files makes it again"
+            )
+        by_values.setdefault(tuple(own.items()), []).append(content)
     if not by_values:
         return table.empty().lazy()
     stored = {name: dtype for name, dtype in table.dtypes.items() if name not in table.partition}
@@ -290,18 +293,19 @@ def scan(place: LakePlace, manifest: Manifest, table: Table, **values: str) -> p
         options |= {"storage_options": get_polars_options(place), "credential_provider": None}
     return pl.concat(
         pl.scan_parquet(paths, hive_partitioning=False, glob=False, **options)
-        .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in stated)
+        .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in own)
         .select(*table.dtypes)
-        for stated, paths in by_values.items()
+        for own, paths in by_values.items()
     )
 
 
 def is_intact(root: Path, files: Iterable[LakeFile]) -> bool:
-    """Return whether files are in the lake with the size they were committed with."""
+    """Return whether files are in the lake with the size they were committed with; or are on a store, as committed."""
     try:
-        return all((root / file.path).stat().st_size == file.bytes for file in files)
+        is_here = all((root / file.path).stat().st_size == file.bytes for file in files)
     except (FileNotFoundError, NotADirectoryError):
-        return False
+        is_here = False
+    return is_here or find_origin(root) is not None
 
 
 def remove_orphans(root: Path, manifest: Manifest) -> int:

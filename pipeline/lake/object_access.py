@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tracklake.pipeline.lake.errors import StoreError
 from tracklake.pipeline.lake.manifest import LakeFile
 from tracklake.pipeline.lake.object_store import find_endpoint
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.places import LakePlace
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 EXTENSIONS = ("httpfs", "aws")
 """Extensions of DuckDB that read object stores, and find the credentials for them; each is a Python package."""
+READABLE = "s3://"
+"""Beginning of the addresses that DuckDB reads."""
 SECRET_SETTINGS = ("s3_access_key_id", "s3_secret_access_key", "s3_session_token")
 """Settings into which httpfs copies credentials of the environment, where every query could read them."""
 UNSIGNED = "AWS_SKIP_SIGNATURE"
@@ -55,11 +58,15 @@ class FileLocations:
 
     def __init__(self, place: LakePlace) -> None:
         self._is_remote = isinstance(place, str)
+        self._origin = None if isinstance(place, str) else find_origin(place)
         # With slashes on Windows, too, as DuckDB takes it for partitions.
         self.root = place if isinstance(place, str) else place.resolve().as_posix()
 
     def find(self, file: LakeFile) -> str:
-        """Return the path or address of a file's content."""
+        """Return the path or address of a file's content; in a folder with a part of a lake, where it is now."""
+        if self._origin is not None and not Path(self.root, file.path).exists():
+            kept = self._origin.objects / name_object(file)
+            return kept.as_posix() if kept.exists() else f"{self._origin.address}/{name_object(file)}"
         return f"{self.root}/{name_object(file) if self._is_remote else file.path}"
 
 
@@ -106,8 +113,10 @@ def admit_place(connection: "duckdb.DuckDBPyConnection", place: LakePlace) -> No
     import duckdb
 
     endpoint = find_endpoint(place)
-    if endpoint.scheme != "s3":
-        raise StoreError(f"{place}: DuckDB reads s3:// only. Copy the lake to a folder first (docs/object-store.md).")
+    if not place.startswith(READABLE):
+        raise StoreError(
+            f"{place}: DuckDB reads {READABLE} only. Copy the lake to a folder first (docs/object-store.md)."
+        )
     for name in EXTENSIONS:
         connection.execute(f"LOAD {quote(str(find_extension(name, 'object-store')))}")
     for setting in SECRET_SETTINGS:

@@ -5,46 +5,30 @@ that no other writer has replaced it: the moment at which readers see the new st
 """
 
 import json
-import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from tracklake.pipeline.lake.checksums import find_damage, hash_file, verify_files
+from tracklake.pipeline.lake import object_folder
+from tracklake.pipeline.lake.checksums import find_damage, verify_files
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import (
-    AlreadyStoredError,
-    DamagedFileError,
     DamagedShardError,
     LakeError,
-    LakeMissingError,
     LakeVersionError,
     MissingObjectError,
     StoreError,
 )
 from tracklake.pipeline.lake.files import STORE, TENSORS
-from tracklake.pipeline.lake.history import ROOTS, list_roots, name_root, read_kept_root
-from tracklake.pipeline.lake.lease import LEASE
-from tracklake.pipeline.lake.manifest import (
-    MANIFEST,
-    Commit,
-    LakeFile,
-    Manifest,
-    collect_document,
-    load,
-    make_foreign_error,
-    parse_manifest,
-    read_root,
-)
-from tracklake.pipeline.lake.object_access import DIGEST_DIGITS, name_object
-from tracklake.pipeline.lake.object_store import PROBES, refuse_unconditional
+from tracklake.pipeline.lake.manifest import MANIFEST, Commit, LakeFile, Manifest, load, read_root
+from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.object_folder import claim_place, sweep_objects
 from tracklake.pipeline.lake.places import LakePlace, open_store
-from tracklake.pipeline.lake.shards import parse_shards
 from tracklake.pipeline.lake.store import Store
+from tracklake.pipeline.lake.transfers import receive_file, seal_commit, transfer
 from tracklake.pipeline.lake.writer import hold_lock, open_for_writing, refuse_foreign
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.errors import TracklakeError
@@ -52,23 +36,10 @@ from tracklake.schemas.files import write_file
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.text import quote_shell
 
-T = TypeVar("T")
-
-MARKER = ".tracklake"
-"""First object of a lake on an object store, with the lake's id: what else is there was put there by us."""
 SYNCED = ".synced"
 """File of a lake in a folder: checksums of both manifests when they last agreed, by address."""
 FETCHING = ".fetching"
 """File of a folder into which a lake is being fetched for the first time: what else is there was put there by us."""
-GRACE = timedelta(days=1)
-"""Time for which objects that are no longer needed are kept, for readers of an earlier state and for other writers."""
-OWN_OBJECTS = re.compile(
-    r"manifest/[0-9a-f]{64}\.json|manifest/roots/\d+\.json|\.probe-[^/]*"
-    rf"|(\.files|tensors|reports|models)/.*\.[0-9a-f]{{{DIGEST_DIGITS}}}(\.[^./]*)?"
-)
-"""Names of the objects that a lake makes and may delete. Others stay, also those of a lake in a folder below it."""
-TRANSFERS = 8
-"""Files that are sent or received at once."""
 
 
 class Transfer(NamedTuple):
@@ -106,7 +77,7 @@ def publish_lake(root: Path, address: str, *, replace_other: bool = False, expec
         )
     is_same = log.manifest.lake_id == manifest.lake_id
     before = log.manifest if is_same else Manifest(manifest.lake_id, generation=generation)
-    sealed = replace(manifest, commits={key: _seal(root, commit) for key, commit in manifest.commits.items()})
+    sealed = replace(manifest, commits={key: seal_commit(root, commit) for key, commit in manifest.commits.items()})
     if not (replace_other or is_synced(root, address, remote=True) or _includes(sealed, before)):
         if not _includes(before, sealed):
             raise LakeError(_describe_fork(root, address))
@@ -172,73 +143,6 @@ def fetch_lake(address: str, root: Path) -> Transfer:
     return Transfer(len(received), sum(file.bytes for file in received), 0, theirs.generation)
 
 
-def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = False) -> None:
-    """Make sure that a place on an object store is a lake's own, before anything else is written there.
-
-    Args:
-        store: the place.
-        lake_id: lake that is to be there; None: any, as where it is not made yet, and nothing is written.
-        replace_other: whether it may take the place of another lake.
-
-    Raises:
-        StoreError: the store ignores the conditions of writes.
-        LakeError: another lake or something else is there.
-    """
-    try:
-        owner = read_root(store.place).get("lake_id")
-        if not isinstance(owner, str):
-            raise make_foreign_error(store.place, ValueError("no lake_id in it"))
-    except LakeMissingError:
-        owner = _read_marker(store)
-    if owner is None:
-        other = next((item for item in store.list() if item.path != LEASE and not item.path.startswith(PROBES)), None)
-        if other is not None:
-            raise LakeError(
-                f"{store.place}: holds other objects, such as {other.path}, and no lake. Name an empty or new folder "
-                "of the bucket."
-            )
-    elif lake_id not in (None, owner) and not replace_other:
-        raise LakeError(
-            f"{store.place}: holds another lake ({owner}). Name another folder of the bucket, or give --replace to put "
-            "this one in its place."
-        )
-    refuse_unconditional(store)
-    if owner is None and lake_id is not None:
-        try:
-            store.put_new(MARKER, lake_id.encode())
-        except AlreadyStoredError:
-            raise LakeError(f"{store.place}: another process has just put a lake there. Run again.") from None
-
-
-def _read_marker(store: Store) -> str | None:
-    """Return the id of the lake whose first publication was broken off, if there was one."""
-    try:
-        return store.get(MARKER)[0].decode(errors="replace")
-    except MissingObjectError:
-        return None
-
-
-def sweep_objects(address: str) -> int:
-    """Delete the objects of a lake that none of its kept states needs; returns how many.
-
-    States are kept as in a folder, and for a day. What is younger than a day is kept, too: another writer may be about
-    to commit it.
-    """
-    store = open_store(address)
-    objects = [*store.list()]
-    young = {item.path for item in objects if item.modified > datetime.now(UTC) - GRACE}
-    others = (read_kept_root(store, path) for path in young if path.startswith(f"{ROOTS}/"))
-    needed = {MANIFEST, MARKER, LEASE}
-    for document in (*list_roots(address), *(each for each in others if each is not None)):
-        needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
-        commits = parse_manifest(address, collect_document(address, document)).commits.values()
-        needed |= {name_object(file) for commit in commits for file in commit.all_files}
-    old = {item for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)}
-    old &= {*store.list()} if old else set()  # what another writer has sent again meanwhile has another time
-    store.delete(item.path for item in old)
-    return len(old)
-
-
 def _open_log(address: str, *, replace_other: bool) -> tuple[CommitLog, int]:
     """Return what is stored at an address, and its generation; what cannot be read counts as nothing if it may go."""
     try:
@@ -262,22 +166,6 @@ def _describe_fork(root: Path, address: str) -> str:
         f"`tracklake fetch {quote_shell(address)} --lake OTHER`, make what is missing there by `tracklake run SOURCE "
         f"--lake OTHER`, and publish that one. {root} can be deleted then."
     )
-
-
-def _seal(root: Path, commit: Commit) -> Commit:
-    """Return a commit in which every file has a checksum, also those that may change, as they are now."""
-
-    def seal(file: LakeFile) -> LakeFile:
-        if file.sha256 is not None:
-            return file
-        try:
-            return replace(file, bytes=(root / file.path).stat().st_size, sha256=hash_file(root / file.path))
-        except FileNotFoundError:
-            raise DamagedFileError(
-                f"{root / file.path}: is missing. `tracklake run SOURCE --lake {quote_shell(root)}` makes it again."
-            ) from None
-
-    return replace(commit, files={table: [seal(file) for file in files] for table, files in commit.files.items()})
 
 
 def _unseal(commit: Commit) -> Commit:
@@ -320,46 +208,24 @@ def _upload(store: Store, root: Path, live: Mapping[str, LakeFile], kept: Collec
         store.upload(name, root / live[name].path)
 
     missing = _find_missing(store, live, kept)
-    _transfer(send, missing)
+    transfer(send, missing)
     if missing and (lost := _find_missing(store, live, live)):
         raise StoreError(f"{store.place}/{lost[0]}: was deleted while the lake was published. Run the command again.")
     return [live[name] for name in missing]
 
 
 def _find_missing(store: Store, live: Mapping[str, LakeFile], kept: Collection[str]) -> list[str]:
-    recent = datetime.now(UTC) - GRACE / 2
+    recent = datetime.now(UTC) - object_folder.GRACE / 2
     there = {item.path: item.bytes for item in store.list() if item.path in kept or item.modified >= recent}
     return [name for name, file in live.items() if there.get(name) != file.bytes]
 
 
 def _download(store: Store, root: Path, live: Iterable[LakeFile]) -> list[LakeFile]:
     """Receive the files that a folder lacks, or has with other content."""
-
-    def receive(file: LakeFile) -> None:
-        target = root / file.path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        store.download(name_object(file), target)
-        reason = find_damage(root, file, again=True)
-        if reason is not None:
-            target.unlink()
-            raise DamagedFileError(
-                f"{store.place}/{name_object(file)}: damaged ({reason}). Publish the lake again from a folder that has "
-                "it whole."
-            )
-
+    advice = "Publish the lake again from a folder that has it whole."
     missing = [file for file in live if find_damage(root, file) is not None]
-    _transfer(receive, missing)
+    transfer(lambda file: receive_file(store, file, root / file.path, advice), missing)
     return missing
-
-
-def _transfer(function: Callable[[T], None], items: Iterable[T]) -> None:
-    """Call a function for several items at once; after an error, those that were not begun are left out."""
-    pool = ThreadPoolExecutor(TRANSFERS)
-    try:
-        for _ in pool.map(function, items):
-            pass
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _record_agreement(root: Path, address: str, local: str | None, remote: str | None) -> None:

@@ -9,6 +9,7 @@ from tracklake.pipeline.lake.files import REPORTS, STAGING, find_orphans
 from tracklake.pipeline.lake.history import ROOTS, find_superseded
 from tracklake.pipeline.lake.live_folders import is_shown
 from tracklake.pipeline.lake.manifest import MANIFEST, Manifest
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.shards import SHARDS
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import list_unfinished, write_file
@@ -29,8 +30,11 @@ def record_end(root: Path) -> None:
 
 
 def is_settled(root: Path, manifest: Manifest) -> bool:
-    """Return whether the last session came to its end, nothing has changed since, and none is going on."""
-    return not (root / WRITER).exists() and has_ended(root, manifest)
+    """Return whether the last session came to its end, nothing has changed since, and none is going on.
+
+    A folder with a part of a lake has neither catalog nor live folders, so that nothing can be unfinished there.
+    """
+    return find_origin(root) is not None or (not (root / WRITER).exists() and has_ended(root, manifest))
 
 
 def has_ended(root: Path, manifest: Manifest) -> bool:

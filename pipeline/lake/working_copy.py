@@ -1,115 +1,129 @@
-"""The copy of a lake on an object store in a folder of this machine, on which stages work."""
+"""The copy of a lake on an object store in a folder of this machine, and the workspaces in which its jobs are built.
+
+The copy has the manifest, the report and the models; tables and tensors are received when they are read. What is made
+is sent at once, and committed at the store.
+"""
 
 import os
 import platform
 import re
+import shutil
+import time
+import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tracklake.pipeline.lake.errors import DamagedShardError, LakeError, LakeMissingError, LakeVersionError
+from tracklake.pipeline.lake.commit_log import CommitLog
+from tracklake.pipeline.lake.errors import DamagedShardError, LakeLockedError, LakeMissingError, LakeVersionError
+from tracklake.pipeline.lake.files import REPORTS, STORE, TENSORS
 from tracklake.pipeline.lake.lease import hold_lease
-from tracklake.pipeline.lake.manifest import MANIFEST, load
+from tracklake.pipeline.lake.manifest import MANIFEST, LakeFile, Manifest, load
+from tracklake.pipeline.lake.object_folder import GRACE, claim_place
+from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.origin import Origin, find_origin
 from tracklake.pipeline.lake.places import open_store
-from tracklake.pipeline.lake.publication import (
-    Transfer,
-    claim_place,
-    fetch_lake,
-    hash_root,
-    is_synced,
-    publish_lake,
-    was_synced,
-)
+from tracklake.pipeline.lake.remote_log import store_copy
+from tracklake.pipeline.lake.transfers import fetch_files, trim_cache
+from tracklake.pipeline.lake.writer import hold_lock
 from tracklake.schemas.hashing import hash_text
-from tracklake.schemas.text import quote_shell
 
 CACHE = "tracklake"
 """Name of our folder in the user's folder of caches."""
 
 
-class WorkingCopy:
-    """The copy of a lake on an object store.
+def locate_origin(lake: Path | str, cache: Path | None = None, cache_gb: float = 0.0) -> Origin | None:
+    """Return what this machine holds of a lake on an object store; None: it is a whole lake in a folder.
 
     Args:
-        address: place of the lake.
-        folder: place of the copy.
-    """
-
-    def __init__(self, address: str, folder: Path) -> None:
-        self.address = address
-        self.folder = folder
-        self._root_at_first = ""
-        self._lake_at_first: str | None = None
-
-    @contextmanager
-    def hold(self, *, is_rebuild: bool = False) -> Iterator[Transfer | None]:
-        """Keep other processes from working on this lake meanwhile, and bring the copy up to date first.
-
-        Yields what was received; None: the copy is up to date, or what was broken off in it is to be gone on with.
-
-        Args:
-            is_rebuild: whether the lake is to be made again, so that it need not be readable.
-
-        Raises:
-            LakeLockedError: another process works on the lake.
-            LakeError: the place holds something else; or it has changed, and the copy has results of its own.
-        """
-        store = open_store(self.address)
-        claim_place(store, None)
-        with hold_lease(store, f"process {os.getpid()} on {platform.node()}"):
-            self._root_at_first = hash_root(self.address) or ""
-            received = self._fetch(is_rebuild=is_rebuild)
-            self._lake_at_first = load(self.folder).lake_id if (self.folder / MANIFEST).exists() else None
-            yield received
-
-    def _fetch(self, *, is_rebuild: bool) -> Transfer | None:
-        """Bring the copy up to date; see `hold`.
-
-        Raises:
-            LakeError: it has changed, and the copy has results of its own.
-        """
-        try:
-            if is_synced(self.folder, self.address, remote=True):
-                return None
-            return fetch_lake(self.address, self.folder)
-        except (LakeVersionError, DamagedShardError):
-            if is_rebuild:
-                return None
-            raise
-        except LakeMissingError:
-            if was_synced(self.folder, self.address):
-                raise LakeError(
-                    f"{self.address}: no lake is there any more, but {self.folder} holds a copy. Publish it by "
-                    f"`tracklake publish store {quote_shell(self.address)} --lake {quote_shell(self.folder)}`, or "
-                    "delete that folder."
-                ) from None
-            return None
-
-    def publish(self, *, rebuilt: bool = False) -> Transfer | None:
-        """Send what was made in the copy, in one commit; None: nothing was made there yet.
-
-        Args:
-            rebuilt: whether the copy was to be made again, under a new id, and takes the place of the lake.
-
-        Raises:
-            LakeError: it was made again, and another process has published meanwhile.
-        """
-        if not (self.folder / MANIFEST).exists():
-            return None
-        if rebuilt and load(self.folder).lake_id != self._lake_at_first:
-            return publish_lake(self.folder, self.address, replace_other=True, expected=self._root_at_first)
-        return publish_lake(self.folder, self.address)
-
-
-def name_copy(address: str, cache: Path | None = None) -> Path:
-    """Return the folder of the copy of a lake.
-
-    Args:
-        address: place of the lake.
+        lake: address of the lake, or a folder.
         cache: folder of all copies; None: in the user's folder of caches.
+        cache_gb: size up to which its contents are kept, in GB.
     """
+    address = find_address(lake)
+    if address is None:
+        return find_origin(Path(lake))
     if cache is None:
         named = os.environ.get("XDG_CACHE_HOME" if os.name != "nt" else "LOCALAPPDATA")
         cache = (Path(named) if named else Path.home() / ".cache") / CACHE
     readable = re.sub(r"[^A-Za-z0-9]+", "-", address).strip("-")[-60:]
-    return cache / f"{readable}-{hash_text(address, 8)}" / "lake"
+    return Origin(address, (cache / f"{readable}-{hash_text(address, 8)}").absolute(), cache_gb)
+
+
+@contextmanager
+def hold_copy(origin: Origin, *, is_rebuild: bool = False) -> Iterator[Path]:
+    """Keep other processes from working on a lake meanwhile, and yield the folder of its copy, up to date.
+
+    Args:
+        origin: the lake.
+        is_rebuild: whether the lake is to be made again, so that it need not be readable.
+
+    Raises:
+        LakeLockedError: another process works on the lake.
+        LakeError: the place holds something else.
+    """
+    store = open_store(origin.address)
+    claim_place(store, None)
+    with hold_lease(store, f"process {os.getpid()} on {platform.node()}"):
+        try:
+            refresh_copy(origin)
+        except LakeMissingError:
+            (origin.copy / MANIFEST).unlink(missing_ok=True)
+        except (LakeVersionError, DamagedShardError):
+            if not is_rebuild:
+                raise
+        yield origin.copy
+    trim_cache(origin)
+
+
+def refresh_copy(origin: Origin) -> Path:
+    """Bring the copy of a lake up to date, and return its folder; while another process writes to it, it is so already.
+
+    Raises:
+        LakeError: no lake is there, or it cannot be read.
+    """
+    origin.mark(origin.copy)
+    manifest = load(origin.address)
+    try:
+        with hold_lock(origin.copy):
+            store_copy(origin.copy, manifest)
+    except LakeLockedError:
+        if not (origin.copy / MANIFEST).exists():
+            raise
+    small = [file for commit in manifest.commits.values() if not commit.tail for file in commit.all_files]
+    fetch_files(origin.copy, [file for file in small if not file.path.startswith((f"{STORE}/", f"{TENSORS}/"))])
+    return origin.copy
+
+
+def list_report(manifest: Manifest) -> list[LakeFile]:
+    """Return the files of a lake's report, with the pages of all subsets."""
+    return [file for commit in manifest.commits.values() for file in commit.files.get(REPORTS, ())]
+
+
+@contextmanager
+def open_workspace(origin: Origin, part: Manifest) -> Iterator[Path]:
+    """Yield a folder with a part of a lake, in which jobs are built; it is deleted at the end: their results were sent.
+
+    Args:
+        origin: the lake.
+        part: the commits that the job may read.
+    """
+    _sweep(origin.workspaces)
+    _sweep(origin.staging)
+    folder = origin.workspaces / uuid.uuid4().hex
+    root = folder / origin.copy.name
+    try:
+        origin.mark(root)
+        CommitLog(root).replace(part)
+        yield root
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        trim_cache(origin)
+
+
+def _sweep(folder: Path) -> None:
+    """Delete what killed processes left in a folder a day ago."""
+    with suppress(FileNotFoundError):
+        for item in folder.iterdir():
+            if item.stat().st_mtime < time.time() - GRACE.total_seconds():
+                shutil.rmtree(item, ignore_errors=True)

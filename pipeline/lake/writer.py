@@ -14,7 +14,9 @@ from tracklake.pipeline.lake.checksums import forget_checksums
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import LakeError, LakeLockedError, LakeMissingError
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retention, load
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.rebuild import start_rebuild
+from tracklake.pipeline.lake.remote_log import RemoteLog, clear_copy, store_copy
 from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.files import SETTINGS_FILE, remove_unfinished
@@ -26,9 +28,12 @@ LOCK = ".lock"
 class Writer:
     """The only process that changes a lake; made by `open_for_writing`."""
 
-    def __init__(self, root: Path, log: CommitLog, generation: int, *, has_catalog: bool) -> None:
+    def __init__(
+        self, root: Path, log: CommitLog, generation: int, *, has_catalog: bool = False, remote: RemoteLog | None = None
+    ) -> None:
         self.root = root
         self._log = log
+        self._remote = remote
         self.manifest = manifest = log.manifest
         self._cataloged = manifest if has_catalog else None
         self._generation = generation
@@ -48,7 +53,8 @@ class Writer:
             if new:
                 self._store(self.manifest.add_commits(new, self._generation))
                 replaced = [known[commit.key] for commit in new if commit.key in known]
-                live_folders.show_commits(self.root, new, replaced)
+                if self._remote is None:
+                    live_folders.show_commits(self.root, new, replaced)
 
     def remember_sources(self, sources: Mapping[str, dict[str, Any]]) -> None:
         """Record which recordings raw files hold, by sha256, so that the next run need not read them to know."""
@@ -63,7 +69,8 @@ class Writer:
             removed = [commit for key, commit in self.manifest.commits.items() if key in keys]
             if removed:
                 self._store(self.manifest.remove_commits(keys, self._generation))
-                live_folders.show_commits(self.root, [], removed)
+                if self._remote is None:
+                    live_folders.show_commits(self.root, [], removed)
 
     def mark_damaged(self, keys: Collection[str]) -> None:
         """Record commits as damaged, so that the next run makes them again; their files stay live until then."""
@@ -87,6 +94,10 @@ class Writer:
         """
         with self._guard:
             self._refuse_child()
+            if self._remote is not None:
+                self.manifest = self._log.replace(self._remote.finish(self.manifest))
+                clear_copy(self.root, self._remote.origin, self.manifest)
+                return
             if self._cataloged != self.manifest:
                 catalog.rebuild_catalog(self.root, self.manifest)
             live_folders.show_manifest(self.root, self.manifest)
@@ -107,6 +118,8 @@ class Writer:
 
     def _store(self, manifest: Manifest) -> None:
         self._refuse_child()
+        if self._remote is not None:
+            manifest = self._remote.replace(manifest)
         self.manifest = self._log.replace(manifest)
 
 
@@ -178,6 +191,11 @@ def hold_lock(root: Path) -> Iterator[None]:
 
 def _open_writer(root: Path, *, rebuild: bool, retention: Retention | None) -> Writer:
     """Load the manifest (or make the first), delete what was half written, and bring the catalog up to date."""
+    if (origin := find_origin(root)) is not None:
+        remote = RemoteLog(origin, is_rebuild=rebuild)
+        log = store_copy(root, remote.begin(retention))
+        clear_copy(root, origin, log.manifest)
+        return Writer(root, log, log.manifest.generation + 1, remote=remote)
     is_new = rebuild
     log = CommitLog(root, is_rebuild=rebuild)
     try:
@@ -214,6 +232,8 @@ def refuse_foreign(root: Path, *, rebuild: bool = False) -> None:
     Raises:
         LakeError: a file, a folder of other things, a manifest that is not ours, or one of another schema version.
     """
+    if find_origin(root) is not None:
+        return  # made by us
     if root.exists() and not root.is_dir():
         raise LakeError(f"{root}: is a file; a lake is a folder. Name another with --lake.")
     if (root / MANIFEST).exists():

@@ -4,9 +4,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import LakeError, refuse_foreign, refuse_if_busy
-from tracklake.pipeline.lake.object_store import find_address
-from tracklake.pipeline.lake.working_copy import WorkingCopy, name_copy
+from tracklake.pipeline.lake import LakeError, load, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake.transfers import fetch_files
+from tracklake.pipeline.lake.working_copy import hold_copy, list_report, locate_origin
 from tracklake.pipeline.orchestration.prefect_home import import_flows
 from tracklake.pipeline.orchestration.run_plan import (
     ALL_STEPS,
@@ -52,15 +52,14 @@ def run(
     chosen = Settings(lake=Path(lake), **settings)
     for message in find_unknown_variables():
         warnings.warn(message, stacklevel=2)
-    address = find_address(lake)
-    if address is None:
+    origin = locate_origin(lake, chosen.cache, chosen.cache_gb)
+    if origin is None:
         result = _run_in_folder(chosen, source, dataset, replace, prune, rebuild)
     else:
-        copy = WorkingCopy(address, name_copy(address, chosen.cache))
-        with copy.hold(is_rebuild=rebuild):
-            in_copy = chosen.model_copy(update={"lake": copy.folder})
+        with hold_copy(origin, is_rebuild=rebuild) as folder:
+            in_copy = chosen.model_copy(update={"lake": folder})
             result = _run_in_folder(in_copy, source, dataset, replace, prune, rebuild)
-            copy.publish(rebuilt=rebuild)
+            fetch_files(folder, list_report(load(folder)))
     if result.failed:
         raise LakeError("\n".join(result.failed))
     return result

@@ -8,13 +8,17 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from tracklake.pipeline.ingest import ingest
-from tracklake.pipeline.lake import Commit
+from tracklake.pipeline.lake import Commit, Manifest, load
+from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.origin import Origin, find_origin
+from tracklake.pipeline.lake.transfers import send_commits
+from tracklake.pipeline.lake.working_copy import locate_origin, open_workspace
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile
 from tracklake.pipeline.stages.planner import build_jobs
@@ -108,20 +112,81 @@ def name_batch(calls: Sequence[Call]) -> str:
     return ", ".join(titles) if len(calls) < 2 else f"{titles[0]} to {titles[-1]} ({len(titles)})"
 
 
-def build_group(lake: str, stage: str, jobs: Sequence[Job], settings: Settings) -> list[Commit]:
+def build_group(
+    lake: str, stage: str, jobs: Sequence[Job], settings: Settings, part: Manifest | None = None
+) -> list[Commit]:
     """Do one stage's work on a group of recordings: read, transform, validate, write; returns the commits to make.
 
-    Nothing that it writes is live before a commit. Raises what the stage's build function raises.
+    Nothing that it writes is live before a commit. Of a lake on an object store, files that it reads are received, and
+    those that it makes are sent, before it returns; the lake's copy on this machine need not be there. Raises what the
+    stage's build function raises.
+
+    Args:
+        lake: folder of the lake, or of the copy of one on an object store; or an address, for workers elsewhere.
+        stage: name of the stage.
+        jobs: recordings, or one job over the whole lake, which is done in a folder.
+        settings: settings of the run.
+        part: what the jobs read of the manifest (`select_part`), where the lake is an address.
     """
-    root = Path(lake)
+    origin = find_own_origin(lake)
+    if origin is None or not any(job.tail for job in jobs):
+        return send_commits(Path(lake), _build(Path(lake), stage, jobs, settings))
+    with open_workspace(origin, part or select_part(load(Path(lake)), stage, jobs, settings)) as root:
+        return send_commits(root, _build(root, stage, jobs, settings))
+
+
+def _build(root: Path, stage: str, jobs: Sequence[Job], settings: Settings) -> list[Commit]:
     if stage == INGEST:
         return try_again(lambda: [ingest.build(root, job, settings.slice_entries) for job in jobs])
     return try_again(lambda: build_jobs(STAGE_BY_NAME[stage], root, jobs, settings))
 
 
+def select_part(manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Manifest:
+    """Return the part of a manifest that jobs on recordings read; it is small, and fit to be sent to a worker."""
+    if stage == INGEST:
+        files = {file.sha256 for job in jobs for file in ingest.list_files(job)}
+        known = {sha256: found for sha256, found in manifest.sources.items() if sha256 in files}
+        return replace(manifest, commits={}, sources=known, retired=(), ingested_from=())
+    before = STAGE_BY_NAME[stage].list_inputs(settings) or (INGEST, *STAGE_BY_NAME)
+    keys = {key for name in before for job in jobs for key in (name, f"{name}/{job.tail}")}
+    commits = {key: manifest.commits[key] for key in sorted(keys & manifest.commits.keys())}
+    return replace(manifest, commits=commits, sources={}, retired=(), ingested_from=())
+
+
+def locate_for_workers(root: Path, settings: Settings) -> str:
+    """Return a lake as workers find it: its folder, or for those of an existing cluster the address that it has."""
+    origin = find_origin(root)
+    is_elsewhere = settings.runner == "dask" and settings.dask_address is not None
+    return origin.address if origin is not None and is_elsewhere else str(root)
+
+
+def make_group_call(lake: str, manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Call:
+    """Return the call that builds a group of jobs of the lake that `locate_for_workers` returns."""
+    titles = tuple(job.title for job in jobs)
+    if find_address(lake) is None:
+        return Call(build_group, (lake, stage, jobs, settings), titles)
+    elsewhere = settings.model_copy(update={"lake": Path(lake), "cache": None})  # no folder of this machine
+    return Call(build_group, (lake, stage, jobs, elsewhere, select_part(manifest, stage, jobs, settings)), titles)
+
+
+def find_own_origin(lake: str) -> Origin | None:
+    """Return what this machine holds of a lake on an object store; None: it is a whole lake in a folder.
+
+    Settings of this machine say where: the coordinator's name a folder of the coordinator, which it need not have.
+    """
+    if find_address(lake) is None:
+        return find_origin(Path(lake))
+    own = Settings()
+    return locate_origin(lake, own.cache, own.cache_gb)
+
+
 def read_file(lake: str, dataset: str, file: dict[str, Any]) -> dict[str, Any]:
     """Read one file that holds several recordings into the staging folder; returns what `ingest.read_file` does."""
-    return try_again(lambda: ingest.read_file(Path(lake), dataset, RawFile.from_dict(file)))
+    origin = find_own_origin(lake)
+    root = Path(lake) if origin is None else origin.copy
+    if origin is not None:
+        origin.mark(root)
+    return try_again(lambda: ingest.read_file(root, dataset, RawFile.from_dict(file)))
 
 
 def try_again(work: Callable[[], T]) -> T:

@@ -22,6 +22,7 @@ from tracklake.pipeline.lake import (
     list_ingested,
     open_for_writing,
 )
+from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.pipeline.orchestration.artifacts import name_run
 from tracklake.pipeline.orchestration.batches import (
@@ -29,8 +30,9 @@ from tracklake.pipeline.orchestration.batches import (
     Engine,
     Outcome,
     Threads,
-    build_group,
     divide_calls,
+    locate_for_workers,
+    make_group_call,
     name_batch,
     read_file,
 )
@@ -129,9 +131,10 @@ def _build_all(
     groups = [[job] for job in jobs]
     if stage != INGEST:
         groups = group_jobs(STAGE_BY_NAME[stage], writer.manifest, jobs, engine.slots)
-    calls = [
-        Call(build_group, (request.lake, stage, group, settings), tuple(job.title for job in group)) for group in groups
-    ]
+    lake = locate_for_workers(writer.root, settings)
+    if find_address(lake) is not None and not jobs[0].tail:  # a job over the whole lake is done where it is committed
+        lake, engine = request.lake, Threads(1)
+    calls = [make_group_call(lake, writer.manifest, stage, group, settings) for group in groups]
     for outcomes in _do_calls(engine, stage, calls):
         made = [commit for _, commits in outcomes if isinstance(commits, list) for commit in commits]
         writer.commit(*made)
@@ -160,9 +163,10 @@ def _ingest(writer: Writer, request: RunRequest, prepared: RunPlan, result: RunR
     remember_places(writer, request, plan)
     remember_hashes(writer.root, discovery)
     remove_missing(writer, request, plan, result)
+    is_elsewhere = find_address(locate_for_workers(writer.root, request.get_settings())) is not None
     needed = {
         file.sha256: (job.inputs["dataset"], file)
-        for job in plan.jobs
+        for job in (() if is_elsewhere else plan.jobs)  # workers elsewhere read what they lack
         for file in ingest.list_spilled(job)
         if not ingest.locate_spill(writer.root, file).exists()
     }
@@ -175,7 +179,8 @@ def _read_all(
 ) -> None:
     if not files:
         return
-    calls = [Call(read_file, (request.lake, dataset, file.to_dict()), (file.name,)) for dataset, file in files.values()]
+    lake = locate_for_workers(writer.root, request.get_settings())
+    calls = [Call(read_file, (lake, dataset, file.to_dict()), (file.name,)) for dataset, file in files.values()]
     for outcomes in _do_calls(engine, "read", calls):
         contents = {}
         for call, made in outcomes:
@@ -200,7 +205,9 @@ def _open_engine(request: RunRequest) -> Iterator[Engine]:
     require_extras('the setting runner = "dask"', "distributed")
     from tracklake.pipeline.orchestration.dask_workers import open_workers
 
-    with open_workers(settings, [request.root / WRITER, *([request.origin] if request.source else [])]) as workers:
+    is_elsewhere = find_address(locate_for_workers(request.root, settings)) is not None
+    places = [*([] if is_elsewhere else [request.root / WRITER]), *([request.origin] if request.source else [])]
+    with open_workers(settings, places) as workers:
         yield workers
 
 

@@ -34,6 +34,9 @@ class DeclaredSettings(BaseModel):
     cache: Path | None = Field(
         None, description="folder for the copies of lakes on object stores; none: in the user's folder of caches"
     )
+    cache_gb: float = Field(
+        50.0, ge=0, description="about as much of a lake on an object store is kept on this machine, in GB"
+    )
     columns: Path | None = Field(None, description="mapping of the columns of raw files in a format of their own")
     recording: str | None = Field(
         None,

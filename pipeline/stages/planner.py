@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, verify_files, write_table
+from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
 from tracklake.pipeline.stages.registry import STAGES
@@ -169,9 +170,7 @@ def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings
         return [build_job(stage, root, job, settings) for job in jobs]
     started = time.perf_counter()
     manifest = load(root)
-    verify_files(
-        root, {file.path: file for job in jobs for file in _list_inputs(stage, manifest, job, settings)}.values()
-    )
+    _prepare_files(root, [file for job in jobs for file in _list_inputs(stage, manifest, job, settings)], jobs)
     results = stage.build([LakeReader(root, manifest, stage.list_inputs(settings), job) for job in jobs], settings)
     assert isinstance(results, list)
     share = (time.perf_counter() - started) * (len(jobs) - 1) / len(jobs)  # each has taken its part of the time
@@ -193,7 +192,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
         return build_jobs(stage, root, [job], settings)[0]
     started = time.perf_counter()
     manifest = load(root)
-    verify_files(root, _list_inputs(stage, manifest, job, settings))
+    _prepare_files(root, _list_inputs(stage, manifest, job, settings), [job])
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
     notes: list[str] = []
@@ -212,6 +211,17 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
             info |= result.info
             notes += result.notes
     return make_commit(job, files, {**info, "notes": notes}, started)
+
+
+def _prepare_files(root: Path, files: Iterable[LakeFile], jobs: Sequence[Job]) -> None:
+    """Verify the files that jobs read, and receive them first where they are elsewhere.
+
+    A job over the whole lake, which may be larger than this machine's disk, receives each file when it reads it.
+    """
+    needed = {file.path: file for file in files}.values()
+    if all(job.tail for job in jobs):
+        fetch_files(root, needed)
+    verify_files(root, needed)
 
 
 def _list_inputs(stage: Stage, manifest: Manifest, job: Job, settings: Settings) -> Iterator[LakeFile]:

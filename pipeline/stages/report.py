@@ -51,7 +51,7 @@ def _describe_settings(settings: Settings) -> dict[str, Any]:
     Those that the protocol decides where the user sets none are given as they are in force.
     """
     of_the_run = {"lake", "columns", "recording", "workers", "slice_entries", "runner", "dask_address", "refusals_fail"}
-    of_the_files = {"cache", "kept_generations", "kept_hours"}
+    of_the_files = {"cache", "cache_gb", "kept_generations", "kept_hours"}
     shown = settings.model_dump(mode="json", exclude={*of_the_run, *of_the_files, "thresholds"})
     protocol = settings.get_protocol()
     return {"settings": shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}}

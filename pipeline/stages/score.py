@@ -6,11 +6,13 @@ from typing import Any
 
 from tracklake.pipeline.lake import LakeFile, Manifest
 from tracklake.pipeline.lake.files import MODELS, TENSORS
+from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.documents import read_json
+from tracklake.schemas.tensors import INDEX_FILE
 
 BASELINE = "constant-velocity"
 """Name of the model that is scored, and of its run."""
@@ -60,6 +62,7 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
     commit = manifest.commits.get(TENSORS)
     if commit is None or commit.info["path"] is None:
         return []
+    fetch_files(root, (file for file in commit.all_files if file.path.endswith(f"/{INDEX_FILE}")))
     index = read_index(root / commit.info["path"])
     scores = []
     for path in finished_runs(root):

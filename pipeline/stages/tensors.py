@@ -12,6 +12,7 @@ import polars as pl
 from tracklake.pipeline.lake import Manifest, find_free_path, write_folder
 from tracklake.pipeline.lake.files import TENSORS
 from tracklake.pipeline.lake.tensor_files import write_tensors
+from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
 from tracklake.pipeline.stages.split import find_training_split
@@ -159,6 +160,7 @@ def tensor_folder(root: Path, manifest: Manifest, settings: Settings) -> Path:
         raise StageError(
             f"{root}: the lake has no tensors. Run `tracklake tensors`; it needs freeway recordings with lanes."
         )
+    fetch_files(root, (file for file in commit.all_files if not (root / file.path).exists()))
     protocol = settings.get_protocol()
     if commit.built_from["protocol"] != protocol.digest:
         made = json.loads((root / str(commit.info["path"]) / INDEX_FILE).read_text(encoding="utf-8"))["protocol"]

@@ -4,16 +4,18 @@ import json
 from unittest.mock import Mock
 
 import pytest
+from export_lakes import KEYS
 from object_stores import HEEDLESS
+from raw_texts import as_csv, ngsim_row, write
 from small_lake import write_round
 from small_recordings import write_highd
 
 import tracklake
-from tracklake.pipeline.lake import LakeMissingError, load
+from tracklake.pipeline.lake import Writer, load
 from tracklake.pipeline.lake.errors import StoreError
 from tracklake.pipeline.lake.lease import hold_lease
 from tracklake.pipeline.lake.places import open_store
-from tracklake.pipeline.lake.working_copy import WorkingCopy
+from tracklake.pipeline.lake.remote_log import RemoteLog
 from tracklake.pipeline.orchestration import api
 from tracklake.pipeline.orchestration.run_plan import RunRequest
 from tracklake.schemas.errors import UsageError
@@ -58,8 +60,9 @@ def test_a_lake_is_fetched_and_followed(published, bucket, tmp_path):
 
 
 REFUSED = {
-    ("report", "--lake", "{bucket}"): (2, "this command works on a lake in a folder"),
-    ("export", "npz", "--out", "x", "--lake", "{bucket}"): (2, "tracklake fetch {bucket} --lake DIR"),
+    ("serve", "--lake", "{bucket}"): (2, "this command works on a lake in a folder"),
+    ("publish", "ducklake", "--lake", "{bucket}"): (2, "tracklake fetch {bucket} --lake DIR"),
+    ("export", "npz", "--out", "x", "--lake", "{bucket}/elsewhere"): (1, "no lake here"),
     ("fetch", "{bucket}", "--lake", "{bucket}"): (2, "this command works on a lake in a folder"),
     ("sql", "--out", "x.duckdb", "--lake", "{bucket}"): (2, "this command works on a lake in a folder"),
     ("sql", "FROM subsets", "--lake", "{bucket}/elsewhere"): (1, "no lake here"),
@@ -105,11 +108,68 @@ def test_two_machines_add_recordings_to_one_lake(machine, bucket, tmp_path):
     assert "nothing to do" in idle.out
     (copy,) = (tmp_path / "one").glob("tracklake/*/lake")
     assert list_recordings(copy) == ["01", "02"]
+    assert not [*copy.rglob("*.parquet")], "tables are received when they are read"
     rebuilt = machine("one", "ingest", tmp_path / "raw" / "01", "--lake", bucket, "--rebuild", "--replace")
     assert rebuilt.code == 0, rebuilt.err
     assert list_recordings(bucket) == ["01"]
     late = machine("two", "ingest", tmp_path / "raw" / "02", "--lake", bucket)
-    assert (late.code, "holds another lake" in late.err) == (1, True)
+    assert late.code == 0, late.err
+    assert list_recordings(bucket) == ["01", "02"]
+
+
+def describe_results(place):
+    """What was made, by key: the fingerprint, and the content of each table and tensor file."""
+    return {
+        key: (commit.fingerprint, {file.path: file.sha256 for file in commit.all_files if is_fixed(file)})
+        for key, commit in load(place).commits.items()
+    }
+
+
+def is_fixed(file):
+    return file.path.startswith((".files", "tensors"))
+
+
+@pytest.mark.usefixtures("plain_flows", "empty_charts")
+def test_every_command_gives_at_an_address_what_it_gives_in_a_folder(machine, bucket, tmp_path):
+    folder = tmp_path / "lake"
+    for number in ("01", "02"):
+        write_highd(tmp_path / "raw", number)
+    for place in (folder, bucket):
+        done = machine("one", "run", tmp_path / "raw", "--lake", place)
+        assert done.code == 0, done.err
+    assert describe_results(bucket) == describe_results(folder)
+    (copy,) = (tmp_path / "one").glob("tracklake/*/lake")
+    assert {page.name for page in copy.rglob("*.html")} == {page.name for page in folder.rglob("*.html")}
+    commands = {
+        "check": ("check", "--fail-on", "error_share > 0.5"),
+        "evaluate": ("evaluate", "constant-velocity", "--json"),
+        "export": ("export", "npz", "--out", "{out}"),
+    }
+    outputs = {}
+    for name, arguments in commands.items():
+        for place in (folder, bucket):
+            out = tmp_path / f"{name}-{place == bucket}"
+            done = machine("two", *(each.format(out=out) for each in arguments), "--lake", place)
+            assert done.code == 0, (name, done)
+            files = {file.name: file.read_bytes() for file in out.rglob("*.npz")}
+            scores = [row["rmse_m"] for row in json.loads(done.out)["rows"]] if "--json" in arguments else []
+            outputs.setdefault(name, []).append((files, scores))
+    assert all(first == second for first, second in outputs.values())
+    assert "nothing to do" in machine("two", "report", "--lake", bucket).out
+    assert machine("two", "remove", "02", "--lake", bucket).code == 0
+    assert list_recordings(bucket) == ["01"]
+
+
+@pytest.mark.usefixtures("plain_flows")
+def test_a_file_of_several_recordings_is_ingested_at_an_address(machine, bucket, tmp_path):
+    """What was read of it waits outside of the jobs' folders, and is gone at the end."""
+    vehicles = {1: "us-101-0750", 2: "us-101-0805"}
+    rows = [ngsim_row(vehicle, frame, key=KEYS[name]) for vehicle, name in vehicles.items() for frame in range(1, 30)]
+    done = machine("one", "ingest", write(tmp_path / "raw.csv", as_csv(rows)), "--lake", bucket)
+    assert done.code == 0, done.err
+    assert list_recordings(bucket) == ["us-101-0750", "us-101-0805"]
+    (cache,) = (tmp_path / "one").glob("tracklake/*")
+    assert {item.name for item in cache.iterdir()} == {"lake", "objects", "work"}
 
 
 def test_a_second_machine_is_told_at_once_who_works_on_the_lake(machine, bucket, tmp_path):
@@ -121,22 +181,30 @@ def test_a_second_machine_is_told_at_once_who_works_on_the_lake(machine, bucket,
 
 
 @pytest.mark.usefixtures("plain_flows")
-def test_a_run_that_is_interrupted_publishes_nothing_and_is_gone_on_with(machine, bucket, tmp_path, monkeypatch):
-    write_highd(tmp_path / "raw", "01")
+def test_what_an_interrupted_run_has_committed_is_there_and_another_machine_goes_on(
+    machine, bucket, tmp_path, monkeypatch
+):
+    for number in ("01", "02"):
+        write_highd(tmp_path / "raw" / number, number)
     arguments = ("ingest", tmp_path / "raw", "--lake", bucket)
+    commit, committed = Writer.commit, []
 
-    def interrupt(*_arguments, **_named):
-        raise KeyboardInterrupt
+    def interrupt(self, made):
+        if committed:
+            raise KeyboardInterrupt
+        committed.append(made.key)
+        commit(self, made)
 
     with monkeypatch.context() as broken:
-        broken.setattr("tracklake.pipeline.cli.ingest.report_result", interrupt)
-        assert machine("one", *arguments).code == 130
-    with pytest.raises(LakeMissingError):
-        load(bucket)
-    done = machine("one", *arguments)
+        broken.setattr(Writer, "commit", interrupt)
+        stopped = machine("one", *arguments)
+    assert (stopped.code, "1 result of this run is in the lake" in stopped.err) == (130, True), stopped
+    assert len(list_recordings(bucket)) == 1
+    done = machine("two", *arguments)
     assert done.code == 0, done.err
-    assert "nothing to do" in done.out  # the copy has the recording already
-    assert list_recordings(bucket) == ["01"]
+    assert list_recordings(bucket) == ["01", "02"]
+    assert "nothing to do" in machine("one", *arguments).out
+    assert load(bucket).generation == 2
 
 
 @pytest.mark.usefixtures("plain_flows")
@@ -165,7 +233,7 @@ def test_a_failed_publication_is_the_only_result_for_programs(machine, bucket, t
     write_highd(tmp_path / "raw", "01")
     refuse = Mock(side_effect=StoreError("no room"))
     with monkeypatch.context() as patched:
-        patched.setattr(WorkingCopy, "publish", refuse)
+        patched.setattr(RemoteLog, "finish", refuse)
         done = machine("one", "ingest", tmp_path / "raw", "--lake", bucket, "--json")
     assert (done.code, json.loads(done.out)) == (1, {"error": "no room"})
     done = machine("one", "ingest", tmp_path / "raw", "--lake", bucket, "--json")

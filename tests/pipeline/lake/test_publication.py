@@ -12,8 +12,11 @@ from tracklake.pipeline.lake import DamagedFileError, LakeError, LakeMissingErro
 from tracklake.pipeline.lake.errors import QueryError, StoreError
 from tracklake.pipeline.lake.manifest import Retention
 from tracklake.pipeline.lake.object_access import name_object
+from tracklake.pipeline.lake.object_folder import MARKER, sweep_objects
 from tracklake.pipeline.lake.object_store import ObjectStore
-from tracklake.pipeline.lake.publication import MARKER, fetch_lake, publish_lake, sweep_objects
+from tracklake.pipeline.lake.publication import fetch_lake, publish_lake
+
+LAKE = "tracklake.pipeline.lake"
 
 
 @pytest.fixture
@@ -161,7 +164,7 @@ def test_a_publication_that_breaks_off_changes_nothing_and_is_gone_on_with(folde
 
         upload = ObjectStore.upload
         broken.setattr(ObjectStore, "upload", fail)
-        broken.setattr(publication, "TRANSFERS", 1)
+        broken.setattr(f"{LAKE}.transfers.TRANSFERS", 1)
         with pytest.raises(StoreError, match="cable"):
             publish_lake(folder, bucket)
     assert read_status(bucket) == before
@@ -251,7 +254,7 @@ def test_objects_are_kept_for_states_that_can_be_queried_and_for_a_day(bucket, t
         publish_lake(folder, bucket)
         (objects[number],) = {name_object(file) for each in load(folder).commits.values() for file in each.all_files}
     assert {item.path for item in store.list()} >= {*objects.values()}
-    monkeypatch.setattr(publication, "GRACE", timedelta(seconds=-5))
+    monkeypatch.setattr(f"{LAKE}.object_folder.GRACE", timedelta(seconds=-5))
     store.put_new(".files/left/by/a/killed-process.0123456789abcdef.parquet", b"")
     others = ["v2/manifest.json", "v2/.files/a.0123456789abcdef.parquet", "notes/paper.txt", ".files/mine.txt"]
     for other in others:
@@ -358,7 +361,7 @@ def test_a_rebuilt_lake_replaces_only_the_state_that_it_was_made_from(folder, bu
 
 def test_the_store_keeps_as_many_states_as_the_folder(bucket, tmp_path, monkeypatch):
     folder = tmp_path / "lake"
-    monkeypatch.setattr(publication, "GRACE", timedelta(0))
+    monkeypatch.setattr(f"{LAKE}.object_folder.GRACE", timedelta(0))
     for number in range(1, 7):
         with open_for_writing(folder, retention=Retention(20, 0.0)) as writer:
             frame = make_status("01-upper", number)
@@ -376,7 +379,7 @@ def test_an_old_object_that_no_state_needs_is_sent_again(folder, bucket, monkeyp
     publish_lake(folder, bucket)
     with open_for_writing(folder) as writer:
         writer.commit(commit)
-    monkeypatch.setattr(publication, "GRACE", timedelta(seconds=-10))
+    monkeypatch.setattr(f"{LAKE}.object_folder.GRACE", timedelta(seconds=-10))
     monkeypatch.setattr(publication, "sweep_objects", lambda _address: 0)
     assert publish_lake(folder, bucket).files == len(commit.all_files)
 

@@ -19,7 +19,8 @@ from distributed import LocalCluster
 from small_recordings import write_highd
 
 from tracklake.pipeline.lake import connect, is_intact, load
-from tracklake.pipeline.orchestration import dask_workers, flows, run_plan, tasks
+from tracklake.pipeline.lake.working_copy import hold_copy, locate_origin
+from tracklake.pipeline.orchestration import batches, dask_workers, flows, run_plan, tasks
 from tracklake.pipeline.orchestration.batches import Call
 from tracklake.pipeline.orchestration.dask_workers import DaskWorkers, WorkersError, open_workers
 from tracklake.pipeline.settings import Settings
@@ -106,7 +107,11 @@ def ingest(root: Path, raw: Path, **settings: object) -> run_plan.RunResult:
     return flows.execute(run_plan.RunRequest(str(root), ("ingest",), str(raw), settings=settings))
 
 
-def read(root: Path) -> list:
+def run_stages(root: Path, *stages: str, **settings: object) -> run_plan.RunResult:
+    return flows.execute(run_plan.RunRequest(str(root), stages, settings=settings))
+
+
+def read(root: Path | str) -> list:
     with connect(root) as lake:
         return [lake.sql(f"FROM {table} ORDER BY ALL").fetchall() for table in ("tracks", "vehicles", "subsets")]
 
@@ -132,7 +137,7 @@ def test_a_job_is_done_again_where_its_worker_was_killed_and_one_that_kills_all_
     workers, raw, tmp_path, monkeypatch
 ):
     """02 kills its first worker while it writes, 03 each worker."""
-    monkeypatch.setattr(tasks, "build_group", toy_calls.build_or_die)
+    monkeypatch.setattr(batches, "build_group", toy_calls.build_or_die)
     monkeypatch.setattr(tasks, "_open_engine", lambda _request: contextlib.nullcontext(workers))
     root = tmp_path / "lake"
     result = ingest(root, raw)
@@ -192,8 +197,25 @@ def test_a_worker_sees_the_lake(start, tmp_path):
         list(workers.do("toy", make_calls(toy_calls.add, (1, 2))))
 
 
+def test_workers_elsewhere_need_the_address_of_a_lake_on_an_object_store_and_the_raw_files(
+    start, raw, bucket, tmp_path
+):
+    """The worker has a cache of its own; no table passes through this process."""
+    own = locate_origin(bucket, tmp_path / "own", 1.0)
+    settings = {"runner": "dask", "dask_address": start(XDG_CACHE_HOME=str(tmp_path / "elsewhere"))}
+    with hold_copy(own) as root:
+        assert ingest(root, raw, **settings).built == {"ingest": 4}
+        assert run_stages(root, "validate", **settings).built == {"validate": 4}
+        (elsewhere,) = (tmp_path / "elsewhere").glob("tracklake/*")
+        assert [len(list(cache.rglob("tracks/**/*.parquet"))) for cache in (own.cache, elsewhere)] == [0, 8]
+        made = run_stages(root, "repair", "samples", "split", **settings)
+        assert (made.built["split"], made.failed) == (1, []), "a job over the whole lake is done here"
+    ingest(tmp_path / "lake", raw)
+    assert read(bucket) == read(tmp_path / "lake")
+
+
 def test_what_was_committed_stays_where_the_scheduler_is_lost(start, raw, tmp_path, monkeypatch):
-    monkeypatch.setattr(tasks, "build_group", toy_calls.build_until_03)
+    monkeypatch.setattr(batches, "build_group", toy_calls.build_until_03)
     root, address = tmp_path / "lake", start()
     with pytest.raises(WorkersError, match=f"Dask at {address}: the connection to the scheduler was lost"):
         ingest(root, raw, runner="dask", dask_address=address)

@@ -11,7 +11,7 @@ from tracklake.pipeline.stages.score import collect_scores
 from tracklake.training.runs.run_folder import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "rmse_longitudinal_m": 2.4, "n": 7}
-MANIFEST = SimpleNamespace(commits={TENSORS: SimpleNamespace(info={"path": "tensors"})})
+MANIFEST = SimpleNamespace(commits={TENSORS: SimpleNamespace(info={"path": "tensors"}, all_files=[])})
 
 
 def write_run(root, name, **config):
