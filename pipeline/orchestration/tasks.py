@@ -62,7 +62,7 @@ LOCK_POLL_S = 1.0
 """Time between two looks at a lake that another process writes to, in seconds."""
 
 
-class BatchFailedError(Exception):
+class BatchFailedError(TracklakeError):
     """The end of a batch in which some calls failed, or which broke off; it carries the outcomes that there are."""
 
     def __init__(self, outcomes: list[Outcome], broken: TracklakeError | None) -> None:
