@@ -137,6 +137,26 @@ def test_coordinators_that_change_different_things_both_count_and_of_the_same_th
     assert read_status(bucket) == [("00", 2), ("01", 4), ("02", 6)]
 
 
+def test_a_rebuild_is_seen_when_it_is_whole(bucket, origin):
+    def rebuild(number: int) -> None:
+        with hold_copy(origin, is_rebuild=True) as root, open_for_writing(root, rebuild=True) as writer:
+            made = put(root, "validate/highd/02", number, make_status("02", number), dataset="highd", subset="02")
+            writer.commit(*send_commits(root, [made]))
+            assert read_status(bucket) == [("01", 4)]
+            if number == 6:
+                raise KeyboardInterrupt
+
+    with hold_copy(origin) as root:
+        commit_status(root, "01", 4)
+    before = load(bucket)
+    with pytest.raises(KeyboardInterrupt):
+        rebuild(6)
+    assert load(bucket) == before
+    rebuild(8)
+    assert read_status(bucket) == [("02", 8)]
+    assert (load(bucket).generation, load(bucket).lake_id != before.lake_id) == (before.generation + 1, True)
+
+
 def test_a_commit_whose_files_were_not_sent_is_refused(bucket, origin):
     with hold_copy(origin) as root, open_for_writing(root) as writer:
         (root / "reports").mkdir()

@@ -211,6 +211,7 @@ def test_workers_elsewhere_need_the_address_of_a_lake_on_an_object_store_and_the
         made = run_stages(root, "repair", "samples", "split", **settings)
         assert (made.built["split"], made.failed) == (1, []), "a job over the whole lake is done here"
     ingest(tmp_path / "lake", raw)
+    run_stages(tmp_path / "lake", "validate", "repair", "samples", "split")
     assert read(bucket) == read(tmp_path / "lake")
 
 
