@@ -25,6 +25,7 @@ from tracklake.schemas.quality_tracks import (
     Starts,
     Subset,
     SubsetFacts,
+    SubsetGroup,
     SubsetScores,
     SubsetTraffic,
     Verdict,
@@ -371,6 +372,7 @@ class Quality(TypedDict):
     verdicts: list[Verdict]
     stages: list[StageProgress]
     left_out: list[LeftOut]
+    groups: NotRequired[list[SubsetGroup]]
     subsets: list[SubsetFacts]
     rules: list[RuleFindings]
     speeds: Speeds

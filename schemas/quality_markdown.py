@@ -30,7 +30,13 @@ In the paths below, `[]` stands for every item of a list and `*` for any name. A
 
 SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Document and lake", "", ("schema", "headline", "verdicts", "stages", "left_out")),
-    ("Subsets and recordings", "", ("subsets", "recordings")),
+    (
+        "Subsets and recordings",
+        "A lake of more than 400 subsets has `groups`. Whatever this document lists by subset, recording or file is\n"
+        "then limited to the 100 subsets with the worst verdicts, so that it stays small; SQL has all. Totals are\n"
+        "those of the whole lake.",
+        ("groups", "subsets", "recordings"),
+    ),
     (
         "Findings",
         "`total` covers the whole lake, an item of `datasets` one dataset, an item of `subsets` one subset. Shares\n"

@@ -90,6 +90,30 @@ class SubsetFacts(TypedDict):
     columns_missing: Annotated[list[str], "columns of `tracks` that the source does not have"]
 
 
+class SubsetGroup(TypedDict):
+    """The subsets of one site and day; listed where a lake has more than 400 subsets."""
+
+    dataset: Dataset
+    site: Site
+    day: Annotated[str | None, "date in the recording's name; null: there is none"]
+    origin: Annotated[str, "recorded or synthetic"]
+    subsets: Annotated[int, "subsets"]
+    recordings: Annotated[int, "recordings"]
+    seconds: Annotated[float, "length of the recordings", "s"]
+    vehicles: Annotated[int, "tracks"]
+    entries: Annotated[int, "rows of `tracks`"]
+    least_flow_vphpl: Annotated[float | None, "least `flow_vphpl` of the subsets", "veh/h/lane"]
+    greatest_flow_vphpl: Annotated[float | None, "greatest `flow_vphpl` of the subsets", "veh/h/lane"]
+    usable: Annotated[int, "subsets that are usable"]
+    usable_with_care: Annotated[int, "subsets that are usable with care"]
+    not_usable: Annotated[int, "subsets that are not usable"]
+    not_checked: Annotated[int, "subsets that were not checked"]
+    error_share: Annotated[float | None, "share of the entries with an error; null before validation"]
+    mean_speed_mps: Annotated[float | None, "recorded speed, mean over entries"]
+    late_starts: Annotated[int, "tracks that begin beyond the cut-off"]
+    samples: Annotated[int, "prediction origins of all protocols"]
+
+
 class RecordingFacts(TypedDict):
     """A recording: found in the lake, and announced."""
 

@@ -11,6 +11,7 @@ from tracklake.pipeline.lake import connect, load
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
 from tracklake.quality_reports.drives import describe_drive, describe_drives
+from tracklake.quality_reports.groups import describe_subset_origins
 from tracklake.quality_reports.reconstruction import collect_reconstruction, describe_reconstruction
 from tracklake.quality_reports.summaries import query
 from tracklake.schemas.origin import describe_synthetic
@@ -51,7 +52,7 @@ def show_result(terminal: Terminal, result: RunResult) -> None:
 
 def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
     """Print the report's figures, its path, and two commands to try next."""
-    terminal.print_origin(describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]}))
+    terminal.print_origin(describe_subset_origins(quality))
     head, drives = quality["headline"], list_drives(lake, load(lake))
     excluded, judged = _format_count(head["excluded_subsets"]), head["eligible_starts"]
     late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"

@@ -23,6 +23,7 @@ from tracklake.pipeline.lake.manifest import Retention as Retention
 from tracklake.pipeline.lake.manifest import load as load
 from tracklake.pipeline.lake.query import connect as connect
 from tracklake.pipeline.lake.query import open_recordings as open_recordings
+from tracklake.pipeline.lake.query import open_stored as open_stored
 from tracklake.pipeline.lake.query import query as query
 from tracklake.pipeline.lake.rebuild import list_ingested as list_ingested
 from tracklake.pipeline.lake.results import LakeResult as LakeResult

@@ -146,13 +146,16 @@ def _write_read_of_file(table: Table, file: LakeFile, locations: FileLocations, 
     return f"SELECT {columns} FROM {read} AS file"
 
 
-def create_views(connection: "duckdb.DuckDBPyConnection", place: LakePlace, manifest: Manifest) -> None:
+def create_views(
+    connection: "duckdb.DuckDBPyConnection", place: LakePlace, manifest: Manifest, *, stored: Collection[str] = ()
+) -> None:
     """Create the views and the macros over them, in one transaction: each statement in its own takes a third longer.
 
     Args:
         connection: connection to an empty database.
         place: the lake's folder, or its address, which the connection was admitted to.
         manifest: live files of the lake.
+        stored: names of tables that are read at once, instead of by each statement.
 
     Raises:
         LakeError: a live file is missing or unreadable.
@@ -161,7 +164,7 @@ def create_views(connection: "duckdb.DuckDBPyConnection", place: LakePlace, mani
         _admit_origin(connection, place, origin, [file for table in TABLES for file in manifest.live(table.name)])
     connection.begin()
     for name, select in _write_selects(place, manifest).items():
-        _create(connection, place, name, f'CREATE VIEW "{name}" AS {select}')
+        _create(connection, place, name, f'CREATE {"TABLE" if name in stored else "VIEW"} "{name}" AS {select}')
     for macro in MACROS:
         connection.execute(macro.statement)
     connection.commit()

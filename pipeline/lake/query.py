@@ -14,12 +14,14 @@ from tracklake.pipeline.lake.manifest import Manifest
 from tracklake.pipeline.lake.object_access import FileLocations, admit_place, quote
 from tracklake.pipeline.lake.places import find_place
 from tracklake.pipeline.lake.results import LakeResult
-from tracklake.schemas import TABLES
+from tracklake.schemas import TABLES, Table
 
 if TYPE_CHECKING:
     import duckdb
 
 Parameters = Mapping[str, Any] | Sequence[Any]
+MOST_STORED_ROWS = 1_000_000
+"""Most rows of a table that `open_stored` holds in memory."""
 
 
 class LakeConnection:
@@ -152,6 +154,23 @@ def open_recordings(root: Path, manifest: Manifest, recordings: Collection[str])
 
     connection = duckdb.connect(":memory:", config={"threads": 1})
     create_views(connection, root, manifest.of_recordings(recordings))
+    return connection
+
+
+def open_stored(root: Path, manifest: Manifest, tables: Collection[Table]) -> "duckdb.DuckDBPyConnection":
+    """Open a lake for many statements of our own: the files of some tables are opened once, not by each statement.
+
+    Larger ones than MOST_STORED_ROWS are views as all others.
+
+    Raises:
+        LakeError: a live file is missing or unreadable.
+    """
+    import duckdb
+
+    connection = duckdb.connect(":memory:")
+    rows = {table.name: sum(file.rows or 0 for file in manifest.live(table.name)) for table in tables}
+    stored = {name for name, count in rows.items() if 0 < count <= MOST_STORED_ROWS}
+    create_views(connection, root, manifest, stored=stored)
     return connection
 
 

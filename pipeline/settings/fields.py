@@ -63,6 +63,9 @@ class DeclaredSettings(BaseModel):
     refusals_fail: bool = Field(
         False, description="a Prefect run that refused files ends as Failed, not as CompletedWithRefusals"
     )
+    pages_of: list[str] = Field(
+        default_factory=list, description="subsets whose pages the report of more than 400 subsets draws"
+    )
     dask_address: str | None = Field(None, description="address of a Dask scheduler; none: a cluster on this machine")
     thresholds: dict[str, float] = Field(
         default_factory=dict, description="thresholds of the rules by name, such as high_acceleration_mps2"

@@ -12,18 +12,25 @@ from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import INGEST, Stage, StageResult
+from tracklake.quality_reports import groups
 from tracklake.quality_reports.pages.page_names import FOLDER, name_pages
 from tracklake.schemas import SPLITS
 from tracklake.schemas.files import write_file
 
 
-def _find_inputs(root: Path, manifest: Manifest, _settings: Settings) -> dict[str, dict[str, Any]]:
-    """Return by recording all that was made of it, its parts of the splits, and the names of its pages."""
+def _find_inputs(root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return by recording all that was made of it, its parts of the splits, and the names of its pages.
+
+    Of many subsets, only those have pages that the setting `pages_of` names, or that have had one.
+    """
     recordings = manifest.of_stage(INGEST)
     keys = {
         each.tail: [(each.info["dataset"], subset["subset"]) for subset in each.info["subsets"]] for each in recordings
     }
     names = name_pages([{"dataset": dataset, "subset": subset} for own in keys.values() for dataset, subset in own])
+    if len(names) > groups.MANY_SUBSETS:
+        drawn = {commit.tail for commit in manifest.of_stage("pages")}
+        keys = {t: own for t, own in keys.items() if t in drawn or {name for _, name in own} & {*settings.pages_of}}
     parts = _find_parts(root, manifest)
     made: dict[str, dict[str, str]] = {tail: {} for tail in keys}
     for commit in manifest.commits.values():

@@ -88,7 +88,8 @@ class Planner:
             return [make(stage.name, "", all_prints, {})]
         jobs = []
         for recording in find_recordings(self._manifest):
-            if subsets := _list_subsets(recording, stage.scope):
+            subsets = _list_subsets(recording, stage.scope)
+            if subsets and not (stage.extra_inputs and recording.tail not in extra):
                 facts = {"dataset": recording.info["dataset"], "subsets": subsets}
                 prints = {name: _find_fingerprint(found, name, recording.tail) for name, found in inputs.items()}
                 jobs.append(make(f"{stage.name}/{recording.tail}", recording.tail, prints, facts))

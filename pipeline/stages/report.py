@@ -11,7 +11,7 @@ from typing import Any
 import polars as pl
 from pydantic import TypeAdapter, ValidationError
 
-from tracklake.pipeline.lake import LakeError, Manifest, connect, scan
+from tracklake.pipeline.lake import LakeError, Manifest, open_stored, scan
 from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
@@ -22,7 +22,22 @@ from tracklake.pipeline.stages.score import collect_scores, finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import DRIVES_FOLDER, FOLDER
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
-from tracklake.schemas import DRIVES, SUBSETS
+from tracklake.schemas import (
+    COMPLETENESS,
+    DRIVES,
+    FINDINGS,
+    INGEST_LOG,
+    RECONSTRUCTED_FINDINGS,
+    RECONSTRUCTED_SUBSET_SCORES,
+    RECONSTRUCTION_QUALITY,
+    SAMPLE_COUNTS,
+    SAMPLE_DROPS,
+    START_ASSESSMENTS,
+    START_CUTOFFS,
+    SUBSET_SCORES,
+    SUBSETS,
+    VEHICLES,
+)
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import remove_unfinished
 from tracklake.schemas.hashing import hash_chunks
@@ -32,6 +47,11 @@ PAGE = "index.html"
 """Name of the report's page for people."""
 DOCUMENT = "quality.json"
 """Name of the report's document for programs."""
+READ_OFTEN = (
+    *(COMPLETENESS, FINDINGS, INGEST_LOG, SAMPLE_COUNTS, SAMPLE_DROPS, START_ASSESSMENTS, START_CUTOFFS, SUBSETS),
+    *(SUBSET_SCORES, VEHICLES, RECONSTRUCTION_QUALITY, RECONSTRUCTED_FINDINGS, RECONSTRUCTED_SUBSET_SCORES),
+)
+"""Tables that several of the overview's statements read; opening thousands of files takes longer than all else."""
 SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 """Libraries whose versions the report names."""
 
@@ -51,7 +71,7 @@ def _describe_settings(settings: Settings) -> dict[str, Any]:
     Those that the protocol decides where the user sets none are given as they are in force.
     """
     of_the_run = {"lake", "columns", "recording", "workers", "slice_entries", "runner", "dask_address", "refusals_fail"}
-    of_the_files = {"cache", "cache_gb", "kept_generations", "kept_hours"}
+    of_the_files = {"cache", "cache_gb", "kept_generations", "kept_hours", "pages_of"}
     shown = settings.model_dump(mode="json", exclude={*of_the_run, *of_the_files, "thresholds"})
     protocol = settings.get_protocol()
     return {"settings": shown | {name: getattr(protocol, name) for name in PROTOCOL_SETTINGS}}
@@ -104,7 +124,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
         "protocol": {"name": settings.protocol, "digest": settings.get_protocol().digest},
     }
     made = [*manifest.of_stage("pages"), *manifest.of_stage("drive_pages")]
-    with connect(root) as connection:
+    with open_stored(root, manifest, READ_OFTEN) as connection:
         notes: list[str] = []
         scores = collect_scores(root, manifest, notes.append)
         drive_scores = collect_drive_scores(root, manifest, notes.append)

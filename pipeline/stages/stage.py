@@ -96,7 +96,7 @@ class Stage:
         batch_entries: number of entries up to which small recordings are built together: `build` then takes a list of
             LakeReaders and returns a list of StageResults. 0: recordings are built one by one.
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
-            (by "" for the scope `lake`).
+            (by "" for the scope `lake`). The stage leaves out recordings without any.
         command: command that runs the stage, where it is called otherwise.
         bytes_per_entry: memory that it takes for each entry of a subset where it works on all of one at once, so that
             it refuses what does not fit into the machine. 0: its memory does not grow with the subset, or is small.

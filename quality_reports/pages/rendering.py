@@ -8,6 +8,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from tracklake.quality_reports.groups import describe_subset_origins
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.schemas.quality import Quality
 from tracklake.schemas.text import make_visible
@@ -50,7 +51,7 @@ def describe_origins(quality: Quality) -> str | None:
     """Describe what of the lake is synthetic; None where nothing is."""
     drives = {row["drive"]: row["origin"] for row in quality["drives"]["drives"]} if "drives" in quality else {}
     texts = [
-        describe_synthetic({row["subset"]: row["origin"] for row in quality["subsets"]}),
+        describe_subset_origins(quality),
         describe_synthetic(drives, noun="drive", maker="instrument"),
     ]
     return " ".join(text for text in texts if text) or None

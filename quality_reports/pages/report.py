@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from tracklake.quality_reports import groups
 from tracklake.quality_reports.drives import collect_drives, describe_drive
 from tracklake.quality_reports.pages.appendix import compare_speeds, count_errors
 from tracklake.quality_reports.pages.assessments import tabulate_assessments
@@ -79,6 +80,7 @@ def build_report(
     if (drives := collect_drives(connection, drive_scores, published_drive_scores)) is not None:
         quality["drives"] = drives
     others = {**render_files(quality), SPLITS_PAGE: render_splits(quality)}
+    quality = groups.shorten(quality)
     shown = {name: page for name, page in others.items() if page is not None}
     return Report(html=render(quality, pages), quality=quality, others=shown)
 
@@ -86,6 +88,7 @@ def build_report(
 def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None) -> str:
     """Render the page; everything but our own style sheet and plots is escaped."""
     drives = quality.get("drives")
+    origins: list[Any] = [*quality.get("groups", quality["subsets"])]
     in_drives = [("v2v", row["drive"]) for row in drives["drives"]] if drives else []
     if pages is None:
         pages = name_pages(quality["subsets"]) | name_pages(
@@ -96,13 +99,14 @@ def render(quality: Quality, pages: Mapping[tuple[str, str], str] | None = None)
         make_environment()
         .get_template("report.html.j2")
         .render(
-            **{**quality, "rules": rank_rules(quality["rules"]), "drives": drives},
+            **{"groups": None, **quality, "rules": rank_rules(quality["rules"]), "drives": drives},
             reconstructed=quality.get("reconstruction"),
             describe_reconstruction=describe_reconstruction,
             has_tracks=bool(quality["subsets"]) or not drives,
+            most=groups.MANY_SUBSETS,
             describe_drive=describe_drive,
             banner=describe_origins(quality),
-            recorded=not quality["subsets"] or any(row["origin"] == "recorded" for row in quality["subsets"]),
+            recorded=not quality["subsets"] or any(row["origin"] == "recorded" for row in origins),
             drawings=_draw_plots(quality, addresses),
             stage={row["stage"]: row for row in quality["stages"]},
             found_in={
@@ -147,7 +151,9 @@ def _draw_plots(quality: Quality, pages: Mapping[tuple[str, str], str]) -> dict[
     beside = {row["split"] for row in splits["recipes"] if not row["trains"]}
     parts = dict.fromkeys((row["split"], row["dataset"]) for row in splits["balance"] if row["split"] not in beside)
     return {
-        "verdicts": Markup(draw_verdicts(quality["verdicts"], pages)) if quality["verdicts"] else None,
+        "verdicts": Markup(draw_verdicts(quality["verdicts"], pages))
+        if quality["verdicts"] and "groups" not in quality
+        else None,
         "speed_histogram": Markup(plots.draw_speed_histogram(speeds["histogram"], speeds["summary"]))
         if speeds["histogram"]
         else None,
