@@ -13,7 +13,7 @@ import polars as pl
 
 from tracklake.pipeline.ingest.discovery import Discovery
 from tracklake.pipeline.ingest.memory_budget import MemoryBudget
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, load_recent, write_table
 from tracklake.pipeline.lake.catalog import ADDED
 from tracklake.pipeline.lake.files import STAGING
 from tracklake.pipeline.lake.origin import find_origin
@@ -287,7 +287,7 @@ def _explain_emptiness(recording: str, canonical: Canonical, lacking: str) -> st
 
 def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:
     """Return notes about files of exactly as many rows as a spreadsheet can hold, whose end may be missing."""
-    known = load(root).sources
+    known = load_recent(root).sources
     rows = dict(canonical.log.select("sha256", "rows_read").iter_rows())
     rows |= {file.sha256: known[file.sha256]["rows_read"] for file in files if file.sha256 in known}
     return [
@@ -300,7 +300,7 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
 
 def _recall_notes(root: Path, job: Job) -> list[str]:
     """Return the notes about how files were read, with the first recording of each file."""
-    known = load(root).sources
+    known = load_recent(root).sources
     contents = [known[file.sha256] for file in list_files(job) if file.sha256 in known]
     named = (found for found in contents if found["recordings"][:1] == [job.inputs["recording"]])
     return [note for found in named for note in found.get("notes", ())]

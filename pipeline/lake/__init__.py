@@ -21,6 +21,7 @@ from tracklake.pipeline.lake.manifest import LakeFile as LakeFile
 from tracklake.pipeline.lake.manifest import Manifest as Manifest
 from tracklake.pipeline.lake.manifest import Retention as Retention
 from tracklake.pipeline.lake.manifest import load as load
+from tracklake.pipeline.lake.manifest import load_recent as load_recent
 from tracklake.pipeline.lake.query import connect as connect
 from tracklake.pipeline.lake.query import open_recordings as open_recordings
 from tracklake.pipeline.lake.query import open_stored as open_stored

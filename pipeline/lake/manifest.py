@@ -202,6 +202,22 @@ def load(place: LakePlace) -> Manifest:
     return parse_manifest(place, read_document(place))
 
 
+_recent: tuple[dict[str, Any], Manifest] | None = None
+
+
+def load_recent(place: LakePlace) -> Manifest:
+    """Return the manifest that this process has read last by this function, as long as its root is the same.
+
+    Reading all of it takes a second where a lake has thousands of recordings, and each job needs it. Raises what `load`
+    does.
+    """
+    global _recent
+    root, recent = read_root(place), _recent
+    if recent is None or recent[0] != root:
+        recent = _recent = root, load(place)
+    return recent[1]
+
+
 def parse_manifest(place: LakePlace, document: Mapping[str, Any]) -> Manifest:
     """Return the manifest that a document of a lake describes; raises what `load` does."""
     version = document["schema_version"]

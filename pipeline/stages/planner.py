@@ -2,10 +2,11 @@
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load, verify_files, write_table
+from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load_recent, verify_files, write_table
 from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
@@ -170,7 +171,7 @@ def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings
     if not stage.batch_entries:
         return [build_job(stage, root, job, settings) for job in jobs]
     started = time.perf_counter()
-    manifest = load(root)
+    manifest = _load_inputs(stage, root, jobs, settings)
     _prepare_files(root, [file for job in jobs for file in _list_inputs(stage, manifest, job, settings)], jobs)
     results = stage.build([LakeReader(root, manifest, stage.list_inputs(settings), job) for job in jobs], settings)
     assert isinstance(results, list)
@@ -192,7 +193,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     if stage.batch_entries:
         return build_jobs(stage, root, [job], settings)[0]
     started = time.perf_counter()
-    manifest = load(root)
+    manifest = _load_inputs(stage, root, [job], settings)
     _prepare_files(root, _list_inputs(stage, manifest, job, settings), [job])
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
@@ -223,6 +224,19 @@ def _prepare_files(root: Path, files: Iterable[LakeFile], jobs: Sequence[Job]) -
     if all(job.tail for job in jobs):
         fetch_files(root, needed)
     verify_files(root, needed)
+
+
+def _load_inputs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings) -> Manifest:
+    """Return the manifest with what was made of the whole lake and of the recordings of some jobs.
+
+    They are found by their keys: looking at thousands of other commits would take longer than a small job.
+    """
+    manifest = load_recent(root)
+    if stage.scope == "lake":
+        return manifest
+    stages = dict.fromkeys((INGEST, *(each.name for each in STAGES), *stage.list_inputs(settings)))
+    keys = (key for name in stages for key in (name, *(f"{name}/{job.tail}" for job in jobs)))
+    return replace(manifest, commits={key: manifest.commits[key] for key in keys if key in manifest.commits})
 
 
 def _list_inputs(stage: Stage, manifest: Manifest, job: Job, settings: Settings) -> Iterator[LakeFile]:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from manifests import read_unsharded, write_unsharded
 from small_lake import make_status, put
 
-from tracklake.pipeline.lake import Commit, LakeError, LakeFile, Manifest, connect, load, open_for_writing
+from tracklake.pipeline.lake import Commit, LakeError, LakeFile, Manifest, connect, load, load_recent, open_for_writing
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import DamagedShardError, SwapConflictError
 from tracklake.pipeline.lake.history import find_superseded, list_generations, load_as_of
@@ -328,3 +328,14 @@ def test_a_reader_whose_shards_were_swept_reads_the_root_again(tmp_path, monkeyp
     monkeypatch.setattr(LocalStore, "get", get)
     assert load(tmp_path).commits == {}
     assert [path for path in reads if path != "manifest.json"], "a shard of the old root was asked for"
+
+
+def test_the_recent_manifest_is_that_of_the_root_and_of_this_lake(tmp_path):
+    one, other = tmp_path / "one", tmp_path / "other"
+    CommitLog(one).replace(Manifest().add_commit(make_commit("ingest/highd/01", 0), 1))
+    CommitLog(other).replace(Manifest().add_commit(make_commit("ingest/highd/02", 0), 1))
+    for place in (one, other, one):
+        assert load_recent(place) == load(place)
+    assert load_recent(one) is load_recent(one)
+    CommitLog(one).replace(load(one).add_commit(make_commit("ingest/highd/03", 0), 1))
+    assert load_recent(one) == load(one)
