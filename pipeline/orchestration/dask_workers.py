@@ -7,20 +7,23 @@ import threading
 import time
 import uuid
 import warnings
-from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
 from queue import Empty, SimpleQueue
 from typing import Any
 
+import dask
 from distributed import Client, LocalCluster, Security, rpc
 from distributed.scheduler import KilledWorker
 from distributed.system import MEMORY_LIMIT
 
-from tracklake.pipeline.orchestration.batches import Call, Outcome, name_batch
+from tracklake.pipeline.lake.checksums import forget_checksums
+from tracklake.pipeline.orchestration.batches import Call, Outcome
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas.errors import TracklakeError
 
@@ -28,6 +31,8 @@ CONNECT_S = 10.0
 """Longest wait for a scheduler, in seconds."""
 WORKERS_WAIT_S = 60.0
 """Longest time without any worker, in seconds: at first, and while there is work."""
+ANSWER_S = 120.0
+"""Longest wait for an answer of the scheduler, or of workers that may have to import packages first, in seconds."""
 POLL_S = 1.0
 """Time between two looks at the workers while work goes on, in seconds."""
 LOCAL_DEATHS = 1
@@ -64,9 +69,8 @@ class DaskWorkers:
         self._places = places
         self._admitted: set[str] = set()
         self._guard = threading.Lock()
-        self._last_seen = time.monotonic()
-        self.slots = sum(client.nthreads().values())
-        self.batch_calls = 2 * self.slots
+        self._missing_since: float | None = None
+        self._count_slots(client.nthreads().values())
 
     def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
         """Yield the outcome of each call as it ends.
@@ -84,20 +88,20 @@ class DaskWorkers:
             else:
                 yield call, made
         for call in suspects:
-            for _, made in self._map(stage, [call]):
+            for _, made in self._map(stage, [call], priority=1):  # or it would wait behind one that kills its worker
                 if isinstance(made, KilledWorker):
                     yield call, _explain_deaths(made.allowed_failures + 1)
                 else:
                     yield call, made
 
-    def _map(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+    def _map(self, stage: str, calls: Sequence[Call], priority: int = 0) -> Iterator[Outcome]:
         """Send calls to the workers, and yield their outcomes as they end."""
         self.check_workers()
         batch = uuid.uuid4().hex
         keys = [f"{stage}-{batch}-{number}" for number in range(len(calls))]
         pending = dict(zip(keys, calls, strict=True))
         ended: SimpleQueue[Any] = SimpleQueue()
-        futures = self._client.map(Call.run, calls, key=keys, pure=False)
+        futures = self._client.map(Call.run, calls, key=keys, pure=False, priority=priority)
         try:
             for future in futures:
                 future.add_done_callback(ended.put)
@@ -112,7 +116,8 @@ class DaskWorkers:
                 yield pending.pop(future.key), made
         finally:
             if pending:
-                self._client.cancel(futures, force=True)
+                with suppress(Exception):  # a client that is closed has cancelled them, and another error is on its way
+                    self._client.cancel(futures, force=True)
 
     def _fetch(self, future: Any) -> Any:  # noqa: ANN401  (untyped in distributed; a record, or an exception)
         """Return the result of a call that has ended, or the exception that it raised."""
@@ -121,6 +126,9 @@ class DaskWorkers:
                 return future.result(timeout=POLL_S)
             except TimeoutError:  # its worker has died since; another does it again
                 self.check_workers()
+            except Exception:  # so does this one, and failed
+                if future.status not in ("error", "cancelled"):
+                    raise
         if future.status == "cancelled":
             raise self._explain_loss()
         return future.exception().with_traceback(future.traceback())
@@ -134,30 +142,54 @@ class DaskWorkers:
         with self._guard:
             if self._client.status != "running":
                 raise self._explain_loss()
-            try:
-                workers = self._client.nthreads().keys()
-            except OSError:
-                raise self._explain_loss() from None
-            now = time.monotonic()
+            threads = self._ask(self._client.nthreads)
+            workers = threads.keys()
             if workers:
-                self._last_seen = now
-            elif now - self._last_seen > WORKERS_WAIT_S:
+                self._missing_since = None
+                self._count_slots(threads.values())
+            elif self._missing_since is None:
+                self._missing_since = time.monotonic()
+            elif time.monotonic() - self._missing_since > WORKERS_WAIT_S:
                 raise WorkersError(
                     f"{self._name()}: no worker was left for {WORKERS_WAIT_S:g} s. What was committed to the lake is "
                     "kept: start workers, and run the same command again."
                 )
             if self._address is not None and workers - self._admitted:
-                self.refuse_unfit(workers - self._admitted)
-                self._admitted |= workers
+                self._admitted |= self.refuse_unfit(workers - self._admitted)
 
-    def refuse_unfit(self, workers: Collection[str], *, is_first: bool = False) -> None:
+    def _count_slots(self, threads: Collection[int]) -> None:
+        """Let the next batches be as large as the cluster is now, which may grow."""
+        self.slots = max(sum(threads), 1)
+        self.batch_calls = 2 * self.slots
+
+    def _ask(self, question: Callable[..., Any], *arguments: Any, **options: Any) -> Any:  # noqa: ANN401  (untyped in distributed)
+        """Return what a method of the client answers.
+
+        Raises:
+            WorkersError: the scheduler is lost, or it or a worker does not answer.
+        """
+        try:
+            return question(*arguments, callback_timeout=ANSWER_S, **options)
+        except TimeoutError:
+            raise WorkersError(
+                f"{self._name()}: the scheduler or a worker did not answer within {ANSWER_S:g} s: it hangs, or the "
+                "disk that holds its packages, the lake or the raw files does. What was committed to the lake is kept: "
+                "end what hangs, and run the same command again."
+            ) from None
+        except (OSError, CancelledError, RuntimeError):
+            raise self._explain_loss() from None
+
+    def refuse_unfit(self, workers: Collection[str], *, is_first: bool = False) -> set[str]:
         """Compare the packages of workers with those here, and find out whether they see the lake's folder.
+
+        Returns those that are fit; one that did not answer, as it is about to go, is neither fit nor refused.
 
         Raises:
             WorkersError: a worker lacks something, or has another version.
         """
-        here = {"Python": python_version()} | {name: found for name in PACKAGES if (found := _find_version(name))}
-        run, options = self._client.run, {"workers": list(workers), "on_error": "return"}
+        here = {"Python": python_version(), **_list_releases()}
+        run, options = partial(self._ask, self._client.run), {"workers": list(workers), "on_error": "return"}
+        fit = set()
         faults: dict[str, list[str]] = {}
         for name, own in here.items():
             found = run(python_version, **options) if name == "Python" else run(version, name, **options)
@@ -168,9 +200,14 @@ class DaskWorkers:
                     faults.setdefault(place, []).append(f"{name} is missing")
                 elif isinstance(answer, str) and _shorten(name, answer) != _shorten(name, own):
                     faults.setdefault(place, []).append(f"{name} {answer} instead of {own}")
-        if not faults:  # now that they should: tracklake may be listed and yet not be found
-            for place, answer in run(name_batch, (), **options).items():
-                if isinstance(answer, ImportError):
+        if not faults:  # now that they should: tracklake may be listed and not be found, or replaced since
+            for place, answer in run(begin_session, **options).items():
+                if isinstance(answer, dict):
+                    fit.add(place)
+                    old = [f"{name} {own}" for name, own in answer.items() if own != here.get(name, own)]
+                    if old:
+                        faults[place] = [f"still runs {', '.join(old)}, and must be started again"]
+                elif not isinstance(answer, OSError):
                     faults[place] = [f"tracklake cannot be imported: {answer}"]
         for path in () if is_first else self._places:
             for place, answer in run(os.path.exists, str(path), **options).items():
@@ -180,14 +217,15 @@ class DaskWorkers:
             listed = "\n".join(f"  {place}: {', '.join(found)}" for place, found in sorted(faults.items()))
             same = " ".join(f'"{name}=={own}"' for name, own in here.items() if name != "Python")
             raise WorkersError(
-                f"{self._name()}: nothing was sent to its workers, as some are not like this machine:\n{listed}\n"
+                f"{self._name()}: it is not used, as some of its workers are not like this machine:\n{listed}\n"
                 "Each needs the same packages, in the same versions, and the disks that hold the lake and the raw "
                 f"files at the same paths: pip install {same}"
             )
+        return fit
 
     def _ask_scheduler(self, package: str) -> str | PackageNotFoundError:
         try:
-            return str(self._client.run_on_scheduler(version, package))
+            return str(self._ask(self._client.run_on_scheduler, version, package))
         except PackageNotFoundError as missing:
             return missing
 
@@ -220,12 +258,16 @@ def open_workers(settings: Settings, places: Collection[Path]) -> Iterator[DaskW
         try:
             client.wait_for_workers(1, timeout=WORKERS_WAIT_S)
         except TimeoutError:
+            if address is None:
+                raise WorkersError(f"no Dask worker started on this machine within {WORKERS_WAIT_S:g} s.") from None
             raise WorkersError(
                 f"Dask at {address}: the scheduler has no workers, and none joined within {WORKERS_WAIT_S:g} s. Start "
-                "some: dask worker " + str(address)
+                f"some: dask worker {address}"
             ) from None
         workers = DaskWorkers(client, address, places)
-        if address is not None:
+        if address is None:
+            client.forward_logging("tracklake")  # those of an existing cluster have logs of their own
+        else:
             workers.refuse_unfit(client.nthreads().keys(), is_first=True)
         yield workers
 
@@ -236,7 +278,7 @@ def _connect(address: str) -> Any:  # noqa: ANN401  (untyped in distributed)
         asked = thread.submit(lambda: asyncio.run(asyncio.wait_for(_identify(address), CONNECT_S)))
         try:
             kind = asked.result()
-        except (OSError, ValueError) as failed:
+        except Exception as failed:  # noqa: BLE001  (each kind of address fails in its own way, such as TLS without keys)
             kind = str(failed) or "no answer"
     if kind != "Scheduler":
         raise WorkersError(
@@ -257,14 +299,22 @@ async def _identify(address: str) -> str:
 def _start_cluster(stack: ExitStack, workers: int) -> Any:  # noqa: ANN401  (untyped in distributed)
     """Start a scheduler in this process and workers in processes of one thread, which share the memory."""
     options: dict[str, Any] = {"memory_limit": MEMORY_LIMIT // workers, "preload": [SETUP]}
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-        scheduler_kwargs={"allowed_failures": LOCAL_DEATHS},
-        **options,
-    )
+    # A paused worker takes no more work until its memory falls, which it need not do while nothing is going on.
+    try:
+        with dask.config.set({"distributed.worker.memory.pause": False}):
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                scheduler_kwargs={"allowed_failures": LOCAL_DEATHS},
+                **options,
+            )
+    except RuntimeError as failed:
+        raise WorkersError(
+            f"Dask's workers could not be started on this machine: {failed} A script must call tracklake.run under "
+            '`if __name__ == "__main__":`, as each worker imports the script; else the lines above say why.'
+        ) from failed
     return stack.enter_context(cluster)
 
 
@@ -280,6 +330,18 @@ def _explain_deaths(tries: int) -> KilledWorkerError:
         "because its memory ran out. Give workers more memory (fewer at once, with --workers, or larger machines), and "
         "run the same command again."
     )
+
+
+def begin_session() -> dict[str, str]:
+    """Return the releases that a worker runs, and let it forget which files an earlier session has compared."""
+    forget_checksums()
+    return _list_releases()
+
+
+@cache
+def _list_releases() -> dict[str, str]:
+    """Return the releases of PACKAGES as they were first asked for: later ones on the disk are not what runs."""
+    return {name: found for name in PACKAGES if (found := _find_version(name))}
 
 
 def _find_version(package: str) -> str | None:

@@ -7,7 +7,7 @@ fingerprints (`pipeline.orchestration.run_plan`), so that an idle command never 
 import logging
 import os
 from contextvars import ContextVar
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -98,6 +98,7 @@ def _run_request(request: RunRequest, lock_timeout_s: float = 0.0) -> State[Any]
     A result with failures is Failed, and so is one without anything usable; refusals alone have a state of their own.
     """
     try:
+        request = replace(request, lake=str(request.root.absolute()))  # workers may stand in other folders
         plan = _PLAN.get() or _plan_here(request)
         settings = request.get_settings()
         if plan.is_idle:

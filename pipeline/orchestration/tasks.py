@@ -65,7 +65,7 @@ LOCK_POLL_S = 1.0
 class BatchFailedError(TracklakeError):
     """The end of a batch in which some calls failed, or which broke off; it carries the outcomes that there are."""
 
-    def __init__(self, outcomes: list[Outcome], broken: TracklakeError | None) -> None:
+    def __init__(self, outcomes: list[Outcome], broken: Exception | None) -> None:
         failures = [describe_error(made) for _, made in outcomes if isinstance(made, BaseException)]
         said = [str(broken)] if broken is not None else failures
         super().__init__(f"{len(failures)} of {len(outcomes)} failed: {said[0]}")
@@ -77,13 +77,14 @@ class BatchFailedError(TracklakeError):
 def do_batch(stage: str, title: str, do: Callable[[], Iterator[Outcome]]) -> list[Outcome]:
     """Do one stage's work on a batch of recordings, and return its outcomes."""
     del title
-    outcomes, broken = [], None
+    outcomes: list[Outcome] = []
+    broken: Exception | None = None
     try:
         for call, made in do():
             outcomes.append((call, made))
             for name in call.titles:
                 reporter().advance(stage, name)
-    except TracklakeError as error:  # of the workers as a whole
+    except Exception as error:  # noqa: BLE001  (of the workers as a whole, raised once all outcomes are committed)
         broken = error
     if broken is not None or any(isinstance(made, BaseException) for _, made in outcomes):
         raise BatchFailedError(outcomes, broken)
@@ -94,7 +95,7 @@ def _do_calls(engine: Engine, stage: str, calls: Sequence[Call]) -> Iterator[lis
     """Do a stage's calls and yield the outcomes of each batch as it ends.
 
     Raises:
-        TracklakeError: the workers broke off; what they had done was yielded before.
+        Exception: the workers broke off; what they had done was yielded before.
     """
     reporter().begin(stage, sum(len(call.titles) for call in calls))
     batches = divide_calls(engine, calls)

@@ -1,13 +1,16 @@
 """Functions that Dask workers run in tests: some die, as a worker does whose memory ran out."""
 
+import logging
 import os
 import signal
 import time
 from pathlib import Path
 from unittest import mock
 
+import dask
+
 from tracklake.pipeline.lake import files
-from tracklake.pipeline.orchestration import batches
+from tracklake.pipeline.orchestration import batches, dask_workers
 
 
 def die(*_anything: object) -> None:
@@ -40,6 +43,17 @@ def add(first: int, second: int) -> int:
     if first < 0:
         raise ValueError(f"{first} is negative")
     return first + second
+
+
+def warn(text: str) -> object:
+    """Log a warning as tracklake does, and return at which share of its memory this worker pauses."""
+    logging.getLogger("tracklake").warning(text)
+    return dask.config.get("distributed.worker.memory.pause")
+
+
+def run_old_release() -> None:
+    """Be a worker that was started before tracklake was installed in this version."""
+    dask_workers._list_releases = lambda: {"tracklake": "0.0.1"}
 
 
 def wait(folder: Path, number: int) -> None:

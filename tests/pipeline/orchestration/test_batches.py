@@ -1,5 +1,6 @@
 """Batches: how many there are, what they are called, and what is committed with them."""
 
+import logging
 from itertools import pairwise
 
 import pytest
@@ -11,6 +12,7 @@ from tracklake.pipeline.lake import Commit, LakeError, LakeFile, load, open_for_
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.orchestration import batches, flows, run_plan
 from tracklake.pipeline.orchestration.batches import Call, Threads, divide_calls, name_batch
+from tracklake.pipeline.orchestration.tasks import BatchFailedError, do_batch
 from tracklake.pipeline.sources import SourceError
 
 
@@ -57,6 +59,35 @@ def test_the_recordings_of_a_batch_are_one_commit(tmp_path, monkeypatch):
     sizes = [after - before for before, after in pairwise(stored) if after > before]
     assert sorted(sizes) == [1, 1, 2]  # 01 alone, 03 and 04, 05; batches end in any order
     assert load(root).generation == 1
+
+
+def test_what_a_batch_has_done_is_handed_on_where_its_workers_break_off():
+    (first, _) = calls = make_calls(2)
+
+    def break_off():
+        yield first, 0
+        raise RuntimeError("the loop is closed")
+
+    with pytest.raises(BatchFailedError, match="the loop is closed") as failed:
+        do_batch.fn("toy", name_batch(calls), break_off)
+    assert failed.value.outcomes == [(first, 0)]
+    assert isinstance(failed.value.broken, RuntimeError)
+
+
+def test_workers_of_a_served_flow_get_the_whole_path_of_a_lake(tmp_path, monkeypatch):
+    """Their working folders are others."""
+    asked = []
+
+    def refuse(request, *_others):
+        asked.append(request.lake)
+        raise SourceError("stop")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(flows, "_plan_here", lambda _request: run_plan.RunPlan())
+    monkeypatch.setattr(flows, "do_work", refuse)
+    monkeypatch.setattr(flows, "get_run_logger", logging.getLogger)
+    flows._run_request(run_plan.RunRequest("lake", ("ingest",), "raw"))
+    assert asked == [str(tmp_path / "lake")]
 
 
 def test_nothing_of_a_batch_is_committed_where_a_file_has_vanished(tmp_path):

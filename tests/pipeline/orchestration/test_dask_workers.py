@@ -1,6 +1,7 @@
 """Dask workers, in processes of their own: they fail, die, are missing, or lack what they need."""
 
 import contextlib
+import logging
 import os
 import socket
 import subprocess
@@ -9,8 +10,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
+from unittest import mock
 
 import polars
 import pytest
@@ -123,6 +127,37 @@ def test_results_and_errors_come_back_by_recording(workers):
     assert isinstance(made["01"], ValueError)
     assert "-1 is negative" in str(made["01"])
     assert made["01"].__traceback__ is not None
+
+
+def test_warnings_of_local_workers_reach_the_log_and_full_memory_pauses_none(workers):
+    """A paused worker would take no more work until its memory falls, which nothing makes fall."""
+    logged: SimpleQueue[logging.LogRecord] = SimpleQueue()
+    handler = QueueHandler(logged)
+    logging.getLogger("tracklake").addHandler(handler)
+    try:
+        ((_, pauses_at),) = workers.do("toy", make_calls(toy_calls.warn, ("tried again",)))
+        assert logged.get(timeout=10).getMessage() == "tried again"
+    finally:
+        logging.getLogger("tracklake").removeHandler(handler)
+    assert pauses_at is False
+
+
+def test_workers_that_cannot_be_started_are_an_error_that_names_the_guard_of_scripts(monkeypatch):
+    monkeypatch.setattr(dask_workers, "LocalCluster", mock.Mock(side_effect=RuntimeError("Nanny failed to start.")))
+    with pytest.raises(WorkersError, match="A script must call"):
+        open_workers(Settings(runner="dask"), ()).__enter__()
+
+
+def test_a_worker_that_hangs_or_runs_an_old_release_is_an_error(workers, monkeypatch):
+    monkeypatch.setattr(dask_workers, "ANSWER_S", 0.5)
+    with pytest.raises(WorkersError, match=r"did not answer within 0\.5 s: it hangs"):
+        workers._ask(workers._client.run, time.sleep, 1.0)
+    monkeypatch.undo()
+    names = workers._client.nthreads().keys()
+    assert workers.refuse_unfit(names) == set(names)
+    workers._client.run(toy_calls.run_old_release)
+    with pytest.raises(WorkersError, match=r"still runs tracklake 0\.0\.1, and must be started again"):
+        workers.refuse_unfit(names)
 
 
 @pytest.fixture
@@ -239,6 +274,7 @@ def test_an_address_must_be_that_of_a_scheduler_with_workers(tmp_path, monkeypat
         assert refuse(address).startswith(f"dask_address = {address}: no Dask scheduler answered within 0.5 s")
     assert "no Dask scheduler answered within 0.5 s" in refuse(address)
     assert "unknown address scheme" in refuse("htp://host:8786")
+    assert "check your TLS configuration" in refuse("tls://127.0.0.1:8786")
     with LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as cluster:
         said = refuse(cluster.scheduler_address)
     assert "the scheduler has no workers, and none joined within 0.5 s" in said
