@@ -93,6 +93,27 @@ def find_missing(folder: Folder, jobs: Iterable[Job], manifest: Manifest, datase
     ]
 
 
+def find_renamed(jobs: Sequence[Job], manifest: Manifest) -> list[Commit]:
+    """Return the commits of recordings whose rows these jobs make recordings of other names of.
+
+    That is where a file that holds several recordings was read with another `--recording` before.
+    """
+    planned = {job.key for job in jobs}
+    read = {
+        (job.inputs["dataset"], source["sha256"])
+        for job in jobs
+        for source in job.built_from["sources"]
+        if source["sha256"] in manifest.sources
+    }
+    return [
+        commit
+        for commit in manifest.of_stage("ingest")
+        if commit.key not in planned
+        and commit.info["recording"] is not None
+        and all((commit.info["dataset"], file["sha256"]) in read for file in commit.built_from["sources"])
+    ]
+
+
 def find_superseded(discovery: Discovery, manifest: Manifest) -> list[Commit]:
     """Return commits of lines without a recording whose file was replaced by a new version, which was read."""
     now = {(str(file.path), file.name): file.sha256 for file in discovery.recognised}

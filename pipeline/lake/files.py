@@ -46,8 +46,12 @@ TABLE_BY_NAME = {table.name: table for table in TABLES}
 
 def name_table_file(table: Table, values: Mapping[str, str], fingerprint: str) -> str:
     """Return the path of a table's file: `.files/tracks/dataset=highd/subset=01-upper/part-<fingerprint>.parquet`."""
-    folders = [f"{name}={escape_name(values[name])}" for name in table.partition]
-    return "/".join([STORE, table.name, *folders, f"part-{fingerprint}.parquet"])
+    return f"{STORE}/{name_folder(table, values)}/part-{fingerprint}.parquet"
+
+
+def name_folder(table: Table, values: Mapping[str, str]) -> str:
+    """Return the folder of a table's files, below that of the store: `tracks/dataset=highd/subset=01-upper`."""
+    return "/".join([table.name, *(f"{name}={escape_name(values[name])}" for name in table.partition)])
 
 
 def escape_name(value: str) -> str:

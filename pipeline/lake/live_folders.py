@@ -8,7 +8,6 @@ files or none while one replaces the other.
 import os
 import shutil
 import uuid
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -21,19 +20,21 @@ from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest
 def list_names(commits: Iterable[Commit]) -> dict[str, str]:
     """Return the files of tables by the names that they have in the live folders: `tracks/.../part-01.parquet`.
 
-    The name is that of the recording, so that it stays when the recording's content is replaced. Further files of one
-    recording in a folder, those of its slices, are numbered after a comma, which no recording's name has here.
+    The name is that of the recording, so that it stays when the recording's content is replaced. Several files of one
+    recording in a folder, those of its slices, are numbered after a comma, which no recording's name has here; sorted
+    by name, they are in order of time.
     """
     names: dict[str, str] = {}
     for commit in commits:
         recording = escape_name(commit.tail.partition("/")[2] or "0")
-        files: Counter[PurePosixPath] = Counter()
+        by_folder: dict[PurePosixPath, list[str]] = {}
         for file in commit.all_files:
-            folders = PurePosixPath(file.path).parent
+            by_folder.setdefault(PurePosixPath(file.path).parent, []).append(file.path)
+        for folders, paths in by_folder.items():
             if folders.parts[0] == STORE:
-                files[folders] += 1
-                number = f",{files[folders]}" if files[folders] > 1 else ""
-                names[f"{folders.relative_to(STORE)}/part-{recording}{number}.parquet"] = file.path
+                for number, path in enumerate(paths, 1):
+                    part = f",{number:04d}" if len(paths) > 1 else ""
+                    names[f"{folders.relative_to(STORE)}/part-{recording}{part}.parquet"] = path
     return names
 
 

@@ -144,6 +144,7 @@ class IngestPlan:
         missing: commits whose files once stood in the source and are missing from it now.
         superseded: commits that a new version of their file makes void.
         moved: commits that stay, with the places where their files are now.
+        renamed: commits of recordings that the source's files now give under other names.
     """
 
     manifest: Manifest
@@ -152,6 +153,7 @@ class IngestPlan:
     missing: list[Commit]
     superseded: list[Commit]
     moved: list[Commit]
+    renamed: list[Commit]
 
 
 @dataclass(frozen=True)
@@ -232,7 +234,7 @@ def conclude_idle(request: RunRequest, plan: RunPlan) -> RunResult:
         with suppress(LakeError), open_for_writing(request.root) as writer:  # where it is busy, the next run will do
             remember_places(writer, request, plan.ingest)
     refused = [*plan.discovery.refusals, *plan.ingest.conflicts]
-    return RunResult(refused=refused, notes=explain_missing(plan.ingest))
+    return RunResult(refused=refused, notes=explain_missing(plan.ingest) + explain_renamed(plan.ingest))
 
 
 def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -> IngestPlan:
@@ -259,6 +261,7 @@ def plan_ingest(request: RunRequest, discovery: Discovery, manifest: Manifest) -
             for job, commit in removal.find_moved(planned, manifest)
             if job not in jobs
         ],
+        renamed=removal.find_renamed(planned, manifest),
     )
 
 
@@ -282,6 +285,7 @@ def remove_missing(writer: Writer, request: RunRequest, plan: IngestPlan, result
         )
     else:
         result.notes += explain_missing(plan)
+    result.notes += explain_renamed(plan)
 
 
 def remove_outdated(writer: Writer, request: RunRequest, settings: Settings) -> None:
@@ -300,6 +304,16 @@ def explain_missing(plan: IngestPlan) -> list[str]:
     many = not name.startswith("recording ")
     are, their = ("are", "their") if many else ("is", "its")
     return [f"{name} {are} in the lake, but {their} files are no longer in SOURCE; --prune removes {their} tables"]
+
+
+def explain_renamed(plan: IngestPlan) -> list[str]:
+    """Return a note about the recordings whose rows are in the lake under other names, too."""
+    if not plan.renamed:
+        return []
+    return [
+        f"{removal.name_recordings(plan.renamed)}: made of the same files as other recordings, so that the lake has "
+        "these rows twice; `tracklake remove RECORDING` takes them out"
+    ]
 
 
 def explain_not_rebuilt(before: set[str], manifest: Manifest) -> list[str]:

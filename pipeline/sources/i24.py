@@ -25,7 +25,7 @@ from tracklake.pipeline.sources.i24_frames import (
     put_on_frames,
 )
 from tracklake.pipeline.sources.ngsim import group
-from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, Spilled
+from tracklake.pipeline.sources.source import Canonical, Part, RawFile, Source, SourceError, Spilled
 from tracklake.pipeline.sources.spill import spill_rows
 from tracklake.pipeline.transforms.slices import Slice, cut_frames
 from tracklake.pipeline.transforms.tracks.headings import find_headings
@@ -40,6 +40,8 @@ LANE_FT = 12.0
 """Width of a lane in feet."""
 MAIN_LANE_SHARE = 0.05
 """Least share of a direction's entries, in the whole file, of a main lane; the shoulder left of lane 1 has fewer."""
+LONGEST_DAYS = 31
+"""Longest recording, in days; a wrong time would make one of decades."""
 MOST_LANES = 8
 """Highest number of a lane, right of the main lanes: of ramps."""
 ORIGIN_FT = {1: 58 * MILE_FT, -1: 64 * MILE_FT}
@@ -105,7 +107,8 @@ def spill_file(file: RawFile, folder: Path) -> Spilled:
         periods = points.partition_by("period", as_dict=True, include_key=False)
         if file.recording:
             shares = ((str(period), rows) for (period,), rows in sorted(periods.items()))
-            recordings[file.recording] += spill_rows(folder / file.recording, number, shares).total()
+            # Added as a counter, which leaves out a recording without rows: such a file is refused.
+            recordings += Counter({file.recording: spill_rows(folder / file.recording, number, shares).total()})
         else:
             shares = ((_name_period(period), rows) for (period,), rows in sorted(periods.items()))
             recordings += spill_rows(folder, number, shares)
@@ -223,6 +226,12 @@ def _to_long(parts: Sequence[Part], recording: str) -> Canonical:
     of_files = counts.group_by(FILE).agg(pl.col("rows").sum()).sort(FILE)["rows"].to_list()
     log, rejects = account_rows("i24", recording, parts, of_files, [])
     first, last = counts.select(first=pl.col("frame").min(), last=pl.col("frame").max()).row(0)
+    if last - first > LONGEST_DAYS * 86_400 * RATE_HZ:
+        begin, end = (datetime.fromtimestamp(frame / RATE_HZ, tz=UTC).date() for frame in (first, last))
+        raise SourceError(
+            f"recording {recording}: its trajectories are from {begin} to {end}; expected those of at most "
+            f"{LONGEST_DAYS} days. Give the files of one day, and repair wrong times, or leave out --recording."
+        )
     zero = first // PERIOD_FRAMES * PERIOD_FRAMES
     is_synthetic = rows.select(pl.col("synthetic").all()).collect(engine="streaming").item()
     facts = _describe_recording(recording, first - zero, last - zero, is_synthetic=is_synthetic)

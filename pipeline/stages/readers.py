@@ -11,14 +11,17 @@ from typing import Any
 import polars as pl
 
 from tracklake.pipeline.lake import Manifest, scan
-from tracklake.pipeline.lake.files import read_partition
+from tracklake.pipeline.lake.files import name_folder
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job, StageError
+from tracklake.pipeline.stages.stage import RECONSTRUCTION, Job, StageError
 from tracklake.pipeline.transforms.reconstruction.causal import filter_tracks
 from tracklake.pipeline.transforms.reconstruction.clean_tracks import replace_positions
 from tracklake.pipeline.transforms.slices import Slice, cut_frames
 from tracklake.schemas import FINDINGS, RECONSTRUCTED, RECONSTRUCTED_FINDINGS, SUBSETS, TRACKS, VEHICLES, Table
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
+
+CLEANING = (RECONSTRUCTION, "revalidate")
+"""Stages that the setting `reconstruct` leaves out."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +102,10 @@ class SubsetReader(LakeReader):
 
     def table(self, table: Table, *columns: str) -> pl.DataFrame:
         """Return a table's rows, sorted by its key where they are in several files; raises as `scan` does."""
-        files = [read_partition(table, file.path) == self.partition for file in self.manifest.live(table.name)]
-        if sum(files) < 2:
+        folder = f"{name_folder(table, self.partition)}/"
+        commits = self.manifest.commits.values()
+        # A lake has thousands of files: to search in a path takes a twentieth of reading its partition.
+        if sum(folder in file.path for commit in commits for file in commit.files.get(table.name, ())) < 2:
             return super().table(table, *columns)
         rows = self.scan(table).select(*dict.fromkeys([*(columns or table.dtypes), *table.key])).sort(table.key)
         return rows.select(columns or table.dtypes.keys()).collect()
@@ -118,10 +123,11 @@ class SubsetReader(LakeReader):
         needed = self.facts["entries"] * bytes_per_entry / 2**30
         if needed > (has := _measure_memory()):
             stage = self.job.key.partition("/")[0]
+            leave_out = "Leave the stage out (reconstruct = false), make" if stage in CLEANING else "Make"
             raise StageError(
                 f"{stage} works on all of {self.subset} at once: its {self.facts['entries']:,} entries need about "
-                f"{needed:,.0f} GiB of memory, and this machine has {has:,.0f} GiB. Leave the stage out (reconstruct = "
-                "false), make shorter recordings (I-24 MOTION: without --recording), or use a machine with more."
+                f"{needed:,.1f} GiB of memory, and this machine has {has:,.1f} GiB. {leave_out} shorter recordings "
+                "(I-24 MOTION: without --recording), or use a machine with more."
             )
 
     def cut(self, settings: Settings, context_s: float) -> Iterator["SubsetReader"]:

@@ -61,6 +61,7 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     for facts in inputs.subsets.sort("dataset", "subset").iter_rows(named=True):
         reader = inputs.reader.open_subset(facts["dataset"], facts["subset"])
         own = blocks.filter(pl.col("dataset") == facts["dataset"], pl.col("subset") == facts["subset"])
+        reader.require_memory(60)
         visits.append(find_visits(reader.table(TRACKS, "vehicle_id", "frame"), own))
         samples = reader.scan(SAMPLES)
         stride = facts["frame_rate_hz"] / recipe.rate_hz

@@ -26,8 +26,8 @@ class Slice:
 
     @property
     def name(self) -> str:
-        """Name of its files, after the fingerprint."""
-        return f"{self.first_frame}-{self.end_frame}"
+        """Name of its files, after the fingerprint; names in order are slices in order of time."""
+        return f"{self.first_frame:09d}-{self.end_frame:09d}"
 
     def is_own(self, frame: pl.Expr) -> pl.Expr:
         """Return whether the slice owns a frame."""
@@ -51,6 +51,7 @@ def cut_frames(frames: Integers, rows: Integers, most_rows: int, context: int) -
         context: number of frames on either side of a slice that it depends on.
     """
     before = np.concatenate([[0], np.cumsum(rows)])
+    most_rows = min(most_rows, int(before[-1]))  # NumPy cannot add a number of more than 63 bits
     first, end_of_all = int(frames[0]), int(frames[-1]) + 1
     while first < end_of_all:
         read = before[np.searchsorted(frames, first - context)]

@@ -141,19 +141,22 @@ def count_collisions(clock: pl.DataFrame, origins: Flags | None = None) -> int:
 
 def _build_line(clock: pl.DataFrame, cell_m: float) -> _Line:
     """Sort the entries by (tick, lane, x) and find which others each can reach."""
-    x_m, lane, tick = clock["x_m"].to_numpy(), clock["lane"].to_numpy(), clock["tick"].to_numpy()
+    lane, tick = clock["lane"].to_numpy(), clock["tick"].to_numpy()
+    # Rounded before the least one is taken away, so that distances do not depend on vehicles elsewhere.
+    x = np.rint(clock["x_m"].to_numpy() * UNITS_PER_M).astype(np.int64)
     lanes = int(lane.max()) - int(lane.min()) + 3
     cell = round(cell_m * UNITS_PER_M)
     reach = ROWS // 2 * cell
-    stretch = round((float(x_m.max()) - float(x_m.min())) * UNITS_PER_M) + reach + 2
+    stretch = int(x.max()) - int(x.min()) + reach + 2
     if (int(tick.max()) - int(tick.min()) + 1) * lanes * stretch >= 1 << 62:
+        least_m, most_m = x.min() / UNITS_PER_M, x.max() / UNITS_PER_M
         raise TracklakeError(
-            f"ticks {tick.min()} to {tick.max()}, lanes {lane.min()} to {lane.max()} and x_m {x_m.min()} to "
-            f"{x_m.max()} are too wide a span to search for neighbors: pass the entries of one recording at a time"
+            f"ticks {tick.min()} to {tick.max()}, lanes {lane.min()} to {lane.max()} and x_m {least_m} to {most_m} are "
+            "too wide a span to search for neighbors: pass the entries of one recording at a time"
         )
     location = (tick.astype(np.int64) - tick.min()) * lanes + (lane.astype(np.int64) - lane.min() + 1)
     location *= stretch
-    location += np.rint((x_m - x_m.min()) * UNITS_PER_M).astype(np.int64)
+    location += x - x.min()
 
     order = np.argsort(location).astype(np.int32)
     location = location[order]

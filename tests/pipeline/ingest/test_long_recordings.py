@@ -14,8 +14,9 @@ from stage_runs import run_stage
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import discover
-from tracklake.pipeline.lake import load, open_for_writing, scan
+from tracklake.pipeline.lake import Manifest, load, open_for_writing, scan
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.schemas import FINDINGS, LANE_CHANGE_EVENTS, NEIGHBORS, SAMPLES, TABLES, TRACKS
@@ -124,6 +125,37 @@ def test_slices_have_the_tables_of_the_whole(corridor, whole, tmp_path, entries)
         assert_frame_equal(made[table], frame, check_exact=True)
     files = [file for table in (TRACKS, SAMPLES, NEIGHBORS) for file in load(root).live(table.name)]
     assert len(files) > 6
+    # Files by name are slices in order of time, in the store and in the live folders.
+    shown = pl.scan_parquet(root / TRACKS.name)
+    for rows in (scan(root, load(root), TRACKS), shown):
+        assert rows.select((pl.col("frame").diff() > 0).over("subset", "vehicle_id").all()).collect().item()
+    assert shown.select(pl.len()).collect().item() == whole[TRACKS].height
     # A subset is read in the order of its key, in however many files it is.
     reader = LakeReader(root, load(root)).open_subset("i24", "day-east")
     assert reader.table(TRACKS, "frame", "x_m").equals(whole[TRACKS].filter(subset="day-east").select("frame", "x_m"))
+
+
+def test_a_file_of_which_no_trajectory_can_be_used_is_refused(tmp_path):
+    document = {"timestamp": [START, START + 0.04], "x_position": [1.0, 2.0], "y_position": [18.0, 18.0]}
+    file = tmp_path / "corridor.json"
+    file.write_text(json.dumps([{**document, "length": 15.0, "width": 6.0, "direction": 3}]), encoding="utf-8")
+    ((source, unread),) = ingest.find_unread_files(discover(file, recording="day", digest=hash_raw), Manifest())
+    with pytest.raises(SourceError, match="none of its 1 rows can be read; this one: direction is neither 1 nor -1"):
+        ingest.read_file(tmp_path / "lake", source.name, unread)
+
+
+def test_a_recording_of_decades_is_refused(tmp_path):
+    steps = np.arange(20)
+    documents = [
+        {
+            "timestamp": (begin + steps / 25).tolist(),
+            "x_position": (60.0 * 5280 + 3 * steps).tolist(),
+            "y_position": [18.0] * 20,
+            **{"length": 15.0, "width": 6.0, "coarse_vehicle_class": 0, "direction": 1},
+        }
+        for begin in (0, START)
+    ]
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "corridor.json").write_text(json.dumps(documents), encoding="utf-8")
+    with pytest.raises(SourceError, match="day: its trajectories are from 1970-01-01 to 2022-11-22; expected"):
+        make_lake(tmp_path / "raw", tmp_path / "lake", 10)

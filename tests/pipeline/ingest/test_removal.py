@@ -370,3 +370,28 @@ def test_a_name_that_two_datasets_have_must_be_qualified(tmp_path):
     removed, _ = remove_recordings(tmp_path, ["ngsim/01"])
     assert [item.name for item in removed] == ["ngsim/01"]
     assert set(load(tmp_path).commits) == {"ingest/highd/01"}
+
+
+def test_rows_that_are_in_the_lake_under_two_names_are_named(ingest, tmp_path):
+    documents = [
+        {
+            "_id": {"$oid": f"{number:024x}"},
+            "timestamp": [1_669_118_400 + 300 * number + frame / 25 for frame in range(20)],
+            "x_position": [60 * 5280 + 4.0 * frame for frame in range(20)],
+            "y_position": [18.0] * 20,
+            **{"length": 15.0, "width": 6.0, "coarse_vehicle_class": 0, "direction": 1},
+        }
+        for number in range(2)
+    ]
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "corridor.json").write_text(json.dumps(documents))
+    short = ["i-24-20221122-0600", "i-24-20221122-0605"]
+    assert ingest(tmp_path / "raw", tmp_path / "lake")["notes"] == []
+    assert counted(tmp_path / "lake") == dict.fromkeys(short, 20)
+    note = f"recordings {', '.join(short)}: made of the same files as other recordings, so that the lake has these rows"
+    for _ in range(2):  # also where nothing is left to do
+        said = ingest(tmp_path / "raw", tmp_path / "lake", settings={"recording": "day"})
+        assert [each for each in said["notes"] if each.startswith(note)]
+    assert counted(tmp_path / "lake") == {**dict.fromkeys(short, 20), "day": 40}
+    remove_recordings(tmp_path / "lake", short)
+    assert ingest(tmp_path / "raw", tmp_path / "lake", settings={"recording": "day"})["notes"] == []

@@ -1,5 +1,7 @@
 """Stages that work on a long subset in slices make the tables that they make of the whole subset, value for value."""
 
+from dataclasses import replace
+
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
@@ -8,7 +10,7 @@ from tracklake.pipeline.lake import load
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import repair, samples, traffic, validate
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.stage import StageError, list_results
+from tracklake.pipeline.stages.stage import Job, StageError, list_results
 from tracklake.schemas import SUBSETS
 
 
@@ -39,5 +41,7 @@ def test_tables_of_slices_are_those_of_the_whole(lake, stage, dataset, subset):
 def test_work_on_all_of_a_subset_that_the_memory_cannot_hold_is_refused(lake):
     reader = LakeReader(lake.root, load(lake.root)).open_subset("highd", "01-lower")
     reader.require_memory(800)
-    with pytest.raises(StageError, match=r"at once: its [\d,]+ entries need about [\d,]+ GiB .*reconstruct = false"):
-        reader.require_memory(10**12)
+    refusal = r"at once: its [\d,]+ entries need about [\d,]+\.\d GiB .* has [\d,]+\.\d GiB\. "
+    for stage, advice in (("reconstruct", r"Leave the stage out \(reconstruct = false\)"), ("tensors", "Make shorter")):
+        with pytest.raises(StageError, match=f"{stage} works on .*{refusal}{advice}"):
+            replace(reader, job=Job(f"{stage}/highd/01", "")).require_memory(10**12)

@@ -33,4 +33,14 @@ def test_cuts_by_hand():
     """Frames 0 to 9 with one row each, at most six rows, two frames of context."""
     made = cut_frames(np.arange(10), np.ones(10, np.int64), 6, 2)
     # 0 to 3 read 0 to 5; then two frames read six: 2 to 7, 4 to 9; the rest is six frames, too: 4 to 9.
-    assert [each.name for each in made] == ["0-4", "4-6", "6-10"]
+    assert [(each.first_frame, each.end_frame) for each in made] == [(0, 4), (4, 6), (6, 10)]
+
+
+def test_a_bound_beyond_all_numbers_is_one_slice():
+    (made,) = cut_frames(np.arange(10), np.ones(10, np.int64), 10**30, 2)
+    assert (made.first_frame, made.end_frame) == (0, 10)
+
+
+def test_names_in_order_are_slices_in_order_of_time():
+    names = [each.name for each in cut_frames(np.arange(0, 3000, 40), np.ones(75, np.int64), 1, 0)]
+    assert names == sorted(names)

@@ -39,6 +39,13 @@ def test_only_the_same_tick_and_adjacent_lanes():
     assert around([(1, 0, 100.0, 2), *others]) == {}
 
 
+def test_vehicles_at_other_ticks_change_nothing():
+    """Positions between whole units round alike, wherever the least one lies: that of a slice is another."""
+    scene = [(1, 1, 0.0, 2), (2, 1, 2.286 - 4e-8, 2)]
+    assert around(scene, tick=1) == {13 + 7: 2}
+    assert around([(1, 0, -0.99999997, 2), *scene], tick=1) == {13 + 7: 2}
+
+
 def test_lanes_of_neighbouring_ticks_are_not_adjacent():
     """The highest lane of one tick and the lowest of the next are sorted beside one another."""
     assert find_neighbors(make_clock([(1, 0, 0.0, 3), (2, 1, 0.0, 1), (3, 2, 0.0, 3)])).neighbors.is_empty()
