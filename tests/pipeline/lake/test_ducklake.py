@@ -12,7 +12,7 @@ from tracklake.pipeline.lake.ducklake import publish_ducklake
 from tracklake.pipeline.lake.object_access import find_extension
 from tracklake.schemas import TABLES, VEHICLES
 
-pytest.importorskip("duckdb_extension_ducklake")
+pytest.importorskip("duckdb_extension_ducklake", reason="the extra [ducklake] is not installed")
 
 
 def attach(path: Path) -> duckdb.DuckDBPyConnection:

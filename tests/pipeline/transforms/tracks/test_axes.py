@@ -171,7 +171,7 @@ def test_lanes_that_drift_off_the_axis_have_no_markings():
 
 @pytest.mark.parametrize("zone", [1, 31, 32, 60])
 def test_the_plane_of_utm_agrees_with_pyproj(zone):
-    pyproj = pytest.importorskip("pyproj")
+    pyproj = pytest.importorskip("pyproj", reason="the extra [onboard] is not installed")
     random = np.random.default_rng(zone)
     lat, lon = random.uniform(-80, 80, 200), random.uniform(-3, 3, 200) + 6 * zone - 183
     east, north = project_utm(lat, lon, zone)
