@@ -1,6 +1,6 @@
 """Selection of samples: the entries on a protocol's clock that can be prediction origins."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,8 +68,8 @@ def draw_samples(
     rates: dict[str, Any] = {"first_frame": first_frame, "frame_rate_hz": frame_rate_hz, "rate_hz": protocol.rate_hz}
     clock = put_on_clock(tracks.select(TRACK_COLUMNS), **rates)
     names = {"protocol": protocol.name, "dataset": dataset, "subset": subset}
-    own = find_own_ticks(clock, part, first_frame=first_frame, frame_rate_hz=frame_rate_hz, rate_hz=protocol.rate_hz)
-    entries = int(own.sum())
+    kept = find_own_ticks(clock, part, **rates)
+    entries = int(kept.sum())
     if has_lanes is None:
         has_lanes = not tracks["lane"].null_count()
     whole_subset = "excluded_subset" if excluded else None if has_lanes else "no_lane"
@@ -84,29 +84,42 @@ def draw_samples(
     early_ids = vehicle_starts.filter("early")["vehicle_id"].implode()
     would_be = find_would_be_neighbors(clock, missing_starts, **rates)
     clock = clock.with_columns(lane)
-    kept = own
 
-    def filter_piece(bounds: tuple[int, int]) -> tuple[pl.DataFrame, dict[str, int]]:
-        rows = slice(*bounds)
-        piece = clock[rows]
+    def find_reasons(piece: pl.DataFrame, rows: slice) -> dict[str, Flags]:
         applies = _find_short(piece, protocol) | {
             "early_vehicle": piece["vehicle_id"].is_in(early_ids).to_numpy(),
             "would_be_neighbor": would_be[rows],
         }
         if protocol.drop_error_findings:
             applies["error_finding"] = find_error_entries(piece, findings, protocol=protocol, **rates)
-        drops = _drop_entries(kept[rows], applies)
-        labels = label_maneuvers(piece, rate_hz=protocol.rate_hz)
-        return piece.hstack(labels).select(SAMPLE_COLUMNS).filter(kept[rows]), drops
+        return applies
 
-    pieces = map_in_threads(filter_piece, cut_runs(clock["segment"].to_numpy(), PIECE_ROWS))
-    samples = pl.concat(piece for piece, _ in pieces)
-    drops = {reason: sum(dropped.get(reason, 0) for _, dropped in pieces) for reason in DROP_REASONS}
+    samples, drops = _label_and_drop(clock, kept, find_reasons, protocol.rate_hz)
     nearest = find_nearest(clock, protocol.nearest, kept) if protocol.nearest else pl.lit(None)
     samples = samples.with_columns(nearest.alias("nearest"))
     clock = clock.select("vehicle_id", "tick", "x_m", "lane")  # frees memory for the neighbors
     neighbors = find_neighbors(clock, kept, cell_m=protocol.grid_cell_m)
     return _build_tables(entries, samples, drops, neighbors, all_collisions, names)
+
+
+def _label_and_drop(
+    clock: pl.DataFrame,
+    kept: Flags,
+    find_reasons: Callable[[pl.DataFrame, slice], dict[str, Flags]],
+    rate_hz: int,
+) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Label the entries, and clear the flags in `kept` of those that a reason drops; returns samples, and counts."""
+
+    def filter_piece(bounds: tuple[int, int]) -> tuple[pl.DataFrame, dict[str, int]]:
+        rows = slice(*bounds)
+        piece = clock[rows]
+        drops = _drop_entries(kept[rows], find_reasons(piece, rows))
+        labels = label_maneuvers(piece, rate_hz=rate_hz)
+        return piece.hstack(labels).select(SAMPLE_COLUMNS).filter(kept[rows]), drops
+
+    pieces = map_in_threads(filter_piece, cut_runs(clock["segment"].to_numpy(), PIECE_ROWS))
+    drops = {reason: sum(dropped.get(reason, 0) for _, dropped in pieces) for reason in DROP_REASONS}
+    return pl.concat(piece for piece, _ in pieces), drops
 
 
 def find_own_ticks(
