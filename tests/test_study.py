@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -13,7 +14,7 @@ import polars as pl
 import pytest
 from study.__main__ import main, run_arms
 from study.jobs import SCORES, Job, Lake, Workshop
-from study.page import lay_out_differences, lay_out_errors, lay_out_prices, render_pages
+from study.page import lay_out_differences, lay_out_errors, lay_out_leakage, lay_out_prices, render_pages
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results, UnprovenError, judge
@@ -264,6 +265,29 @@ def test_errors_of_two_splits_are_subtracted_with_both_their_intervals():
     assert found == pytest.approx({"difference": 2.0, "low": 1.5, "high": 2.5})
 
 
+def test_the_price_of_leakage_is_what_constant_velocity_does_not_share():
+    """Better than it by 1.0 m under the leaking split, by 0.6 m under the other: 0.4 m too little is shown."""
+    rows = [
+        {"arm": arm, "model": model, "against": against, "dataset": "all", "figure": "rmse_m", "seconds": 5.0}
+        | {"difference": value, "low": value - half, "high": value + half}
+        for arm, differences in (("csp-2018", (4.0, 5.0, -1.0)), ("generated", (2.0, 2.6, -0.6)))
+        for model, against, value, half in (
+            ("lstm", NOTHING, differences[0], 1.0),
+            ("constant-velocity", NOTHING, differences[1], 1.0),
+            ("lstm", "constant-velocity", differences[2], 0.3 if arm == "csp-2018" else 0.1),
+        )
+    ]
+    seeds = [{"arm": "csp-2018", "model": model, "seconds": 5.0} for model in ("constant-velocity", "lstm")]
+    results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds)})
+    half = math.sqrt(0.3**2 + 0.1**2)
+    price = results.price_leakage("lstm")
+    assert price == pytest.approx({"difference": -0.4, "low": -0.4 - half, "high": -0.4 + half})
+    (arm,) = next(piece.arms for piece in PIECES if piece.name == "leakage")
+    *_, own = lay_out_leakage(results, arm).splitlines()
+    assert own.startswith("| `lstm` | +2.00 (+0.59 to +3.41) | -0.40 (-0.72 to -0.08) |")
+    assert own.endswith("| shows 0.40 m too little |")
+
+
 def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     """0.4 m more with a defect of 20 % of the vehicles: 0.02 m per per cent."""
     (arm,) = next(piece.arms for piece in PIECES if piece.name == "defects")
@@ -303,6 +327,20 @@ def test_committed_pages_are_those_of_the_committed_tables():
         check_verdicts(page)
 
 
+def price_leaks_by_hand(comparisons):
+    """Subtract differences to constant velocity at 5 s under both splits; returns prices and bounds as printed."""
+    rows = comparisons.filter(against="constant-velocity", seconds=5.0, figure="rmse_m", dataset="all").to_dicts()
+    by_arm = {(row["arm"], row["model"]): row for row in rows}
+    said = set()
+    for arm, model in by_arm:
+        if arm == "csp-2018" and ("generated", model) in by_arm:
+            leaks, fair = by_arm[arm, model], by_arm["generated", model]
+            price = leaks["difference"] - fair["difference"]
+            half = math.hypot(leaks["high"] - leaks["difference"], fair["high"] - fair["difference"])
+            said |= {f"{value:+.2f}" for value in (price, price - half, price + half)}
+    return said
+
+
 def test_every_number_of_the_discussion_is_in_the_tables():
     """Decimals alone: numbers of seconds, sites and shares of intervals are whole."""
     tables = Results.read(DOCS).tables
@@ -312,6 +350,7 @@ def test_every_number_of_the_discussion_is_in_the_tables():
     differences = tables["comparisons"].select("difference", "low", "high")
     known = {f"{value:.2f}" for row in means.drop(key).rows() for value in row if value is not None}
     known |= {f"{value:+.2f}" for row in differences.rows() for value in row if value is not None}
+    known |= price_leaks_by_hand(tables["comparisons"])
     said = re.findall(r"(?<![\w.])[+-]?\d+\.\d+", (DOCS / "results-discussion.md").read_text())
     assert set(said) <= known
 
@@ -329,6 +368,12 @@ def test_the_plan_stays_within_four_hours_and_names_every_arm_once():
     assert len(set(names)) == len(names)
     assert sum(minutes for _, minutes in estimate_pieces(PIECES).values()) < 240
     assert sum(minutes for _, minutes in estimate_pieces(map(make_quick, PIECES)).values()) < 10
+
+
+def test_models_are_compared_with_those_that_are_scored_in_the_same_arm():
+    for arm in (arm for piece in PIECES for arm in piece.arms):
+        scored = {*arm.plain, *(own.name for own in arm.learners)}
+        assert {name for pair in arm.pairs for name in pair} <= scored, arm.name
 
 
 def test_every_setting_of_the_plan_is_one_of_its_model_and_every_name_that_of_a_run():

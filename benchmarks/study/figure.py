@@ -1,6 +1,6 @@
-"""The figure of errors over the horizon: a panel per arm, a line per model."""
+"""Figures of the study: errors over the horizon, a panel per arm; and what leakage and defects cost."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import altair as alt
 import polars as pl
@@ -48,3 +48,30 @@ def draw_errors(rows: pl.DataFrame, figures: Mapping[str, str]) -> Drawing:
     heading = alt.Title("Errors over the horizon", subtitle="means over seeds, in bands of all of them", offset=10)
     chart = panels.facet(alt.Facet("arm:N", sort=arms, header=header), columns=2).properties(title=heading)
     return Drawing(chart, {"errors": seeds.to_dicts()})
+
+
+def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
+    """Draw prices with their 95 % intervals, a panel for leakage and one for defects; orange where one excludes zero.
+
+    Args:
+        rows: those of `Results.list_prices`.
+    """
+    titles = {
+        "leakage": "Leakage: RMSE at 5 s beside constant velocity's under csp-2018, minus that under time-blocks",
+        "defects": "Defects of a fifth of the vehicles: RMSE at 5 s, minus that of training on clean traffic",
+    }
+    panels = []
+    for price, title in titles.items():
+        shown = [row for row in rows if row["price"] == price]
+        if shown:
+            base = alt.Chart(alt.NamedData("prices"), title=alt.Title(title, anchor="start", frame="group", fontSize=13))
+            base = base.transform_filter(f"datum.price == '{price}'").encode(
+                y=alt.Y("what:N", title=None, sort=[row["what"] for row in shown], axis=alt.Axis(labelLimit=320)),
+                color=alt.condition("datum.low > 0 || datum.high < 0", alt.value(ORANGE), alt.value(BLUE)),
+            )
+            interval = base.mark_rule(strokeWidth=2).encode(x=alt.X("low:Q", title="m"), x2="high:Q")
+            point = base.mark_point(filled=True, size=60, opacity=1).encode(x=alt.X("difference:Q", title="m"))
+            zero = alt.Chart(alt.NamedData("prices")).mark_rule(color=INK, strokeDash=[4, 3]).encode(x=alt.datum(0))
+            panels.append((zero + interval + point).properties(width=560, height=24 * len(shown)))
+    heading = alt.Title("What leakage and defects cost", subtitle="points and 95 % intervals, m", offset=10)
+    return Drawing(alt.vconcat(*panels, title=heading), {"prices": [dict(row) for row in rows]})

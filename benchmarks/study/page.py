@@ -1,4 +1,4 @@
-"""docs/results.md, its figure and docs/results-discussion.md, made of the committed tables and nothing else."""
+"""docs/results.md, its figures and docs/results-discussion.md, made of the committed tables and nothing else."""
 
 from functools import partial
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from study.figure import draw_errors
+from study.figure import draw_errors, draw_prices
 from study.pieces import PIECES
 from study.plan import Arm
 from study.results import FEW, Results, find_dataset, grid, judge
@@ -26,7 +26,7 @@ PAGES = ("results.md", "results-discussion.md")
 
 
 def write_pages(docs: Path) -> None:
-    """Write both pages and the figure of the tables in the same folder, and the tables where nothing was run yet."""
+    """Write both pages and the figures of the tables in the same folder, and the tables where nothing was run yet."""
     results = Results.read(docs)
     for name, table in results.tables.items():
         if not (docs / f"results-{name}.csv").exists():
@@ -38,6 +38,8 @@ def write_pages(docs: Path) -> None:
     drawn = results.tables["seeds"].filter(shown, group=EVERYTHING)
     if drawn.height:
         write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
+    if prices := results.list_prices():
+        write_file(docs / "results-prices.svg", draw_prices(prices).render(".svg"))
 
 
 def render_pages(results: Results) -> dict[str, str]:
@@ -51,6 +53,7 @@ def render_pages(results: Results) -> dict[str, str]:
         "missing": [piece for piece in PIECES if not any(arm.name in has for arm in piece.arms)],
         "has": has,
         "figures": FIGURES,
+        "prices": results.list_prices(),
         **{own.__name__: partial(own, results) for own in TABLES_OF_ARM},
     }
     return {name: templates.get_template(f"{name}.j2").render(given) for name in PAGES}
@@ -210,13 +213,26 @@ def lay_out_prices(results: Results, arm: Arm) -> str:
 
 
 def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
-    """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart."""
+    """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart.
+
+    The price, in the last columns, is what is left of it beside constant velocity, which learns nothing.
+    """
     seconds = results.list_seconds(arm.name)
-    body = [
-        [f"`{own}`", *(_format_difference(results.subtract(arm.name, fair, own, at)) for at in seconds)]
-        for own in results.list_models(arm.name)
-    ]
-    return grid(["model", *(f"{at:g} s" for at in seconds)], body)
+    body = []
+    for own in results.list_models(arm.name):
+        price = results.price_leakage(own, fair, arm.name) if own in results.list_networks(arm.name) else None
+        found = (*(results.subtract(arm.name, fair, own, at) for at in seconds), price)
+        body.append([f"`{own}`", *(_format_difference(each, is_judged=False) for each in found), _say_leakage(price)])
+    return grid(["model", *(f"{at:g} s" for at in seconds), f"price at {seconds[-1]:g} s", "in words"], body)
+
+
+def _say_leakage(price: dict[str, float] | None) -> str:
+    """Say what a split that leaks does to the error that is shown of a model."""
+    if price is None:
+        return "-"
+    metres = abs(price["difference"])
+    shown = {"better": f"shows {metres:.2f} m too little", "worse": f"shows {metres:.2f} m too much"}
+    return shown.get(judge(price["low"], price["high"]), "no price shown")
 
 
 def lay_out_forests(results: Results, arm: Arm) -> str:
@@ -286,12 +302,12 @@ def _format_figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _format_difference(found: dict[str, float] | None) -> str:
-    """Format a difference and its interval, after the verdict where there is one."""
+def _format_difference(found: dict[str, float] | None, *, is_judged: bool = True) -> str:
+    """Format a difference and its interval, after the verdict where there is one to be made."""
     if found is None:
         return "-"
     if found["low"] is None:
         return f"{found['difference']:+.2f}"
     says = judge(found["low"], found["high"])
-    verdict = f"{says} " if says in ("better", "worse") else ""
+    verdict = f"{says} " if is_judged and says in ("better", "worse") else ""
     return f"{verdict}{found['difference']:+.2f} ({found['low']:+.2f} to {found['high']:+.2f})"

@@ -96,14 +96,45 @@ class Results:
         found = rows.filter(model=model, against=against, seconds=seconds, figure=figure, dataset=find_dataset(arm))
         return found.row(0, named=True) if found.height else None
 
-    def subtract(self, arm: str, other: str, model: str, seconds: float) -> dict[str, float] | None:
-        """Subtract a model's RMSE in another arm, of other vehicles: squares of both intervals' halves add up."""
-        found = [self.compare(name, model, NOTHING, seconds, "rmse_m") for name in (arm, other)]
+    def list_pairs(self, arm: str) -> list[tuple[str, str]]:
+        """List the networks of an arm that were compared with another than the plain models, and that other."""
+        own = find_arm(arm)
+        made = self.of_arm("comparisons", arm).select("model", "against").unique().rows()
+        return [pair for pair in own.pairs if pair in made and pair[0] not in own.plain]
+
+    def subtract(
+        self, arm: str, other: str, model: str, seconds: float, against: str = NOTHING
+    ) -> dict[str, float] | None:
+        """Subtract a model's RMSE in another arm, of other vehicles: squares of both intervals' halves add up.
+
+        With `against`, it is the difference to that model which is subtracted.
+        """
+        found = [self.compare(name, model, against, seconds, "rmse_m") for name in (arm, other)]
         if found[0] is None or found[1] is None or None in (found[0]["low"], found[1]["low"]):
             return None
         difference = found[0]["difference"] - found[1]["difference"]
         half = sum((own["high"] - own["difference"]) ** 2 for own in found if own) ** 0.5
         return {"difference": difference, "low": difference - half, "high": difference + half}
+
+    def price_leakage(self, model: str, fair: str = "generated", leaking: str = "csp-2018") -> dict[str, float] | None:
+        """Price a split that leaks: what it adds, at the last horizon, to a model's difference to constant velocity."""
+        seconds = self.list_seconds(leaking)
+        return self.subtract(leaking, fair, model, seconds[-1], "constant-velocity") if seconds else None
+
+    def list_prices(self) -> list[dict[str, object]]:
+        """List the prices of leakage by model, and of defects by training, that were measured with an interval."""
+        found: list[tuple[str, str, dict[str, float] | None]] = []
+        if self.list_seconds("csp-2018"):
+            found += (("leakage", model, self.price_leakage(model)) for model in self.list_networks("csp-2018"))
+        for at in self.list_seconds("defects")[-1:]:
+            pairs = self.list_pairs("defects")
+            found += (("defects", own, self.compare("defects", own, clean, at, "rmse_m")) for own, clean in pairs)
+        keys = ("difference", "low", "high")
+        return [
+            {"price": price, "what": what, **{key: own[key] for key in keys}}
+            for price, what, own in found
+            if own is not None and own["low"] is not None
+        ]
 
     def prove(self, what: str, arm: str, model: str, against: str, seconds: float, figure: str = "rmse_m") -> str:
         """State that a model is `better` or `worse` than another, or that `no difference` is shown, with the interval.
