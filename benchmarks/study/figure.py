@@ -64,7 +64,8 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
     for price, title in titles.items():
         shown = [row for row in rows if row["price"] == price]
         if shown:
-            base = alt.Chart(alt.NamedData("prices"), title=alt.Title(title, anchor="start", frame="group", fontSize=13))
+            heading = alt.Title(title, anchor="start", frame="group", fontSize=13)
+            base = alt.Chart(alt.NamedData("prices"), title=heading)
             base = base.transform_filter(f"datum.price == '{price}'").encode(
                 y=alt.Y("what:N", title=None, sort=[row["what"] for row in shown], axis=alt.Axis(labelLimit=320)),
                 color=alt.condition("datum.low > 0 || datum.high < 0", alt.value(ORANGE), alt.value(BLUE)),
