@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 from study.__main__ import main, run_arms
+from study.figure import draw_curves, draw_prices
 from study.jobs import SCORES, Job, Lake, Workshop
 from study.page import lay_out_differences, lay_out_errors, lay_out_leakage, lay_out_prices, render_pages
 from study.pieces import PIECES
@@ -21,6 +22,7 @@ from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
 
 from tracklake.pipeline.cli.train import _check_name, read_model_settings
+from tracklake.schemas.chart_theme import BLUE, ORANGE
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.onboard.as_published import CONSTANT, DIFFERENCE, OURS, PUBLISHED
 
@@ -303,6 +305,28 @@ def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     *_, first, second = page.splitlines()
     assert first.endswith("| worse +0.40 (+0.30 to +0.50) | +0.0200 | +0.0200 | costs 0.40 m |")
     assert second.endswith("| +0.05 (-0.05 to +0.15) | +0.0025 | +0.0025 | no cost shown |")
+
+
+def test_losses_are_drawn_by_model_and_phase_and_prices_by_their_intervals():
+    phases = [("own", "mse", 0), ("own", "nll", 1), ("other", "nll", 0)]
+    rows = [
+        {"arm": "a", "model": model, "seed": 0, "lake": "a", "epoch": epoch + first, "phase": phase}
+        | {"loss": 2.0 - epoch, "validation_loss": 3.0 - epoch}
+        for model, phase, first in phases
+        for epoch in (0, 1)
+    ]
+    svg = draw_curves(pl.DataFrame(rows)).render(".svg").decode()
+    assert [name for name in ("own: mse", "own: nll", "other: nll", "other: mse") if f">{name}<" in svg] == [
+        "own: mse",
+        "own: nll",
+        "other: nll",
+    ]
+    price = {"price": "defects", "difference": 0.3, "low": 0.1, "high": 0.5}
+    doubtful = price | {"what": "gaps", "low": -0.1}
+    svg = draw_prices([price | {"what": "jumps"}, doubtful]).render(".svg").decode()
+    assert all(f">{name}<" in svg for name in ("jumps", "gaps"))
+    assert "Leakage" not in svg  # nothing of it was measured
+    assert re.findall(r'<line [^>]*stroke="([^"]+)" stroke-width="2"', svg) == [ORANGE, BLUE]
 
 
 INTERVAL = re.compile(r"(better|worse) (?:\()?([+-][\d.]+)[^()]*?\(?(?:95 % interval )?([+-][\d.]+) to ([+-][\d.]+)")

@@ -1,4 +1,4 @@
-"""Figures of the study: errors over the horizon, a panel per arm; and what leakage and defects cost."""
+"""Figures of the study: errors over the horizon, prices of leakage and defects, and losses by epoch."""
 
 from collections.abc import Mapping, Sequence
 
@@ -76,3 +76,26 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
             panels.append((zero + interval + point).properties(width=560, height=24 * len(shown)))
     heading = alt.Title("What leakage and defects cost", subtitle="points and 95 % intervals, m", offset=10)
     return Drawing(alt.vconcat(*panels, title=heading), {"prices": [dict(row) for row in rows]})
+
+
+def draw_curves(rows: pl.DataFrame) -> Drawing:
+    """Draw losses by epoch, a panel per model and phase: validation in orange, training in blue, a line per seed.
+
+    Args:
+        rows: `curves` of the study's tables.
+    """
+    panel = pl.format("{}: {}", "model", "phase").alias("panel")
+    drawn = rows.select(panel, pl.format("{} {}", "lake", "seed").alias("run"), "epoch", "loss", "validation_loss")
+    order = drawn["panel"].unique(maintain_order=True).to_list()
+    base = alt.Chart().encode(x=alt.X("epoch:Q", title="epoch"), detail="run:N")
+    training = base.mark_line(strokeWidth=1, color=BLUE).encode(y=alt.Y("loss:Q", title="loss").scale(zero=False))
+    validation = base.mark_line(strokeWidth=1.5, color=ORANGE).encode(y=alt.Y("validation_loss:Q").scale(zero=False))
+    panels = alt.layer(training, validation, data=alt.NamedData("curves"), width=260, height=160)
+    header = alt.Header(title=None, labelFontSize=13, labelFontWeight="bold", labelColor=INK, labelAnchor="start")
+    text = "orange: validation, blue: training; a line per seed; mse in m2, nll in nats"
+    chart = (
+        panels.facet(alt.Facet("panel:N", sort=order, header=header), columns=3)
+        .resolve_scale(x="independent", y="independent")
+        .properties(title=alt.Title("Losses by epoch", subtitle=text, offset=10))
+    )
+    return Drawing(chart, {"curves": drawn.to_dicts()})

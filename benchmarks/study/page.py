@@ -6,7 +6,7 @@ from pathlib import Path
 import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from study.figure import draw_errors, draw_prices
+from study.figure import draw_curves, draw_errors, draw_prices
 from study.pieces import PIECES
 from study.plan import Arm
 from study.results import FEW, Results, find_dataset, grid, judge
@@ -40,6 +40,8 @@ def write_pages(docs: Path) -> None:
         write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
     if prices := results.list_prices():
         write_file(docs / "results-prices.svg", draw_prices(prices).render(".svg"))
+    if (curves := results.tables["curves"]).height:
+        write_file(docs / "results-curves.svg", draw_curves(curves).render(".svg"))
 
 
 def render_pages(results: Results) -> dict[str, str]:
