@@ -10,11 +10,12 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
-from tracklake.pipeline.lake.errors import AlreadyStoredError, LakeError, MissingObjectError, SwapConflictError
+from tracklake.pipeline.lake.errors import LakeError, MissingObjectError, SwapConflictError
 from tracklake.pipeline.lake.history import name_root
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, Manifest, Retired, load
 from tracklake.pipeline.lake.places import LakePlace, open_store
 from tracklake.pipeline.lake.shards import Changes, append_changes, parse_shards
+from tracklake.pipeline.lake.store import find_tag, swap_own
 from tracklake.schemas import SCHEMA_VERSION
 from tracklake.schemas.hashing import hash_chunks
 
@@ -111,7 +112,7 @@ class CommitLog:
         }
         if self.is_migrated and any(root[name] != self._root[name] for name in ("generation", "lake_id")):
             self._keep_root()
-        self._tag = self.store.swap(MANIFEST, _encode(root), self._tag)
+        self._tag = swap_own(self.store, MANIFEST, _encode(root), self._tag)
         self.manifest, self._shards, self._root = manifest, shards, root
 
     def _find_time(self, manifest: Manifest, changes: Changes) -> str:
@@ -123,12 +124,16 @@ class CommitLog:
         return datetime.now(UTC).isoformat(timespec="seconds")
 
     def _keep_root(self) -> None:
-        """Keep the root that ends a generation."""
-        path, content = name_root(self._root["generation"]), _encode(self._root)
-        try:
-            self.store.put_new(path, content)
-        except AlreadyStoredError:  # by a process that was killed before it stored the next root
-            self.store.swap(path, content, self.store.get(path)[1])
+        """Keep the root that ends a generation.
+
+        Raises:
+            SwapConflictError: another process has replaced it since it was read, so that it need not be the last one.
+        """
+        path = name_root(self._root["generation"])
+        kept = find_tag(self.store, path)  # before the root is looked at, so that only a newer one can replace it then
+        if find_tag(self.store, MANIFEST) != self._tag:
+            raise SwapConflictError(f"{self._place}/{MANIFEST}: was changed by another writer")
+        swap_own(self.store, path, _encode(self._root), kept)
 
     def _rebase(self, manifest: Manifest) -> Manifest:
         """Return what is stored by now with the changes that a manifest was to bring.
@@ -138,8 +143,6 @@ class CommitLog:
         """
         base, ours = self.manifest, find_changes(self.manifest, manifest)
         self._read()
-        if _is_same(self.manifest, manifest):  # stored, but the store's answer was lost
-            return manifest
         if self.manifest.lake_id != base.lake_id:
             raise LakeError(f"{self._place}: another process has made or rebuilt this lake meanwhile. Run again.")
         if manifest.lake_id != base.lake_id:
@@ -150,7 +153,7 @@ class CommitLog:
         theirs = find_changes(base, self.manifest)
         for section, changed in ours.items():
             for name in changed.keys() & theirs[section].keys():
-                if changed[name] != theirs[section][name]:
+                if not _is_same(changed[name], theirs[section][name]):
                     raise LakeError(
                         f"{self._place}: another process has changed {name} ({section}) meanwhile; its version stays. "
                         "Run again, one process at a time."
@@ -159,9 +162,9 @@ class CommitLog:
         return _apply(self.manifest, manifest, ours, max(number, manifest.generation))
 
 
-def _is_same(manifest: Manifest, other: Manifest) -> bool:
-    numbers = {(each.lake_id, each.generation) for each in (manifest, other)}
-    return len(numbers) == 1 and not any(find_changes(manifest, other).values())
+def _is_same(item: object, other: object) -> bool:
+    """Return whether two items would be stored as the same; of one that was read, lists may have been tuples before."""
+    return json.dumps(item, sort_keys=True) == json.dumps(other, sort_keys=True)
 
 
 def find_changes(before: Manifest, after: Manifest) -> Changes:

@@ -66,7 +66,8 @@ class FileLocations:
         """Return the path or address of a file's content; in a folder with a part of a lake, where it is now."""
         if self._origin is not None and not Path(self.root, file.path).exists():
             kept = self._origin.objects / name_object(file)
-            return kept.as_posix() if kept.exists() else f"{self._origin.address}/{name_object(file)}"
+            is_whole = kept.exists() and kept.stat().st_size == file.bytes
+            return kept.as_posix() if is_whole else f"{self._origin.address}/{name_object(file)}"
         return f"{self.root}/{name_object(file) if self._is_remote else file.path}"
 
 

@@ -3,7 +3,13 @@
 import re
 from datetime import UTC, datetime, timedelta
 
-from tracklake.pipeline.lake.errors import AlreadyStoredError, LakeError, LakeMissingError, MissingObjectError
+from tracklake.pipeline.lake.errors import (
+    DamagedShardError,
+    LakeError,
+    LakeMissingError,
+    MissingObjectError,
+    SwapConflictError,
+)
 from tracklake.pipeline.lake.history import ROOTS, list_roots, name_root, read_kept_root
 from tracklake.pipeline.lake.lease import LEASE
 from tracklake.pipeline.lake.manifest import (
@@ -17,7 +23,7 @@ from tracklake.pipeline.lake.object_access import DIGEST_DIGITS, name_object
 from tracklake.pipeline.lake.object_store import PROBES, refuse_unconditional
 from tracklake.pipeline.lake.places import open_store
 from tracklake.pipeline.lake.shards import parse_shards
-from tracklake.pipeline.lake.store import Store
+from tracklake.pipeline.lake.store import Store, swap_own
 
 MARKER = ".tracklake"
 """First object of a lake on an object store, with the lake's id: what else is there was put there by us."""
@@ -27,7 +33,9 @@ OWN_OBJECTS = re.compile(
     r"manifest/[0-9a-f]{64}\.json|manifest/roots/\d+\.json|\.probe-[^/]*"
     rf"|(\.files|tensors|reports|models)/.*\.[0-9a-f]{{{DIGEST_DIGITS}}}(\.[^./]*)?"
 )
-"""Names of the objects that a lake makes and may delete. Others stay, also those of a lake in a folder below it."""
+"""Names of the objects that a lake makes and may delete. Others stay."""
+TOPS = (f"/{MARKER}", f"/{MANIFEST}")
+"""Ends of the paths of objects that stand at the top of a lake in a folder below."""
 
 
 def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = False) -> None:
@@ -63,8 +71,8 @@ def claim_place(store: Store, lake_id: str | None, *, replace_other: bool = Fals
     refuse_unconditional(store)
     if owner is None and lake_id is not None:
         try:
-            store.put_new(MARKER, lake_id.encode())
-        except AlreadyStoredError:
+            swap_own(store, MARKER, lake_id.encode(), None)
+        except SwapConflictError:
             raise LakeError(f"{store.place}: another process has just put a lake there. Run again.") from None
 
 
@@ -80,18 +88,26 @@ def sweep_objects(address: str) -> int:
     """Delete the objects of a lake that none of its kept states needs; returns how many.
 
     States are kept as in a folder, and for a day. What is younger than a day is kept, too: another writer may be about
-    to commit it.
+    to commit it. So is all that belongs to a lake in a folder below this one.
     """
     store = open_store(address)
     objects = [*store.list()]
     young = {item.path for item in objects if item.modified > datetime.now(UTC) - GRACE}
     others = (read_kept_root(store, path) for path in young if path.startswith(f"{ROOTS}/"))
     needed = {MANIFEST, MARKER, LEASE}
-    for document in (*list_roots(address), *(each for each in others if each is not None)):
+    *kept, present = list_roots(address)
+    for document in (present, *kept, *(each for each in others if each is not None)):
         needed |= {name_root(document["generation"]), *(shard.path for shard in parse_shards(document))}
-        commits = parse_manifest(address, collect_document(address, document)).commits.values()
+        try:
+            commits = parse_manifest(address, collect_document(address, document)).commits.values()
+        except DamagedShardError:
+            if document is present:
+                raise
+            continue  # nobody can read this earlier state
         needed |= {name_object(file) for commit in commits for file in commit.all_files}
+    inner = tuple(f"{item.path.rpartition('/')[0]}/" for item in objects if item.path.endswith(TOPS))
     old = {item for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)}
+    old = {item for item in old if not item.path.startswith(inner)}
     old &= {*store.list()} if old else set()  # what another writer has sent again meanwhile has another time
     store.delete(item.path for item in old)
     return len(old)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from tracklake.pipeline.lake.errors import AlreadyStoredError, MissingObjectError, StoreError, SwapConflictError
-from tracklake.pipeline.lake.store import Store, StoredObject
+from tracklake.pipeline.lake.store import Store, StoredObject, swap_own
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_file
@@ -51,6 +51,8 @@ _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(.*)", re.DOTALL)
 """Pattern of an address, also of one from which `Path` took a slash."""
 _OPTIONS = re.compile("[@?#]")
 """Pattern of what comes before or after credentials and options in an address."""
+_UNSAFE = re.compile(r"[*\[\]%\\\x00-\x1f]|(^|/)\.{0,2}/|/\.{1,2}$")
+"""Pattern of what DuckDB takes for a pattern, and of what clients decode or leave out, each in its own way."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"status code: (\d+ [A-Za-z ]+)")
 
@@ -70,6 +72,11 @@ def find_address(lake: Path | str) -> str | None:
         raise UsageError(
             f"{scheme}://...: an address names a bucket and a folder only. Credentials belong in the environment "
             "(docs/object-store.md)."
+        )
+    if _UNSAFE.search(rest):
+        raise UsageError(
+            f"{scheme}://{rest}: the folder of an address may have none of * [ ] % \\ in it, and no part that is "
+            "empty, one dot or two: not all readers would find it. Name another one."
         )
     if scheme not in ENDPOINTS or not bucket:
         expected = ", ".join(f"{each}://BUCKET/FOLDER" for each in ENDPOINTS)
@@ -265,12 +272,12 @@ def refuse_unconditional(store: Store) -> None:
     """
     path = f"{PROBES}{uuid.uuid4().hex}"
     lacking = "If-None-Match: *"
-    tag = store.put_new(path, b"1")
     try:
+        tag = swap_own(store, path, b"1", None)
         store.put_new(path, b"2")
     except AlreadyStoredError:
         lacking = "If-Match"
-        second = store.swap(path, b"3", tag)
+        second = swap_own(store, path, b"3", tag)
         try:
             store.swap(path, b"4", tag)
         except SwapConflictError:
@@ -301,7 +308,11 @@ def _describe_failure(failed: Exception) -> str:
     code, status = _CODE.search(text), _STATUS.search(text)
     if code or status:
         answer = ", ".join(found[1].strip() for found in (status, code) if found)
+        if answer.startswith("5"):
+            return f"the store failed, again and again ({answer}). Run the same command again later."
         return f"the store refused ({answer}). Check the credentials in the environment, and their rights."
     if "error sending request" in text:
         return "the store cannot be reached. Check the network, and the endpoint if one is set."
+    if "body" in text:
+        return "the transfer broke off, again and again. Check the network, and run the same command again."
     return f"{type(failed).__name__}. Check the credentials and the endpoint in the environment (docs/object-store.md)."

@@ -5,10 +5,13 @@ names files that need not be there: they are on the store, and are received when
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from tracklake.schemas.documents import read_json
+from tracklake.schemas.errors import FileAccessError, explain_file_errors
 from tracklake.schemas.files import write_file
 
 ORIGIN = ".origin"
@@ -50,9 +53,26 @@ class Origin(NamedTuple):
 
     def mark(self, root: Path) -> None:
         """Make a folder one that holds a part of this lake."""
-        root.mkdir(parents=True, exist_ok=True)
         described = {"address": self.address, "cache": str(self.cache), "cache_gb": self.cache_gb}
-        write_file(root / ORIGIN, json.dumps(described).encode())
+        with self.explain_errors(root):
+            root.mkdir(parents=True, exist_ok=True)
+            write_file(root / ORIGIN, json.dumps(described).encode())
+
+    @contextmanager
+    def explain_errors(self, path: Path) -> Iterator[None]:
+        """Say of an error on a file or folder here what it is for.
+
+        Raises:
+            FileAccessError: the block raised one, or an OSError.
+        """
+        try:
+            with explain_file_errors(path):
+                yield
+        except FileAccessError as failed:
+            raise FileAccessError(
+                f"{failed} This is the cache of {self.address}: make room there, or name another folder with the "
+                "setting `cache`."
+            ) from failed.__cause__
 
 
 def find_origin(root: Path) -> Origin | None:

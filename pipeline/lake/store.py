@@ -7,11 +7,12 @@ replaces only the content whose tag the caller has read. All that makes commits 
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from tracklake.pipeline.lake.errors import AlreadyStoredError, MissingObjectError, SwapConflictError
+from tracklake.pipeline.lake.errors import AlreadyStoredError, MissingObjectError, StoreError, SwapConflictError
 from tracklake.schemas.errors import FileAccessError, explain_file_errors
 from tracklake.schemas.files import is_unfinished, write_file
 from tracklake.schemas.hashing import hash_chunks
@@ -71,6 +72,29 @@ class Store(Protocol):
         Raises:
             MissingObjectError: there is no such object.
         """
+
+
+def swap_own(store: Store, path: str, data: bytes, tag: str | None) -> str:
+    """Swap content that no other writer makes: found there after an error, it was stored, and the answer lost.
+
+    A client repeats a request without an answer, and is then told that another writer was first. Raises as `swap`.
+    """
+    try:
+        return store.swap(path, data, tag)
+    except StoreError:
+        with suppress(StoreError):
+            found, stored = store.get(path)
+            if found == data:
+                return stored
+        raise
+
+
+def find_tag(store: Store, path: str) -> str | None:
+    """Return the tag of an object; None: there is none."""
+    try:
+        return store.get(path)[1]
+    except MissingObjectError:
+        return None
 
 
 class LocalStore:

@@ -19,7 +19,6 @@ from tracklake.pipeline.lake.object_access import name_object
 from tracklake.pipeline.lake.origin import Origin, find_origin
 from tracklake.pipeline.lake.places import open_store
 from tracklake.pipeline.lake.store import Store
-from tracklake.schemas.errors import FileAccessError
 from tracklake.schemas.text import quote_shell
 
 T = TypeVar("T")
@@ -93,13 +92,8 @@ def fetch_objects(origin: Origin, files: Iterable[LakeFile], root: Path | None =
     def fetch(file: LakeFile) -> None:
         kept = origin.objects / name_object(file)
         if find_damage(kept.parent, replace(file, path=kept.name)) is not None:
-            try:
+            with origin.explain_errors(kept):
                 receive_file(store, file, kept, advice)
-            except FileAccessError as full:
-                raise FileAccessError(
-                    f"{full} This is the cache of {origin.address}: make room there, or name another folder with the "
-                    "setting `cache`."
-                ) from full.__cause__
             _count_added(origin, file.bytes)
         os.utime(kept, ns=(time_ns(), kept.stat().st_mtime_ns))  # its checksum is known by the time of its last change
         if root is not None:

@@ -28,6 +28,8 @@ from tracklake.pipeline.lake.transfers import fetch_files, trim_cache
 from tracklake.pipeline.lake.writer import hold_lock
 from tracklake.schemas.hashing import hash_text
 
+FIRST_COPY_S = 30.0
+"""Longest wait for another process that makes the copy of a lake at the same time, in seconds."""
 CACHE = "tracklake"
 """Name of our folder in the user's folder of caches."""
 
@@ -80,15 +82,17 @@ def refresh_copy(origin: Origin) -> Path:
     """Bring the copy of a lake up to date, and return its folder; while another process writes to it, it is so already.
 
     Raises:
+        LakeLockedError: another process makes the lake again in the copy, where half of it is to be seen.
         LakeError: no lake is there, or it cannot be read.
     """
     origin.mark(origin.copy)
     manifest = load(origin.address)
+    is_new = not (origin.copy / MANIFEST).exists()
     try:
-        with hold_lock(origin.copy):
+        with hold_lock(origin.copy, wait_s=FIRST_COPY_S if is_new else 0.0):
             store_copy(origin.copy, manifest)
     except LakeLockedError:
-        if not (origin.copy / MANIFEST).exists():
+        if is_new or load(origin.copy).lake_id != manifest.lake_id:
             raise
     small = [file for commit in manifest.commits.values() if not commit.tail for file in commit.all_files]
     fetch_files(origin.copy, [file for file in small if not file.path.startswith((f"{STORE}/", f"{TENSORS}/"))])

@@ -166,13 +166,18 @@ def refuse_if_busy(root: Path, *, rebuild: bool = False) -> None:
 
 
 @contextmanager
-def hold_lock(root: Path) -> Iterator[None]:
-    """Hold the lock of a lake, whose folder is made where there is none."""
+def hold_lock(root: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Hold the lock of a lake, whose folder is made where there is none.
+
+    Args:
+        root: the lake's folder.
+        wait_s: longest wait for another process, in seconds.
+    """
     from filelock import FileLock, Timeout  # its import takes 50 ms, for which no query should wait
 
     try:
         root.mkdir(parents=True, exist_ok=True)
-        held = FileLock(root / LOCK, thread_local=False).acquire(blocking=False)
+        held = FileLock(root / LOCK, thread_local=False).acquire(timeout=wait_s, blocking=wait_s > 0)
     except Timeout:
         holder = ""
         with suppress(OSError):

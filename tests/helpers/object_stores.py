@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import socket
 import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator
@@ -14,8 +15,9 @@ from unittest import mock
 import pytest
 
 KEY_ID, SECRET = "AKIAEXAMPLEOFTESTS", "a/secret/that/must/be/written/nowhere"
-HEEDLESS, FORBIDDEN = "heedless", "forbidden"
-"""Beginnings of the names of buckets that ignore the conditions of writes, and that refuse everything."""
+HEEDLESS, FORBIDDEN, BUSY, FORGETFUL = "heedless", "forbidden", "busy", "forgetful"
+"""Beginnings of the names of buckets: those ignore the conditions of writes, refuse everything, never have time,
+or lose the answer to each write except of tables: a client repeats it, and gets the second answer."""
 REFUSAL = (
     "<Error><Code>SignatureDoesNotMatch</Code><Message>no</Message>"
     f"<AWSAccessKeyId>{KEY_ID}</AWSAccessKeyId><StringToSign>{SECRET}</StringToSign></Error>"
@@ -43,7 +45,7 @@ class ObjectStoreServer:
         import boto3
 
         name = f"{kind}-{uuid.uuid4().hex}"
-        if kind != FORBIDDEN:
+        if kind not in (FORBIDDEN, BUSY):
             region = {"LocationConstraint": "eu-north-1"}
             with mock.patch.dict(os.environ, self.environment):
                 client = boto3.client("s3", endpoint_url=self.url, region_name="eu-north-1")
@@ -57,17 +59,28 @@ def _make_application() -> Callable[..., Iterable[bytes]]:
 
     moto = DomainDispatcherApplication(create_backend_app)
     one_at_a_time = threading.Lock()  # moto looks at a condition first, and writes then
+    repeated = set()
 
     def answer(request: dict[str, object], start: Callable[..., object]) -> Iterable[bytes]:
         bucket = str(request["PATH_INFO"]).lstrip("/")
         if bucket.startswith(FORBIDDEN):
             start("403 Forbidden", [("Content-Type", "application/xml")])
             return [REFUSAL.encode()]
+        if bucket.startswith(BUSY):
+            start("503 Slow Down", [("Content-Type", "application/xml")])
+            return [b"<Error><Code>SlowDown</Code></Error>"]
         if bucket.startswith(HEEDLESS):
             for name in ("HTTP_IF_MATCH", "HTTP_IF_NONE_MATCH"):
                 request.pop(name, None)
         with one_at_a_time:
-            return moto(request, start)
+            answered = moto(request, start)
+        if bucket.startswith(FORGETFUL) and request["REQUEST_METHOD"] == "PUT" and "/lake/" in bucket:
+            write = (re.sub("[0-9a-f]{64}", "", bucket), request.get("HTTP_IF_MATCH"))  # another try has another shard
+            if ".parquet" not in bucket and write not in repeated:
+                repeated.add(write)
+                request["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
+                raise ConnectionError("the answer is lost")
+        return answered
 
     return answer
 

@@ -158,6 +158,19 @@ def test_an_address_with_credentials_is_refused_and_not_repeated(lake):
     assert KEY_ID not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    "folder", ["a*b", "a[1]", "a%20b", "a%2Fb", "a\\b", "a//b", ".", "../b", "a/./b", "a/..", "a\nb"]
+)
+def test_a_folder_that_readers_take_in_different_ways_is_refused(folder):
+    with pytest.raises(UsageError, match="not all readers would find it"):
+        find_address(f"s3://bucket/{folder}")
+
+
+@pytest.mark.parametrize("folder", ["a b", "ü+日本", "it's", "a.b/..c", "year=2026/a&b", "a/b/"])
+def test_a_folder_with_unusual_letters_is_taken(folder):
+    assert find_address(f"s3://bucket/{folder}") == f"s3://bucket/{folder}".rstrip("/")
+
+
 @pytest.mark.parametrize("lake", ["http://host/lake", "ftp://host/lake", "s3://"])
 def test_other_addresses_are_refused(lake):
     with pytest.raises(UsageError, match="s3://BUCKET/FOLDER"):
