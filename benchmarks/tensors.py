@@ -37,6 +37,7 @@ from reference_loader import Reference
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
+from tracklake.pipeline.transforms.tensors.entries import TensorInputs
 from tracklake.schemas.arrays import expand_ranges
 from tracklake.schemas.columns import Table
 from tracklake.schemas.findings import FINDINGS
@@ -215,7 +216,7 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir()
 
-    def subsets() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
+    def subsets() -> Iterator[tuple[dict[str, Any], list[SubsetTensors]]]:
         clock = {"first_frame": 1, "frame_rate_hz": case["rate"]}
         for folder in folders:
             tensors = build_subset_tensors(
@@ -224,13 +225,13 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
                     "protocol", "vehicle_id", "tick", "lateral_maneuver", "longitudinal_maneuver"]),
                 pl.read_parquet(folder / "neighbors.parquet", columns=[
                     "protocol", "vehicle_id", "tick", "cell", "neighbor_id"]),
-                splits.filter(pl.col("subset") == folder.name),
+                TensorInputs(splits.filter(pl.col("subset") == folder.name),
                 vehicles=pl.read_parquet(folder / "vehicles.parquet"), findings=pl.read_parquet(
                     folder / "findings.parquet"),
-                protocol=CSP, storage=storage, **clock,
+                protocol=CSP, storage=storage, **clock),
             )  # fmt: skip
             yield {"dataset": "highd", "subset": folder.name, "frame_rate_hz": case["rate"],
-                   "lane_markings_m": None}, tensors  # fmt: skip
+                   "lane_markings_m": None}, [tensors]  # fmt: skip
 
     start, before = time.perf_counter(), time.process_time()
     index = write_tensors(target, subsets(), splits, CSP, storage=storage)

@@ -18,18 +18,18 @@ from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, Array
 
 def write_tensors(
     folder: Path,
-    subsets: Iterable[tuple[Mapping[str, Any], SubsetTensors]],
+    subsets: Iterable[tuple[Mapping[str, Any], Iterable[SubsetTensors]]],
     splits: pl.DataFrame,
     protocol: Protocol,
     *,
     storage: str,
     split_recipe: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write a tensor folder and return its index; no more than one subset is held in memory at a time.
+    """Write a tensor folder and return its index; no more than one part of a subset is held in memory.
 
     The folder is empty; the lake makes it visible afterwards. `subsets` are facts (dataset, subset, origin,
-    frame_rate_hz, lane_markings_m) and tensors of each, in the split's order; `split_recipe` has digest, parameters,
-    left_out_vehicles.
+    frame_rate_hz, lane_markings_m) and tensors of each, in one part or several, in the split's order; `split_recipe`
+    has digest, parameters, left_out_vehicles.
 
     Raises:
         ValueError: an array is missing, not of the declared dtype or shape, or there are too many rows.
@@ -42,13 +42,16 @@ def write_tensors(
         files = {array.name: opened.enter_context((folder / array.file).open("wb")) for array in ARRAYS}
         for array in ARRAYS:
             _write_header(files[array.name], array, storage, sizes)
-        for facts, tensors in subsets:
-            _check_arrays(tensors.arrays, storage, f"{facts['dataset']}/{facts['subset']}")
-            for name, values in join_after(tensors.arrays, sizes, len(described)).items():
-                values.tofile(files[name])
-            own = count_sizes(tensors.arrays)
-            sizes = {letter: count + own[letter] for letter, count in sizes.items()}
-            by_part += np.bincount(tensors.arrays["sample_part"], minlength=len(PARTS))
+        for facts, parts in subsets:
+            earlier: dict[str, int] | None = None
+            for tensors in parts:
+                _check_arrays(tensors.arrays, storage, f"{facts['dataset']}/{facts['subset']}")
+                for name, values in join_after(tensors.arrays, sizes, len(described), earlier).items():
+                    values.tofile(files[name])
+                own = count_sizes(tensors.arrays)
+                earlier = {letter: count + (earlier or {}).get(letter, 0) for letter, count in own.items()}
+                by_part += np.bincount(tensors.arrays["sample_part"], minlength=len(PARTS))
+            sizes = {letter: count + (earlier or {})[letter] for letter, count in sizes.items()}
             worst = np.maximum(worst, tensors.max_error_m)
             squares += tensors.squared_error_m2
             described.append(describe_subset(facts, tensors))

@@ -20,6 +20,9 @@ from tracklake.pipeline.transforms.slices import Slice, cut_frames
 from tracklake.schemas import FINDINGS, RECONSTRUCTED, RECONSTRUCTED_FINDINGS, SUBSETS, TRACKS, VEHICLES, Table
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
 
+CLEAN_CONTEXT_S = 3.0
+"""Time before and after an entry, in s, on which its row depends besides its reconstructed position: the sides of a
+filled gap of at most 2 s, and differences over 0.2 s."""
 CLEANING = (RECONSTRUCTION, "revalidate")
 """Stages that the setting `reconstruct` leaves out."""
 
@@ -96,9 +99,11 @@ class SubsetReader(LakeReader):
         return self.table(SUBSETS).row(0, named=True)
 
     def scan(self, table: Table) -> pl.LazyFrame:
-        """Return a table's rows lazily, tracks of the slice alone; raises as for the whole lake."""
+        """Return a table's rows lazily, entries of the slice alone; raises as for the whole lake."""
         rows = super().scan(table)
-        return rows if self.slice is None or table is not TRACKS else rows.filter(self.slice.is_read(pl.col("frame")))
+        if self.slice is None or table not in (TRACKS, RECONSTRUCTED):
+            return rows
+        return rows.filter(self.slice.is_read(pl.col("frame")))
 
     def table(self, table: Table, *columns: str) -> pl.DataFrame:
         """Return a table's rows, sorted by its key where they are in several files; raises as `scan` does."""
@@ -141,10 +146,15 @@ class SubsetReader(LakeReader):
         for each in cut_frames(frames, rows, settings.slice_entries, context):
             yield replace(self, slice=each)
 
-    def read_whole_tracks(self, settings: Settings, *columns: str) -> Iterator[pl.DataFrame]:
-        """Yield columns of the recorded tracks, whole tracks by id, as many at once as a worker holds of entries."""
+    def read_whole_tracks(
+        self, settings: Settings, *columns: str, tracks_from: TracksFrom = RECORDED
+    ) -> Iterator[pl.DataFrame]:
+        """Yield columns of whole tracks in order of vehicles, as many at once as a worker holds of entries.
+
+        Of filtered and reconstructed tracks, columns that depend on other vehicles (`gap_m`) are not among them.
+        """
         if not self.is_long(settings):
-            yield self.table(TRACKS, *columns)
+            yield self.read_tracks_from(tracks_from, *columns)
             return
         vehicles = self.table(VEHICLES, "vehicle_id", "entries", "first_frame", "last_frame").sort("vehicle_id")
         group = pl.col("entries").cast(pl.Int64).cum_sum() // settings.slice_entries
@@ -152,7 +162,16 @@ class SubsetReader(LakeReader):
             # Frames, too: the files of slices are sorted by these.
             is_own = pl.col("vehicle_id").is_between(some["vehicle_id"].min(), some["vehicle_id"].max())
             is_own &= pl.col("frame").is_between(some["first_frame"].min(), some["last_frame"].max())
-            yield self.scan(TRACKS).filter(is_own).select(columns).collect().sort("vehicle_id", "frame")
+            read = columns if tracks_from == RECORDED else tuple(TRACKS.dtypes)
+            tracks = self.scan(TRACKS).filter(is_own).select(read).collect().sort("vehicle_id", "frame")
+            if tracks_from == RECORDED:
+                yield tracks
+                continue
+            if tracks_from == RECONSTRUCTED_TRACKS:
+                motion = self.scan(RECONSTRUCTED).filter(is_own).collect()
+            else:
+                motion = filter_tracks(tracks, self.facts)
+            yield self._replace_positions(tracks, motion).select(columns)
 
     def read_tracks(self, settings: Settings, *columns: str) -> pl.DataFrame:
         """Return some columns of the subset's tracks (all where none is named), from what `tracks_from` says."""
@@ -161,15 +180,24 @@ class SubsetReader(LakeReader):
     def read_tracks_from(self, tracks_from: TracksFrom, *columns: str) -> pl.DataFrame:
         """Return tracks as recorded, or with filtered or reconstructed positions; those left out are as recorded.
 
-        Raises as `scan` does.
+        Slices have no filtered positions, which depend on all that was before. Raises as `scan` does.
         """
         if tracks_from == RECORDED:
             return self.table(TRACKS, *columns)
-        recorded = self.table(TRACKS)
         is_reconstructed = tracks_from == RECONSTRUCTED_TRACKS
-        motion = self.table(RECONSTRUCTED) if is_reconstructed else filter_tracks(recorded, self.facts)
-        tracks = replace_positions(recorded, motion, self.table(VEHICLES, "vehicle_id", "length_m"), self.facts)
+        wide = self
+        if self.slice is not None:
+            assert is_reconstructed
+            more = ceil(CLEAN_CONTEXT_S * self.facts["frame_rate_hz"])
+            wide = replace(self, slice=replace(self.slice, context=self.slice.context + more))
+        recorded = wide.table(TRACKS)
+        motion = wide.table(RECONSTRUCTED) if is_reconstructed else filter_tracks(recorded, self.facts)
+        tracks = self._replace_positions(recorded, motion)
+        tracks = tracks if self.slice is None else tracks.filter(self.slice.is_read(pl.col("frame")))
         return tracks.select(columns) if columns else tracks
+
+    def _replace_positions(self, tracks: pl.DataFrame, motion: pl.DataFrame) -> pl.DataFrame:
+        return replace_positions(tracks, motion, self.table(VEHICLES, "vehicle_id", "length_m"), self.facts)
 
     def read_findings(self, settings: Settings, *columns: str) -> pl.DataFrame:
         """Return the findings on the tracks that `read_tracks` returns; on filtered ones, those on the recorded."""

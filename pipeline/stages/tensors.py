@@ -11,14 +11,18 @@ import polars as pl
 
 from tracklake.pipeline.lake import Manifest, find_free_path, write_folder
 from tracklake.pipeline.lake.files import TENSORS
+from tracklake.pipeline.lake.scratch import open_scratch
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
 from tracklake.pipeline.stages.split import find_training_split
 from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Stage, StageError, StageResult
+from tracklake.pipeline.transforms.number_store import MakeStore
 from tracklake.pipeline.transforms.resample import put_on_clock
 from tracklake.pipeline.transforms.tensors.arrays import SubsetTensors, build_subset_tensors
+from tracklake.pipeline.transforms.tensors.entries import TensorInputs
+from tracklake.pipeline.transforms.tensors.parts import LongSubset, build_parts
 from tracklake.schemas import NEIGHBORS, SAMPLES, SPLIT_LEFT_OUT, SPLITS, VEHICLES
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.protocols import LATER, Protocol
@@ -45,17 +49,18 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     drops = drops_cut_samples(settings, split)
     cut_samples = np.zeros(len(PARTS), np.int64)
 
-    def build_all() -> Iterator[tuple[dict[str, Any], SubsetTensors]]:
-        for subset in included:
-            vehicles = left_out.filter(**subset.partition)["vehicle_id"]
-            blocks = splits.filter(**subset.partition)
-            tensors = build_subset(subset, blocks, vehicles, settings, drop_cut=drops)
-            cut_samples[:] += tensors.cut_samples
-            yield subset.facts, tensors
+    def build_one(subset: SubsetReader, make_store: MakeStore) -> Iterator[SubsetTensors]:
+        vehicles = left_out.filter(**subset.partition)["vehicle_id"]
+        blocks = splits.filter(**subset.partition)
+        for tensors in build_subset(subset, blocks, vehicles, settings, make_store, drop_cut=drops):
+            yield tensors
+        cut_samples[:] += tensors.cut_samples
 
     def write(folder: Path) -> None:
         recipe = {**_describe_recipe(settings, split), "left_out_vehicles": left_out.height}
-        write_tensors(folder, build_all(), splits, protocol, storage=storage, split_recipe=recipe)
+        with open_scratch(root) as make_store:
+            tensors = ((subset.facts, build_one(subset, make_store)) for subset in included)
+            write_tensors(folder, tensors, splits, protocol, storage=storage, split_recipe=recipe)
 
     path = find_free_path(root, f"{TENSORS}/{split}/{reader.job.fingerprint}")
     files = write_folder(root, path, write)
@@ -97,15 +102,17 @@ def read_split(reader: LakeReader, split: str) -> tuple[pl.DataFrame, pl.DataFra
 
 
 def build_subset(
-    reader: SubsetReader, blocks: pl.DataFrame, left_out: pl.Series, settings: Settings, *, drop_cut: bool
-) -> SubsetTensors:
-    """Read a subset's tables and build its arrays; see `build_subset_tensors`."""
+    reader: SubsetReader,
+    blocks: pl.DataFrame,
+    left_out: pl.Series,
+    settings: Settings,
+    make_store: MakeStore,
+    *,
+    drop_cut: bool,
+) -> Iterator[SubsetTensors]:
+    """Read a subset's tables and build its arrays, those of a long one in parts; see `build_subset_tensors`."""
     protocol = settings.get_protocol()
-    reader.require_memory(200)
-    return build_subset_tensors(
-        put_on_clock(reader.read_tracks(settings, *TRACK_COLUMNS), rate_hz=protocol.rate_hz, **reader.clock),
-        reader.table(SAMPLES, *SAMPLE_COLUMNS),
-        reader.table(NEIGHBORS, *NEIGHBOR_COLUMNS),
+    inputs = TensorInputs(
         blocks,
         vehicles=reader.table(VEHICLES, *VEHICLE_COLUMNS),
         findings=reader.read_findings(settings, *FINDING_COLUMNS),
@@ -115,6 +122,27 @@ def build_subset(
         drop_cut=drop_cut,
         **reader.clock,
     )
+
+    def read_clocks() -> Iterator[pl.DataFrame]:
+        for tracks in reader.read_whole_tracks(settings, *TRACK_COLUMNS, tracks_from=settings.tracks_from):
+            yield put_on_clock(tracks, rate_hz=protocol.rate_hz, **reader.clock)
+
+    def read_samples(low: int | None, high: int | None) -> tuple[pl.DataFrame, pl.DataFrame]:
+        bounds = [] if low is None else [pl.col("vehicle_id") > low]
+        bounds += [] if high is None else [pl.col("vehicle_id") <= high]
+        samples, neighbors = (
+            reader.scan(table).filter(pl.col("protocol") == protocol.name, *bounds).select(columns).collect()
+            for table, columns in ((SAMPLES, SAMPLE_COLUMNS), (NEIGHBORS, NEIGHBOR_COLUMNS))
+        )
+        return samples, neighbors
+
+    if reader.is_long(settings):
+        subset = LongSubset(read_clocks, read_samples, make_store, settings.slice_entries)
+        yield from build_parts(subset, inputs)
+        return
+    (clock,) = read_clocks()
+    tables = reader.table(SAMPLES, *SAMPLE_COLUMNS), reader.table(NEIGHBORS, *NEIGHBOR_COLUMNS)
+    yield build_subset_tensors(clock, *tables, inputs)
 
 
 def _list_sampled_subsets(reader: LakeReader, splits: pl.DataFrame, protocol: Protocol) -> Iterator[SubsetReader]:

@@ -60,3 +60,26 @@ def cut_frames(frames: Integers, rows: Integers, most_rows: int, context: int) -
         end = min(max(end, first + max(context, 1)), end_of_all)
         yield Slice(first, end, context)
         first = end
+
+
+def list_windows(first: Integers, size: Integers, most_rows: int) -> Iterator[tuple[Integers, Integers, Integers]]:
+    """Yield windows of time, in order, in which runs of consecutive frames have at most so many rows together.
+
+    A frame is not divided. Of each window: the runs that reach into it, how many of each one's frames lie before it,
+    and how many in it.
+
+    Args:
+        first: (R,) first frame of each run.
+        size: (R,) number of its frames.
+        most_rows: most rows of a window.
+    """
+    if not len(first):
+        return
+    zero, end = int(first.min()), first + size
+    changes = np.bincount(first - zero, minlength=int(end.max()) - zero + 1)
+    rows = np.cumsum(changes - np.bincount(end - zero, minlength=len(changes)))
+    frames = np.flatnonzero(rows)
+    for window in cut_frames(frames + zero, rows[frames], most_rows, 0):
+        runs = np.flatnonzero((first < window.end_frame) & (end > window.first_frame))
+        before = np.maximum(window.first_frame - first[runs], 0)
+        yield runs, before, np.minimum(size[runs], window.end_frame - first[runs]) - before

@@ -5,6 +5,7 @@ import polars as pl
 
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.transforms.tensors.arrays import build_subset_tensors
+from tracklake.pipeline.transforms.tensors.entries import TensorInputs
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.findings import FINDINGS
 from tracklake.schemas.protocols import Protocol
@@ -106,18 +107,22 @@ def build_subsets(tables, splits, *, protocol=TINY, storage="float32", markings=
         facts["lane_markings_m"] = markings
         yield (
             facts,
-            build_subset_tensors(
-                clock,
-                samples,
-                neighbors,
-                splits.filter(pl.col("subset") == subset),
-                vehicles=sizes_of(clock),
-                findings=found.filter(pl.col("subset") == subset),
-                first_frame=1,
-                frame_rate_hz=rate,
-                protocol=protocol,
-                storage=storage,
-            ),
+            [
+                build_subset_tensors(
+                    clock,
+                    samples,
+                    neighbors,
+                    TensorInputs(
+                        splits.filter(pl.col("subset") == subset),
+                        vehicles=sizes_of(clock),
+                        findings=found.filter(pl.col("subset") == subset),
+                        first_frame=1,
+                        frame_rate_hz=rate,
+                        protocol=protocol,
+                        storage=storage,
+                    ),
+                )
+            ],
         )
 
 

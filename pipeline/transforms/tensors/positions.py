@@ -1,5 +1,6 @@
 """Storage of positions in tensors: float32, or int16 in whole steps from the subset's centre."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +25,31 @@ class Stored:
     squared_error_m2: tuple[float, float]
 
 
-def store_positions(x_m: Floats, y_m: Floats, *, storage: str, where: str) -> Stored:
+def find_centre(medians_m: Sequence[float], storage: str) -> tuple[float, float]:
+    """Return the origin of stored positions: the medians in whole steps, so that positions on their grid are exact."""
+    step = np.array(STEPS_M[storage])
+    along, across = np.round(np.array(medians_m) / step) * step
+    return float(along), float(across)
+
+
+def store_positions(
+    x_m: Floats,
+    y_m: Floats,
+    *,
+    storage: str,
+    where: str,
+    centre_m: tuple[float, float] | None = None,
+    earlier_m2: tuple[float, float] = (0.0, 0.0),
+) -> Stored:
     """Round (N,) positions along the direction of travel and across it to one of POSITION_STORAGES; measure the error.
+
+    Args:
+        x_m: positions along the direction of travel.
+        y_m: positions across it.
+        storage: one of POSITION_STORAGES.
+        where: the subset, for messages.
+        centre_m: origin of int16 positions; None: that of these.
+        earlier_m2: sums of the squared errors of rows before these.
 
     Raises:
         TracklakeError: a position lies farther from the median than int16 reaches in the storage's steps.
@@ -39,8 +63,9 @@ def store_positions(x_m: Floats, y_m: Floats, *, storage: str, where: str) -> St
         read = steps.astype(np.float64)
     else:
         step = np.array(STEPS_M[storage])
-        # The centre is a whole number of steps, so positions on the steps' grid are stored exactly.
-        centre = np.round(np.median(given, axis=0) / step) * step if len(given) else np.zeros(2)
+        if centre_m is None:
+            centre_m = find_centre(np.median(given, axis=0).tolist(), storage) if len(given) else (0.0, 0.0)
+        centre = np.array(centre_m)
         counted = np.round((given - centre) / step)
         for axis, name in enumerate((_ALONG, _ACROSS)):
             farthest = float(np.abs(counted[:, axis]).max(initial=0.0))
@@ -53,7 +78,7 @@ def store_positions(x_m: Floats, y_m: Floats, *, storage: str, where: str) -> St
         steps = counted.astype(np.int16)
         read = (centre + counted * step).astype(np.float32).astype(np.float64)
     error = np.abs(read - given)
-    worst, squares = error.max(axis=0, initial=0.0), (error**2).sum(axis=0)
+    worst, squares = error.max(axis=0, initial=0.0), np.vstack([earlier_m2, error**2]).sum(axis=0)
     return Stored(
         steps=steps,
         centre_m=(float(centre[0]), float(centre[1])),

@@ -1,38 +1,36 @@
 """Scenes: all vehicles of a subset's tensors at one tick."""
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from tracklake.schemas.arrays import Integers, find_run_starts
+from tracklake.schemas.arrays import Bytes, Integers, find_run_starts
 
 
-@dataclass(frozen=True)
-class Scenes:
-    """C scenes with M vehicles in total, sorted by (block, tick); rows increase within a scene; a sample of -1 is none.
+def build_scene_arrays(
+    row: Integers, block: Integers, tick: Integers, sample: Integers, part_of_block: Bytes
+) -> dict[str, npt.NDArray[Any]]:
+    """Gather rows by block and tick; scenes without samples are left out, rows increase within a scene.
 
-    The vehicles of scene c are [offset[c], offset[c + 1]).
+    Args:
+        row: (N,) numbers of the rows, increasing.
+        block: (N,) their blocks.
+        tick: (N,) their ticks.
+        sample: (N,) number of the sample of each, -1 = none.
+        part_of_block: part of each block.
     """
-
-    offset: Integers
-    block: Integers
-    row: Integers
-    sample: Integers
-
-
-def find_scenes(tick: Integers, block: Integers, sample: Integers) -> Scenes:
-    """Gather rows sorted by (vehicle_id, tick) by block and tick; scenes without samples (-1 = none) are left out."""
     scene = (block << 32) | tick
-    row = np.argsort(scene, kind="stable")
-    start = find_run_starts(scene[row])
-    length = np.diff(start, append=len(row))
+    order = np.argsort(scene, kind="stable")
+    start = find_run_starts(scene[order])
+    length = np.diff(start, append=len(order))
     # A scene has samples if their running count grows over it.
-    running = np.concatenate([[0], np.cumsum(sample[row] >= 0)])
+    running = np.concatenate([[0], np.cumsum(sample[order] >= 0)])
     sampled = running[start + length] > running[start]
-    row = row[np.repeat(sampled, length)]
-    return Scenes(
-        offset=np.concatenate([[0], np.cumsum(length[sampled])]),
-        block=block[row[np.cumsum(length[sampled]) - length[sampled]]],
-        row=row,
-        sample=sample[row],
-    )
+    order = order[np.repeat(sampled, length)]
+    return {
+        "scene_offset": np.concatenate([[0], np.cumsum(length[sampled])]),
+        "scene_row": row[order],
+        "scene_sample": sample[order],
+        "scene_part": part_of_block[block[order[np.cumsum(length[sampled]) - length[sampled]]]],
+    }

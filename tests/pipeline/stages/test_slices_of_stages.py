@@ -1,14 +1,16 @@
 """Stages that work on a long subset in slices make the tables that they make of the whole subset, value for value."""
 
+import shutil
 from dataclasses import replace
 
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
+from stage_runs import run_stage
 
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import repair, samples, traffic, validate
+from tracklake.pipeline.stages import repair, revalidate, samples, traffic, validate
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import Job, StageError, list_results
 from tracklake.schemas import SUBSETS
@@ -24,18 +26,57 @@ def make_tables(stage, reader, **values):
     return {table: pl.concat(frames).sort(table.key) for table, frames in parts.items()}
 
 
-@pytest.mark.parametrize("stage", [validate, samples, traffic, repair])
+@pytest.mark.parametrize(
+    ("stage", "values"),
+    [
+        (validate, {}),
+        (revalidate, {}),
+        (samples, {}),
+        (samples, {"tracks_from": "reconstructed"}),
+        (traffic, {}),
+        (repair, {}),
+    ],
+)
 @pytest.mark.parametrize(("dataset", "subset"), [("highd", "01-lower"), ("ngsim", None)])
-def test_tables_of_slices_are_those_of_the_whole(lake, stage, dataset, subset):
+def test_tables_of_slices_are_those_of_the_whole(lake, stage, values, dataset, subset):
     reader = LakeReader(lake.root, load(lake.root))
     if subset is None:  # whose headways are recorded
         subset = reader.scan(SUBSETS).filter(dataset=dataset).sort("entries").collect()["subset"][0]
     own = reader.open_subset(dataset, subset)
-    whole, sliced = make_tables(stage, own), make_tables(stage, own, slice_entries=own.facts["entries"] // 3)
+    whole, sliced = (
+        make_tables(stage, own, **values, **sliced) for sliced in ({}, {"slice_entries": own.facts["entries"] // 3})
+    )
     assert len(list(own.cut(Settings(slice_entries=own.facts["entries"] // 3), 1.0))) > 2
     assert whole.keys() == sliced.keys()
     for table, frame in whole.items():
         assert_frame_equal(sliced[table], frame, check_exact=True)
+
+
+@pytest.mark.parametrize(
+    ("tracks_from", "storage"),
+    [("recorded", "int16-decimetres"), ("reconstructed", "float32"), ("filtered", "float32")],
+)
+def test_tensors_of_slices_are_those_of_the_whole(lake, tmp_path, tracks_from, storage):
+    def write(name, **values):
+        root = tmp_path / name
+        shutil.copytree(lake.root, root)
+        settings = Settings(lake=root, tracks_from=tracks_from, tensor_positions=storage, **values)
+        for stage in ("samples", "split", "tensors"):
+            run_stage(root, stage, settings)
+        commit = load(root).commits["tensors"]
+        assert list(find_scratch(root)) == []
+        return commit.info, {file.path: (root / file.path).read_bytes() for file in commit.all_files}
+
+    (info, files), (sliced, parts) = write("whole"), write("sliced", slice_entries=2_000)
+    assert info.pop("seconds") != sliced.pop("seconds"), "made once more"
+    assert sliced == info
+    assert info["samples"] > 1000
+    assert parts == files
+
+
+def find_scratch(root):
+    """What stages leave in the lake's staging folder."""
+    return (root / ".staging").glob("numbers-*")
 
 
 def test_work_on_all_of_a_subset_that_the_memory_cannot_hold_is_refused(lake):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracklake.pipeline.transforms.slices import cut_frames
+from tracklake.pipeline.transforms.slices import cut_frames, list_windows
 
 COUNTS = st.dictionaries(st.integers(0, 60), st.integers(1, 9), min_size=1)
 
@@ -44,3 +44,17 @@ def test_a_bound_beyond_all_numbers_is_one_slice():
 def test_names_in_order_are_slices_in_order_of_time():
     names = [each.name for each in cut_frames(np.arange(0, 3000, 40), np.ones(75, np.int64), 1, 0)]
     assert names == sorted(names)
+
+
+@given(st.lists(st.tuples(st.integers(-5, 40), st.integers(1, 12)), max_size=8), st.integers(1, 30))
+def test_windows_have_every_frame_of_every_run_once_in_order_of_time(runs, most_rows):
+    first, size = np.array(runs, np.int64).reshape(-1, 2).T
+    seen, last = [], -6
+    for chosen, before, inside in list_windows(first, size, most_rows):
+        rows = [(run, first[run] + b + k) for run, b, n in zip(chosen, before, inside, strict=True) for k in range(n)]
+        frames = {frame for _, frame in rows}
+        assert min(frames) > last
+        assert len(rows) <= most_rows or len(frames) == 1
+        last = max(frames)
+        seen += rows
+    assert sorted(seen) == [(run, f) for run in range(len(runs)) for f in range(first[run], first[run] + size[run])]

@@ -9,6 +9,7 @@ import pytest
 
 from tracklake.pipeline.lake.tensor_files import write_tensors
 from tracklake.pipeline.transforms.tensors.arrays import build_subset_tensors, count_sizes, join_after
+from tracklake.pipeline.transforms.tensors.entries import TensorInputs
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.findings import FINDINGS
 from tracklake.schemas.protocols import Protocol
@@ -78,7 +79,7 @@ GIVEN = {"vehicles": VEHICLES, "findings": FINDINGS.empty()} | AT_2_HZ
 
 def build_tensors(sampled=SAMPLED, around=None, split=WHOLE, clock=CLOCK, protocol=P, **more):
     around = neighbors() if around is None else around
-    return build_subset_tensors(clock, sampled, around, split, protocol=protocol, **(GIVEN | more))
+    return build_subset_tensors(clock, sampled, around, TensorInputs(split, protocol=protocol, **(GIVEN | more)))
 
 
 def build(**changes):
@@ -232,7 +233,9 @@ FACTS = {
 
 def test_the_index_names_protocol_subsets_blocks_sizes_and_errors(tmp_path):
     marked = FACTS | {"subset": "b", "lane_markings_m": [0.0, 4.0, 8.0, 12.0]}
-    index = write_tensors(tmp_path, [(FACTS, build_tensors()), (marked, build_tensors())], WHOLE, P, storage="float32")
+    index = write_tensors(
+        tmp_path, [(FACTS, [build_tensors()]), (marked, [build_tensors()])], WHOLE, P, storage="float32"
+    )
     assert json.loads((tmp_path / "index.json").read_text()) == index
     assert set(index) == INDEX_KEYS.keys()
     assert index["split"] == "s"
@@ -296,9 +299,9 @@ def test_arrays_of_another_kind_are_not_written(tmp_path):
     )
     for arrays, message in wrong:
         with pytest.raises(ValueError, match=message):
-            write_tensors(tmp_path, [(FACTS, replace(tensors, arrays=arrays))], WHOLE, P, storage="float32")
+            write_tensors(tmp_path, [(FACTS, [replace(tensors, arrays=arrays)])], WHOLE, P, storage="float32")
 
 
 def test_nothing_but_the_arrays_and_the_index_is_left(tmp_path):
-    write_tensors(tmp_path, [(FACTS, build_tensors())], WHOLE, P, storage="float32")
+    write_tensors(tmp_path, [(FACTS, [build_tensors()])], WHOLE, P, storage="float32")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["index.json", *(array.file for array in ARRAYS)])
