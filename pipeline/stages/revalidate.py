@@ -5,9 +5,7 @@ import polars as pl
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
 from tracklake.pipeline.stages.stage import INGEST, RECONSTRUCTION, Stage
-from tracklake.pipeline.stages.validate import describe_rules, open_scene
-from tracklake.quality_reports.rules.evaluate import judge, tracks_needed
-from tracklake.quality_reports.rules.registry import RULES, select_thresholds
+from tracklake.pipeline.stages.validate import describe_rules, judge_tracks
 from tracklake.schemas import RECONSTRUCTED_FINDINGS, RECONSTRUCTED_SUBSET_SCORES, Table
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 
@@ -18,8 +16,7 @@ two tracks keeps both: that the bounds of platoons move these apart does not men
 
 def build(reader: SubsetReader, settings: Settings) -> dict[Table, pl.DataFrame]:
     """Find what breaks rules in a subset's reconstructed tracks; tracks that were left out are as recorded."""
-    scene, lacking = open_scene(reader, reader.read_tracks_from(RECONSTRUCTED_TRACKS, *tracks_needed()))
-    judged = judge(scene, lacking | UNCHANGED, select_thresholds(RULES, settings.thresholds))
+    _, judged = judge_tracks(reader, settings, RECONSTRUCTED_TRACKS, UNCHANGED)
     return {RECONSTRUCTED_FINDINGS: judged.findings, RECONSTRUCTED_SUBSET_SCORES: judged.subset_scores}
 
 
@@ -30,7 +27,6 @@ STAGE = Stage(
     after=(INGEST, RECONSTRUCTION),
     settings=(describe_rules,),
     version=3,
-    bytes_per_entry=800,
     build=build,
     command=RECONSTRUCTION,
 )

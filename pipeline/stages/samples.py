@@ -20,7 +20,7 @@ from tracklake.schemas import (
     VEHICLE_STARTS,
     Table,
 )
-from tracklake.schemas.protocols import LAST_LANES, RECORDED
+from tracklake.schemas.protocols import FILTERED_TRACKS, LAST_LANES
 
 
 def build(reader: SubsetReader, settings: Settings) -> Iterator[StageResult]:
@@ -29,8 +29,8 @@ def build(reader: SubsetReader, settings: Settings) -> Iterator[StageResult]:
     context_s = max(protocol.history_s, protocol.horizon_s, LANE_WINDOW_S, BRAKE_HISTORY_S, BRAKE_FUTURE_S) + 1.0
     has_lanes = None
     drawn: list[dict[Table, pl.DataFrame]] = []
-    # Positions that were filtered or reconstructed depend on whole tracks.
-    for each in reader.cut(settings, context_s) if settings.tracks_from == RECORDED else [reader]:
+    # Filtered positions depend on all that was before.
+    for each in [reader] if settings.tracks_from == FILTERED_TRACKS else reader.cut(settings, context_s):
         if each.slice is not None and has_lanes is None:
             has_lanes = not reader.scan(TRACKS).select(pl.col("lane").null_count()).collect(engine="streaming").item()
         made = draw_samples(

@@ -14,7 +14,8 @@ from tracklake.quality_reports.rules.findings import judge_subset
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
 from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene, Whole, find_lacking
 from tracklake.quality_reports.rules.surveys import survey
-from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, TRACKS, VEHICLE_SCORES, VEHICLES
+from tracklake.schemas import FINDINGS, SUBSET_SCORES, SUBSET_STATUS, SUBSETS, VEHICLE_SCORES, VEHICLES
+from tracklake.schemas.protocols import RECORDED, TracksFrom
 
 LONGEST_WINDOW_S = 2.0
 """Time before and after an entry on which rules depend, in s, besides the stay of `lane_flicker`: reversals of jerk
@@ -40,14 +41,8 @@ def open_scene(reader: SubsetReader, tracks: pl.DataFrame) -> tuple[Scene, froze
 
 def build(reader: SubsetReader, settings: Settings) -> StageResult:
     """Find what breaks rules in a subset, score its vehicles, and judge the subset."""
-    limits = _select(settings)
-    slices = list(reader.cut(settings, LONGEST_WINDOW_S + resolve(RULES, limits)["lane_flicker_s"]))
-    if slices[0].slice is None:
-        tracks = reader.table(TRACKS, *tracks_needed())
-        judged = judge(*open_scene(reader, tracks), limits)
-    else:
-        tracks, judged = _judge_slices(slices, limits)
-    status = judge_subset(tracks, max_backward_share=settings.max_backward_share)
+    speeds, judged = judge_tracks(reader, settings, RECORDED)
+    status = judge_subset(speeds, max_backward_share=settings.max_backward_share)
     # No NGSIM recording has these, and no arterial a section, so a note about each of them would tell nothing.
     usual = {"lane_markings_m", "length_range_m", "heading_error_rad", *([] if reader.facts["freeway"] else ["lanes"])}
     lacking = [rule.name for rule in judged.unchecked if not usual & {*rule.columns, *rule.reads}]
@@ -65,20 +60,39 @@ def build(reader: SubsetReader, settings: Settings) -> StageResult:
     )
 
 
-def _judge_slices(slices: list[SubsetReader], limits: dict[str, float]) -> tuple[pl.DataFrame, Judgement]:
+def judge_tracks(
+    reader: SubsetReader, settings: Settings, tracks_from: TracksFrom, ignored: frozenset[str] = frozenset()
+) -> tuple[pl.DataFrame, Judgement]:
+    """Judge a subset's tracks by the rules that need none of the ignored columns, a long subset's slice by slice.
+
+    Also returns a speed for each entry, or of a long subset the least one of each vehicle.
+    """
+    limits = _select(settings)
+    slices = list(reader.cut(settings, LONGEST_WINDOW_S + resolve(RULES, limits)["lane_flicker_s"]))
+    if slices[0].slice is not None:
+        return _judge_slices(slices, tracks_from, ignored, limits)
+    tracks = reader.read_tracks_from(tracks_from, *tracks_needed())
+    scene, lacking = open_scene(reader, tracks)
+    return tracks, judge(scene, lacking | ignored, limits)
+
+
+def _judge_slices(
+    slices: list[SubsetReader], tracks_from: TracksFrom, ignored: frozenset[str], limits: dict[str, float]
+) -> tuple[pl.DataFrame, Judgement]:
     """Judge a subset slice by slice, after a look at all of them; also return the least speed of each vehicle."""
 
     def read(each: SubsetReader, *, context: bool) -> pl.DataFrame:
         assert each.slice is not None
         own = each if context else replace(each, slice=replace(each.slice, context=0))
-        return own.table(TRACKS, *tracks_needed())
+        return own.read_tracks_from(tracks_from, *tracks_needed())
 
     def open_one(tracks: pl.DataFrame) -> Scene:
         return open_scene(slices[0], tracks)[0]
 
     assert slices[0].slice is not None
     whole = survey((read(each, context=False) for each in slices), open_one, slices[0].slice.context)
-    lacking = open_scene(slices[0], whole.anchors)[1] | ({"heading_error_rad"} if not whole.has_headings else set())
+    lacking = ignored | open_scene(slices[0], whole.anchors)[1]
+    lacking |= {"heading_error_rad"} if not whole.has_headings else set()
 
     def open_all() -> Iterator[Scene]:
         for each in slices:

@@ -23,7 +23,7 @@ from tracklake.schemas import FINDINGS, LANE_CHANGE_EVENTS, NEIGHBORS, SAMPLES, 
 
 START = 1_669_118_400 + 300 - 24
 """24 s before a period ends, in s since 1970."""
-STAGES = ("validate", "repair", "assess", "traffic", "samples")
+STAGES = ("validate", "repair", "assess", "reconstruct", "revalidate", "traffic", "samples")
 LANES_FT = (18.0, 30.0, 42.0)
 
 
