@@ -129,21 +129,33 @@ def read_settings(
         if source.values:
             LOG.debug("settings from %s: %s", source.name, source.values)
     if in_folder and find_address(settings.lake) is not None:
-        origin = locate_origin(settings.lake, settings.cache, settings.cache_gb)
-        assert origin is not None
-        return settings.model_copy(update={"lake": refresh_copy(origin)})
+        return settings.model_copy(update={"lake": find_folder(settings.lake, settings)})
     follow_move(settings.lake)
     return settings
+
+
+def find_folder(lake: Path, settings: Settings) -> Path:
+    """Return the folder of a lake to read; of one on an object store that of its copy, which is brought up to date.
+
+    Raises:
+        LakeError: no lake is at the address.
+    """
+    if find_address(lake) is None:
+        return lake
+    origin = locate_origin(lake, settings.cache, settings.cache_gb)
+    assert origin is not None
+    return refresh_copy(origin)
 
 
 def refuse_address(settings: Settings) -> Path:
     """Return the folder of a lake.
 
     Raises:
-        UsageError: it is on an object store.
+        UsageError: it is on an object store, or what this machine holds of one.
     """
-    address = find_address(settings.lake)
-    if address is not None:
+    origin = locate_origin(settings.lake)
+    if origin is not None:
+        address = origin.address
         raise UsageError(
             f"{address}: this command works on a lake in a folder. Copy the lake to one by `tracklake fetch {address} "
             "--lake DIR`, name it by --lake DIR here, and send the result back by `tracklake publish store`."

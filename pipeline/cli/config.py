@@ -6,6 +6,7 @@ from typing import Any
 from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, WorkersOption
 from tracklake.pipeline.cli.tables import print_table
+from tracklake.pipeline.lake.object_store import find_address
 from tracklake.pipeline.settings import (
     OPTION,
     PROTOCOL_SETTINGS,
@@ -51,7 +52,8 @@ def _list_settings(settings: Settings, options: dict[str, Any]) -> dict[str, dic
     sources = read_sources(options)
     protocol = settings.get_protocol()
     values: dict[Key, Any] = {}
-    for name, value in settings.model_dump(mode="json").items():
+    lake = find_address(settings.lake) or str(settings.lake)
+    for name, value in {**settings.model_dump(mode="json"), "lake": lake}.items():
         table = resolve(ALL_RULES, settings.thresholds) if name == "thresholds" else value
         values |= (
             {(name, inner): own for inner, own in table.items()}

@@ -9,6 +9,7 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, QuietOption
 from tracklake.pipeline.cli.session import work_in_folder
 from tracklake.pipeline.ingest.removal import describe_sizes, remove_recordings
+from tracklake.pipeline.lake.object_store import find_address
 
 
 def remove(
@@ -34,6 +35,7 @@ def remove(
             terminal.print_line(
                 f"note: {', '.join(outdated)} were made of it and are removed, too; `tracklake run` makes them again"
             )
+        place = find_address(named.lake) or named.lake
         terminal.print_json(
-            {"lake": named.lake, "removed": [asdict(recording) for recording in removed], "outdated": outdated}
+            {"lake": place, "removed": [asdict(recording) for recording in removed], "outdated": outdated}
         )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tracklake.pipeline.cli.command import command, read_settings
+from tracklake.pipeline.cli.command import command, find_folder, read_settings
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, WorkersOption
 from tracklake.pipeline.cli.session import report_result, run_steps, work_in_folder
 from tracklake.pipeline.lake import load
@@ -35,9 +35,10 @@ def report(
 ) -> None:
     """Write the quality report."""
     with command(quiet=quiet, json=json) as terminal:
-        if compare is not None:
-            load(compare)  # raises where there is no lake, before any work is done
         named = read_settings(lake=lake, workers=workers, protocol=protocol, in_folder=False)
+        if compare is not None:
+            compare = find_folder(compare, named)
+            load(compare)  # raises where there is no lake, before any work is done
         with work_in_folder(terminal, named) as settings:
             if subsets:
                 _require_subsets(settings.lake, subsets)

@@ -59,6 +59,19 @@ def test_a_lake_is_fetched_and_followed(published, bucket, tmp_path):
     assert "0 files" in published("fetch", bucket, "--lake", tmp_path / "copy").out
 
 
+def test_what_a_machine_keeps_of_a_lake_is_not_taken_for_a_whole_one(published, bucket, tmp_path):
+    assert published("check", "--lake", bucket).code == 0
+    (copy,) = (tmp_path / "cache").glob("tracklake/*/lake")
+    for arguments in (("publish", "store", f"{bucket}2"), ("publish", "ducklake"), ("fetch", bucket), ("serve",)):
+        done = published(*arguments, "--lake", copy)
+        assert (done.code, f"`tracklake fetch {bucket} --lake DIR`" in done.err) == (2, True), done
+
+
+def test_the_address_is_shown_as_it_was_given(published, bucket):
+    done = published("config", "--lake", bucket, "--json")
+    assert json.loads(done.out)["settings"]["lake"]["value"] == bucket
+
+
 REFUSED = {
     ("serve", "--lake", "{bucket}"): (2, "this command works on a lake in a folder"),
     ("publish", "ducklake", "--lake", "{bucket}"): (2, "tracklake fetch {bucket} --lake DIR"),
@@ -156,7 +169,11 @@ def test_every_command_gives_at_an_address_what_it_gives_in_a_folder(machine, bu
             outputs.setdefault(name, []).append((files, scores))
     assert all(first == second for first, second in outputs.values())
     assert "nothing to do" in machine("two", "report", "--lake", bucket).out
-    assert machine("two", "remove", "02", "--lake", bucket).code == 0
+    for lake, other in ((bucket, folder), (folder, bucket)):
+        compared = machine("two", "report", "--lake", lake, "--compare", other, "--json")
+        assert json.loads(compared.out)["comparison"]["equal"], compared
+    removed = machine("two", "remove", "02", "--lake", bucket, "--json")
+    assert (removed.code, json.loads(removed.out)["lake"]) == (0, bucket)
     assert list_recordings(bucket) == ["01"]
 
 
