@@ -20,6 +20,7 @@ from unittest import mock
 import duckdb
 import pytest
 import vl_convert
+from cloud_stores import cloud as cloud
 from hypothesis import HealthCheck, settings
 from lake_sources import EXCERPTS, SAMPLE
 from object_stores import bucket as bucket

@@ -15,6 +15,7 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.logs import LOG, open_log
 from tracklake.pipeline.lake import follow_move
 from tracklake.pipeline.lake.object_store import find_address
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.working_copy import locate_origin, refresh_copy
 from tracklake.pipeline.settings import DEBUG, Settings, find_unknown_variables, read_sources
 from tracklake.schemas.errors import TracklakeError, UsageError, describe_bug
@@ -108,6 +109,8 @@ def read_settings(
 ) -> Settings:
     """Read the settings from files and environment, flags on top; a moved lake gets its catalog again.
 
+    The folder of what this machine holds of a lake on an object store stands for its address.
+
     Args:
         lake: the lake; this and the next ones are options of the command line.
         workers: recordings worked on at once.
@@ -128,6 +131,9 @@ def read_settings(
     for source in read_sources(given) if LOG.isEnabledFor(logging.DEBUG) else ():
         if source.values:
             LOG.debug("settings from %s: %s", source.name, source.values)
+    origin = find_origin(settings.lake)
+    if origin is not None:  # the copy that commands name: what it lacks is at the address
+        settings = settings.model_copy(update={"lake": Path(origin.address), "cache": origin.cache.parent})
     if in_folder and find_address(settings.lake) is not None:
         return settings.model_copy(update={"lake": find_folder(settings.lake, settings)})
     follow_move(settings.lake)
@@ -151,11 +157,10 @@ def refuse_address(settings: Settings) -> Path:
     """Return the folder of a lake.
 
     Raises:
-        UsageError: it is on an object store, or what this machine holds of one.
+        UsageError: it is on an object store.
     """
-    origin = locate_origin(settings.lake)
-    if origin is not None:
-        address = origin.address
+    address = find_address(settings.lake)
+    if address is not None:
         raise UsageError(
             f"{address}: this command works on a lake in a folder. Copy the lake to one by `tracklake fetch {address} "
             "--lake DIR`, name it by --lake DIR here, and send the result back by `tracklake publish store`."

@@ -97,7 +97,7 @@ def work_in_folder(terminal: Terminal, settings: Settings, *, rebuild: bool = Fa
     What is made there is committed at the store as it is made. After Ctrl-C or an error the same command goes on.
     """
     origin = locate_origin(settings.lake, settings.cache, settings.cache_gb)
-    if origin is None or settings.lake == origin.copy:
+    if origin is None:
         yield settings
         return
     terminal.print_line(f"working in {origin.copy}, a copy of {origin.address}", style="dim")

@@ -8,6 +8,7 @@ from typing import Any
 from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.cli.drives import list_drives
 from tracklake.pipeline.lake import connect, load
+from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
 from tracklake.quality_reports.drives import describe_drive, describe_drives
@@ -82,7 +83,9 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
     for name, value in lines.items():
         terminal.print_line(f"{name:<{width}}{value}")
     terminal.print_line(f"{'report':<{width}}{report.resolve()}", style="bold green")
-    lake_option = "" if lake == Path("lake") else f" --lake {quote_shell(lake)}"
+    origin = find_origin(lake)
+    named = lake if origin is None else origin.address
+    lake_option = "" if lake == Path("lake") else f" --lake {quote_shell(named)}"
     protocol = quality["provenance"]["protocol"]["name"]
     protocol_option = "" if protocol == "csp" else f" --protocol {protocol}"
     terminal.print_line("\nTry next:")

@@ -53,7 +53,7 @@ _OPTIONS = re.compile("[@?#]")
 """Pattern of what comes before or after credentials and options in an address."""
 _UNSAFE = re.compile(r"[*\[\]%\\\x00-\x1f]|(^|/)\.{0,2}/|/\.{1,2}$")
 """Pattern of what DuckDB takes for a pattern, and of what clients decode or leave out, each in its own way."""
-_CODE = re.compile(r"<Code>(\w+)</Code>")
+_CODE = re.compile(r"(?:<Code>|\(code: )(\w+)")
 _STATUS = re.compile(r"status code: (\d+ [A-Za-z ]+)")
 
 
@@ -176,9 +176,14 @@ class ObjectStore:
         import obstore
 
         named = [*paths]
-        with self._explain_errors():
-            if named:
+        if not named:
+            return
+        try:
+            with self._explain_errors():
                 obstore.delete(self._client, named)
+        except MissingObjectError:  # on Google's and Azure, and the others need not be deleted
+            for path in named if len(named) > 1 else ():
+                self.delete([path])
 
     def upload(self, path: str, file: Path) -> None:
         """Send a file; see `Store`."""

@@ -104,11 +104,16 @@ def object_store_server() -> Iterator[ObjectStoreServer]:
     thread.join()
 
 
+def forget_clouds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take what the machine's environment says of object stores out of it."""
+    for name in [name for name in os.environ if re.match("(AWS|GOOGLE|AZURE)_", name)]:
+        monkeypatch.delenv(name)
+
+
 @pytest.fixture
 def bucket(object_store_server: ObjectStoreServer, monkeypatch: pytest.MonkeyPatch) -> str:
     """The address of an empty folder on an object store, which the environment leads to."""
-    for name in [name for name in os.environ if re.match("(AWS|GOOGLE|AZURE)_", name)]:
-        monkeypatch.delenv(name)
+    forget_clouds(monkeypatch)
     for name, value in object_store_server.environment.items():
         monkeypatch.setenv(name, value)
     return object_store_server.make_bucket()

@@ -59,9 +59,17 @@ def test_a_lake_is_fetched_and_followed(published, bucket, tmp_path):
     assert "0 files" in published("fetch", bucket, "--lake", tmp_path / "copy").out
 
 
-def test_what_a_machine_keeps_of_a_lake_is_not_taken_for_a_whole_one(published, bucket, tmp_path):
+def test_what_a_machine_keeps_of_a_lake_stands_for_its_address(published, bucket, tmp_path):
+    """It is no whole lake, and another machine may have changed that since."""
     assert published("check", "--lake", bucket).code == 0
     (copy,) = (tmp_path / "cache").glob("tracklake/*/lake")
+    write_round(tmp_path / "lake", 4)
+    assert published("publish", "store", bucket, "--lake", tmp_path / "lake").code == 0
+    count = published("sql", "SELECT max(backward_vehicles) n FROM subset_status", "--lake", copy, "--format", "csv")
+    assert count.out == "n\n4\n", count
+    with hold_lease(open_store(bucket), "process 7 on north"):
+        done = published("validate", "--lake", copy)
+    assert (done.code, "process 7 on north" in done.err) == (1, True)
     for arguments in (("publish", "store", f"{bucket}2"), ("publish", "ducklake"), ("fetch", bucket), ("serve",)):
         done = published(*arguments, "--lake", copy)
         assert (done.code, f"`tracklake fetch {bucket} --lake DIR`" in done.err) == (2, True), done
@@ -150,6 +158,7 @@ def test_every_command_gives_at_an_address_what_it_gives_in_a_folder(machine, bu
     for place in (folder, bucket):
         done = machine("one", "run", tmp_path / "raw", "--lake", place)
         assert done.code == 0, done.err
+        assert f"train lstm --lake {place}" in done.out, "what to try next"
     assert describe_results(bucket) == describe_results(folder)
     (copy,) = (tmp_path / "one").glob("tracklake/*/lake")
     assert {page.name for page in copy.rglob("*.html")} == {page.name for page in folder.rglob("*.html")}
