@@ -29,7 +29,7 @@ from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.stages.planner import Planner, build_job
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 
-STEPS = ("read", "ingest", "validate", "repair", "traffic", "samples")
+STEPS = ("read", "ingest", "validate", "repair", "reconstruct", "revalidate", "traffic", "samples", "split", "tensors")
 RATE_HZ = 25
 START_S = 1_669_118_400
 DRIVE_ENTRIES = 6_000

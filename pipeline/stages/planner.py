@@ -9,7 +9,7 @@ from typing import Any
 from tracklake.pipeline.lake import Commit, LakeFile, Manifest, is_intact, load_recent, verify_files, write_table
 from tracklake.pipeline.lake.transfers import fetch_files
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.readers import LakeReader, SubsetReader
+from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.registry import STAGES
 from tracklake.pipeline.stages.stage import (
     INGEST,
@@ -199,8 +199,6 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
     info: dict[str, Any] = {}
     notes: list[str] = []
     for reader in _open_readers(stage, root, manifest, job, settings):
-        if isinstance(reader, SubsetReader) and stage.bytes_per_entry:
-            reader.require_memory(stage.bytes_per_entry)
         built = stage.build(reader, settings)
         assert not isinstance(built, list)
         for result in list_results(built):

@@ -1,6 +1,5 @@
 """What build functions read the lake with: the tables of all recordings, or of one subset."""
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ import polars as pl
 from tracklake.pipeline.lake import Manifest, scan
 from tracklake.pipeline.lake.files import name_folder
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import RECONSTRUCTION, Job, StageError
+from tracklake.pipeline.stages.stage import Job
 from tracklake.pipeline.transforms.reconstruction.causal import filter_tracks
 from tracklake.pipeline.transforms.reconstruction.clean_tracks import replace_positions
 from tracklake.pipeline.transforms.slices import Slice, cut_frames
@@ -23,8 +22,6 @@ from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFr
 CLEAN_CONTEXT_S = 3.0
 """Time before and after an entry, in s, on which its row depends besides its reconstructed position: the sides of a
 filled gap of at most 2 s, and differences over 0.2 s."""
-CLEANING = (RECONSTRUCTION, "revalidate")
-"""Stages that the setting `reconstruct` leaves out."""
 
 
 @dataclass(frozen=True)
@@ -119,22 +116,6 @@ class SubsetReader(LakeReader):
         """Return whether the subset has more entries than a worker holds at once."""
         return bool(self.facts["entries"] > settings.slice_entries)
 
-    def require_memory(self, bytes_per_entry: int) -> None:
-        """Refuse work on all of the subset at once that this machine has not the memory for.
-
-        Raises:
-            StageError: saying how much it needs, and what to do.
-        """
-        needed = self.facts["entries"] * bytes_per_entry / 2**30
-        if needed > (has := _measure_memory()):
-            stage = self.job.key.partition("/")[0]
-            leave_out = "Leave the stage out (reconstruct = false), make" if stage in CLEANING else "Make"
-            raise StageError(
-                f"{stage} works on all of {self.subset} at once: its {self.facts['entries']:,} entries need about "
-                f"{needed:,.1f} GiB of memory, and this machine has {has:,.1f} GiB. {leave_out} shorter recordings "
-                "(I-24 MOTION: without --recording), or use a machine with more."
-            )
-
     def cut(self, settings: Settings, context_s: float) -> Iterator["SubsetReader"]:
         """Yield readers of slices with their context, in order; the subset itself where it is not long."""
         if not self.is_long(settings):
@@ -208,11 +189,3 @@ class SubsetReader(LakeReader):
     def clock(self) -> dict[str, Any]:
         """First frame and frame rate (Hz), as transforms take them."""
         return {name: self.facts[name] for name in ("first_frame", "frame_rate_hz")}
-
-
-def _measure_memory() -> float:
-    """Return this machine's memory in GiB, infinite where the system does not tell it."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    except (AttributeError, ValueError, OSError):  # AttributeError: Windows
-        return float("inf")

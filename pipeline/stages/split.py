@@ -32,7 +32,7 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     Raises:
         StageError: a split that claims to be free of leakage is not.
     """
-    inputs = SplitInputs(reader, gather_subsets(reader, settings.get_protocol()), settings.get_protocol())
+    inputs = SplitInputs(reader, gather_subsets(reader, settings.get_protocol()), settings)
     made = {recipe: make_split(recipe, inputs) for recipe in settings.get_split_recipes()}
     measured = _measure_all(inputs, made)
     refuse_leaks(measured)

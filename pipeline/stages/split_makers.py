@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.transforms.splits.allocation import (
     allocate_flow_balanced,
@@ -30,7 +31,7 @@ from tracklake.schemas.split_recipes import BY_RECORDING, CSP_2018, FLOW_BALANCE
 
 @dataclass(frozen=True)
 class SplitInputs:
-    """The reader of the lake's tables, the subsets to split, and the protocol whose samples count.
+    """The reader of the lake's tables, the subsets to split, and the settings.
 
     Subsets are the freeway ones not excluded: the columns of `splits.tables.COLUMNS`, and recording, lanes,
     frame_rate_hz.
@@ -38,7 +39,12 @@ class SplitInputs:
 
     reader: LakeReader
     subsets: pl.DataFrame
-    protocol: Protocol
+    settings: Settings
+
+    @property
+    def protocol(self) -> Protocol:
+        """The protocol whose samples count."""
+        return self.settings.get_protocol()
 
 
 @dataclass(frozen=True)
@@ -61,21 +67,23 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     for facts in inputs.subsets.sort("dataset", "subset").iter_rows(named=True):
         reader = inputs.reader.open_subset(facts["dataset"], facts["subset"])
         own = blocks.filter(pl.col("dataset") == facts["dataset"], pl.col("subset") == facts["subset"])
-        reader.require_memory(60)
-        visits.append(find_visits(reader.table(TRACKS, "vehicle_id", "frame"), own))
-        samples = reader.scan(SAMPLES)
         stride = facts["frame_rate_hz"] / recipe.rate_hz
-        weights.append(
-            count_samples(
-                samples.filter(pl.col("protocol") == inputs.protocol.name).select("vehicle_id", "tick").collect(),
-                own,
-                stride=stride,
-                first_frame=facts["first_frame"],
-                history=round(recipe.history_s * recipe.rate_hz) * stride,
-                future=recipe.min_future_ticks * stride,
+        for part in reader.cut(inputs.settings, 0):
+            visits.append(find_visits(part.table(TRACKS, "vehicle_id", "frame"), own))
+            rows = reader.scan(SAMPLES).filter(pl.col("protocol") == inputs.protocol.name)
+            if part.slice is not None:
+                rows = rows.filter(part.slice.is_own(facts["first_frame"] + pl.col("tick") * stride))
+            weights.append(
+                count_samples(
+                    rows.select("vehicle_id", "tick").collect(),
+                    own,
+                    stride=stride,
+                    first_frame=facts["first_frame"],
+                    history=round(recipe.history_s * recipe.rate_hz) * stride,
+                    future=recipe.min_future_ticks * stride,
+                )
             )
-        )
-    seen, sampled = pl.concat(visits), pl.concat(weights)
+    seen, sampled = _add_up(visits, "entries"), _add_up(weights, "weight")
     units = describe_blocks(blocks, inputs.subsets, seen, sampled)
     allocation = (allocate_flow_balanced if recipe.eval_block is None else leave_block_out)(units, recipe)
     left_out = find_left_out(seen, allocation.splits)
@@ -83,6 +91,13 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
     recounted = recount_blocks(units, allocation.splits, left_out, seen, sampled)
     written = tabulate_allocation(recounted, recipe)
     return SplitResult(written, left_out, units.select("dataset", "subset", "block", "vehicles_per_lane_s"))
+
+
+def _add_up(counts: list[pl.DataFrame], count: str) -> pl.DataFrame:
+    """Add up what slices of a subset count of one vehicle in one block; sorted."""
+    joined = pl.concat(counts)
+    key = [name for name in joined.columns if name != count]
+    return joined.group_by(key).agg(pl.col(count).sum()).sort(key)
 
 
 def _make_csp(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:

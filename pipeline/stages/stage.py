@@ -98,8 +98,6 @@ class Stage:
         extra_inputs: (lake, manifest, settings) to other values that the result depends on, by `dataset/recording`
             (by "" for the scope `lake`). The stage leaves out recordings without any.
         command: command that runs the stage, where it is called otherwise.
-        bytes_per_entry: memory that it takes for each entry of a subset where it works on all of one at once, so that
-            it refuses what does not fit into the machine. 0: its memory does not grow with the subset, or is small.
     """
 
     name: str
@@ -113,7 +111,6 @@ class Stage:
     extra_inputs: Callable[[Path, Manifest, Settings], Mapping[str, Mapping[str, Any]]] | None = None
     after_reconstruction: tuple[str, ...] = ()
     command: str = ""
-    bytes_per_entry: int = 0
 
     def list_inputs(self, settings: Settings) -> tuple[str, ...]:
         """Return the stages whose tables it reads with these settings."""

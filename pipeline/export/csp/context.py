@@ -47,7 +47,7 @@ def read_context(
     if not {(dataset, part) for dataset in names for part in PARTS} <= set(parts):
         recipe = settings.get_split_recipe(name)
         reader = LakeReader(root, manifest)
-        inputs = SplitInputs(reader, gather_subsets(reader, protocol), protocol)
+        inputs = SplitInputs(reader, gather_subsets(reader, protocol), settings)
         allocation = make_split(replace(recipe, validation=True), inputs).allocation
         splits = allocation.splits
         notes.append(

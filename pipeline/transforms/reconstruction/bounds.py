@@ -22,6 +22,10 @@ class Limits:
         """Return the lower of both greatest accelerations; the other bounds do not depend on speed."""
         return replace(self, accel_mps2=np.minimum(self.accel_mps2, others.accel_mps2))
 
+    def at(self, points: Integers) -> "Limits":
+        """Return the bounds at some points."""
+        return Limits(self.accel_mps2[points], self.braking_mps2[points], self.jerk_mps3[points])
+
 
 def limit_motion(bounds: Sequence[MotionBounds], kind: Integers, speed_mps: Floats) -> Limits:
     """Return the bounds at points of the given speeds; `kind` is the place of each point's bounds in the list."""

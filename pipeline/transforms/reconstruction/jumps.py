@@ -7,6 +7,7 @@ positions stay where most of its entries are.
 
 import numpy as np
 
+from tracklake.pipeline.transforms.number_store import NumberStore, find_median
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series
 from tracklake.schemas.arrays import Flags, Floats
 
@@ -24,23 +25,22 @@ MOST_NEAR = 2
 NORMAL_MAD = 1.4826
 
 
-def find_displacements(series: Series, z: Floats, recorded: Flags) -> Floats:
-    """Return by how much jumps have displaced each position (N,); 0 for most entries of a track.
+def find_displacements(
+    series: Series, z: Floats, recorded: Flags, least_m: float | None, before_m: float = 0.0
+) -> tuple[Floats, float]:
+    """Return by how much jumps have displaced each position (N,), 0 for most entries of a track; and all jumps' sum.
 
     Args:
         series: the pieces.
         z: (N,) recorded positions, interpolated in gaps.
         recorded: (N,) which of them were recorded.
+        least_m: see `find_least_jump`; None: there are no jumps.
+        before_m: sum of the jumps of the pieces before these, so that rounding is as if all were given at once.
     """
     displaced = np.zeros(len(z))
-    known = series.lie_within(1)[:-1] & recorded[:-1] & recorded[1:]
-    steps = np.where(known, np.diff(z), np.nan)
-    beside = np.full(len(steps), np.nan)
-    beside[1:-1] = steps[1:-1] - (steps[:-2] + steps[2:]) / 2
-    clear = np.abs(beside[~np.isnan(beside)])
-    if not clear.size:
-        return displaced
-    least_m = max(LEAST_JUMP_M, LEAST_NOISE_RATIO * NORMAL_MAD * float(np.median(clear)))
+    if least_m is None or not len(z):
+        return displaced, before_m
+    steps, beside = _measure_steps(series, z, recorded)
     candidates = np.flatnonzero(np.abs(beside) > least_m / 2)
     reach = round(AROUND_S * series.rate_hz)
     piece = np.searchsorted(series.first, candidates, side="right") - 1
@@ -53,11 +53,34 @@ def find_displacements(series: Series, z: Floats, recorded: Flags) -> Floats:
     enough = (usual * series.rate_hz > CRAWL_MPS) | (np.abs(excess) > CRAWL_JUMP_M)
     jumps = (np.abs(excess) > least_m) & enough & (near <= MOST_NEAR)
     if not jumps.any():
-        return displaced
+        return displaced, before_m
     displaced[candidates[jumps] + 1] = excess[jumps]
-    total = np.cumsum(displaced)
+    total = np.cumsum(np.append(before_m, displaced))[1:]
+    after_m = float(total[-1])
     total -= np.repeat(total[series.first], series.size)
     for number in np.unique(piece[jumps]):
         own = slice(series.first[number], series.first[number] + series.size[number])
         total[own] -= np.median(total[own][recorded[own]])
-    return total
+    return total, after_m
+
+
+def measure_differences(series: Series, z: Floats, recorded: Flags) -> Floats:
+    """Return how far steps differ from the mean of the two beside them, where all three are recorded."""
+    beside = _measure_steps(series, z, recorded)[1]
+    return np.abs(beside[~np.isnan(beside)])
+
+
+def find_least_jump(differences: NumberStore, at_once: int) -> float | None:
+    """Return the least jump in m among steps of such differences; None where there are none."""
+    if not differences.size:
+        return None
+    return max(LEAST_JUMP_M, LEAST_NOISE_RATIO * NORMAL_MAD * find_median(differences, at_once))
+
+
+def _measure_steps(series: Series, z: Floats, recorded: Flags) -> tuple[Floats, Floats]:
+    """Return the steps between recorded positions, and how far each differs from the mean of the two beside it."""
+    known = series.lie_within(1)[:-1] & recorded[:-1] & recorded[1:]
+    steps = np.where(known, np.diff(z), np.nan)
+    beside = np.full(len(steps), np.nan)
+    beside[1:-1] = steps[1:-1] - (steps[:-2] + steps[2:]) / 2
+    return steps, beside

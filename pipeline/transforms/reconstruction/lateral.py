@@ -55,7 +55,7 @@ def bound_lateral(problem: Problem, direction: Integers, accel_mps2: float) -> F
         direction: see `find_lane_changes`.
         accel_mps2: greatest lateral acceleration, of either sign.
     """
-    y = problem.smoothed.copy()
+    y = np.array(problem.smoothed[:])
     back = np.zeros(len(y), bool)
     back[:-1] = direction[:-1] * np.diff(y) < 0
     broken = back | (np.abs(differentiate(problem.series, y)[1]) > accel_mps2)

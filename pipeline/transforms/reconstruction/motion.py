@@ -6,13 +6,13 @@ compact differences, of which the written speeds and accelerations are means (se
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
+from tracklake.pipeline.transforms.number_store import NumberStore
 from tracklake.pipeline.transforms.reconstruction.bounds import Limits, find_breaks, measure_motion
 from tracklake.pipeline.transforms.reconstruction.programs import Rows, solve_programs
-from tracklake.pipeline.transforms.reconstruction.smoothing import Series, select_pieces
+from tracklake.pipeline.transforms.reconstruction.smoothing import Series, make_penalty, select_pieces
 from tracklake.schemas.arrays import Floats, Integers
 
 MARGIN = 0.99
@@ -32,16 +32,18 @@ class Problem:
     Args:
         series: the pieces.
         smoothed: (N,) positions without bounds.
-        penalty: (4, N) lower diagonals of the penalty.
         weights: (N,) weights of the recorded positions.
+        weight_s6: weight of the penalty.
     """
 
     series: Series
-    smoothed: Floats
-    penalty: Floats
-    weights: Floats
+    smoothed: Floats | NumberStore
+    weights: Floats | NumberStore
+    weight_s6: float
 
-    def solve(self, pieces: Integers, x: Floats, make_rows: Callable[[Series, Integers], list[Rows]]) -> None:
+    def solve(
+        self, pieces: Integers, x: Floats | NumberStore, make_rows: Callable[[Series, Integers], list[Rows]]
+    ) -> None:
         """Write the positions of some pieces within their rows into x; a piece without a solution stays as it is."""
         if not pieces.size:
             return
@@ -49,10 +51,12 @@ class Problem:
         for number in np.unique(batch):
             self._solve_together(pieces[batch == number], x, make_rows)
 
-    def _solve_together(self, pieces: Integers, x: Floats, make_rows: Callable[[Series, Integers], list[Rows]]) -> None:
+    def _solve_together(
+        self, pieces: Integers, x: Floats | NumberStore, make_rows: Callable[[Series, Integers], list[Rows]]
+    ) -> None:
         """Solve the programs of some pieces at once, and those without a solution again by themselves."""
         points, series = select_pieces(self.series, pieces)
-        bands = self.penalty[:, points]
+        bands = make_penalty(series, self.weight_s6)
         bands[0] += self.weights[points]
         way, solved = solve_programs(bands, make_rows(series, points), series.first, series.size)
         done = np.repeat(solved, series.size)
@@ -69,13 +73,17 @@ def bound_motion(problem: Problem, limit: Callable[[Floats], Limits]) -> tuple[F
         problem: the smoothed pieces.
         limit: positions (N,) to the bounds at their speeds.
     """
-    x = problem.smoothed.copy()
+    x = np.array(problem.smoothed[:])
     limits = limit(x)
     for _ in range(ROUNDS):
         pieces = find_broken_pieces(problem.series, x, limits)
         if not pieces.size:
             break
-        problem.solve(pieces, x, partial(make_motion_rows, problem, limits))
+
+        def make_rows(series: Series, points: Integers, limits: Limits = limits) -> list[Rows]:
+            return make_motion_rows(series, problem.smoothed[points], limits.at(points))
+
+        problem.solve(pieces, x, make_rows)
         limits = limits.lower_to(limit(x))
     return x, limits
 
@@ -86,19 +94,17 @@ def find_broken_pieces(series: Series, x: Floats, limits: Limits) -> Integers:
     return np.flatnonzero(np.logical_or.reduceat(broken, series.first))
 
 
-def make_motion_rows(problem: Problem, limits: Limits, series: Series, points: Integers) -> list[Rows]:
+def make_motion_rows(series: Series, x: Floats, limits: Limits) -> list[Rows]:
     """Return the rows that keep pieces within the bounds of motion.
 
     The bound of a compact difference is the least of those of the points that it has a part in.
 
     Args:
-        problem: the smoothed pieces.
-        limits: bounds at the N points.
         series: the pieces that are solved.
-        points: their points among the N.
+        x: (N,) their smoothed positions.
+        limits: bounds at their points.
     """
-    rate, x = series.rate_hz, problem.smoothed[points]
-    accel, braking, jerk = limits.accel_mps2[points], limits.braking_mps2[points], limits.jerk_mps3[points]
+    rate, accel, braking, jerk = series.rate_hz, limits.accel_mps2, limits.braking_mps2, limits.jerk_mps3
     one, two, three = series.lie_within(1)[:-1], series.lie_within(2)[:-2], series.lie_within(3)[:-3]
     second, third = np.diff(x, 2) * rate**2, np.diff(x, 3) * rate**3
     least = MARGIN * np.minimum(accel[1:-1], np.minimum(accel[:-2], accel[2:]))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tracklake.pipeline.transforms.reconstruction.smoothing import Series, make_penalty, select_pieces, smooth
+from tracklake.pipeline.transforms.reconstruction.smoothing import Series, make_penalty, smooth
 from tracklake.schemas.arrays import Flags, Floats, Integers
 
 BLOCK_S, PERIOD_S = 2.1, 5.4
@@ -64,8 +64,8 @@ def compute_cutoff(weight_s6: float) -> float:
 
 def estimate_noise(
     series: Series,
-    positions: Floats,
-    recorded: Flags,
+    z: Floats,
+    known: Flags,
     noise_m: float | None,
     weight_s6: float | None,
     least_hz: float,
@@ -73,29 +73,27 @@ def estimate_noise(
     """Estimate what is None of the noise and the weight; a set noise scales the estimated weight by its square.
 
     Args:
-        series: the pieces.
-        positions: (N,) recorded, or interpolated in gaps.
-        recorded: (N,) which of them were recorded.
+        series: the pieces that `draw_pieces` has drawn.
+        z: (N,) positions, recorded or interpolated in gaps.
+        known: (N,) which of them were recorded.
         noise_m: the noise, where it is set.
         weight_s6: the weight, where it is set.
         least_hz: lowest cut-off frequency.
     """
-    points, sample = select_pieces(series, _draw_pieces(series))
-    z, known = positions[points], recorded[points]
     ratio = (compute_weight(least_hz) / compute_weight(MOST_HZ)) ** (1 / (STEPS - 1))
     weights = compute_weight(MOST_HZ) * ratio ** np.arange(STEPS)
-    estimated = _choose_weight(sample, z, known, weights) if weight_s6 is None else weight_s6
+    estimated = _choose_weight(series, z, known, weights) if weight_s6 is None else weight_s6
     if noise_m is not None and weight_s6 is not None:
         return Noise(noise_m, weight_s6)
-    found_m = _measure_noise(sample, z, known, estimated)
+    found_m = _measure_noise(series, z, known, estimated)
     if noise_m is None:
         return Noise(found_m, estimated)
     scale = (noise_m / max(found_m, 1e-6)) ** 2
     return Noise(noise_m, float(np.clip(estimated * scale, weights[0] / 100, weights[-1] * 100)))
 
 
-def _draw_pieces(series: Series) -> Integers:
-    """Return pieces spread evenly over the subset, with about SAMPLE_POINTS points."""
+def draw_pieces(series: Series) -> Integers:
+    """Return pieces of a subset, spread evenly over it, with about SAMPLE_POINTS points."""
     share = min(1.0, SAMPLE_POINTS / max(int(series.size.sum()), 1))
     wanted = max(1, int(len(series.size) * share))
     return np.unique(np.linspace(0, len(series.size) - 1, wanted).astype(np.int64))

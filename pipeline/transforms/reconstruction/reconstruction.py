@@ -1,30 +1,34 @@
 """Reconstruction of a subset: physically possible tracks near the recorded ones."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.transforms.reconstruction.bounds import (
-    Limits,
-    Runs,
-    find_breaks,
-    limit_motion,
-    list_runs,
-    measure_motion,
-)
-from tracklake.pipeline.transforms.reconstruction.config import DEFAULT_CLASS, ReconstructionConfig
-from tracklake.pipeline.transforms.reconstruction.jumps import find_displacements
+from tracklake.pipeline.transforms.number_store import MakeStore, MemoryStore, NumberStore
+from tracklake.pipeline.transforms.reconstruction.along import smooth_share, solve_along
+from tracklake.pipeline.transforms.reconstruction.bounds import Runs, find_breaks, list_runs, measure_motion
+from tracklake.pipeline.transforms.reconstruction.config import ReconstructionConfig
+from tracklake.pipeline.transforms.reconstruction.estimates import Estimates, make_estimates
 from tracklake.pipeline.transforms.reconstruction.lateral import bound_lateral, find_lane_changes
-from tracklake.pipeline.transforms.reconstruction.motion import Problem, bound_motion
-from tracklake.pipeline.transforms.reconstruction.noise import LEAST_HZ, Noise, estimate_noise
-from tracklake.pipeline.transforms.reconstruction.pieces import Pieces, Skip, cut_pieces
-from tracklake.pipeline.transforms.reconstruction.platoons import find_leaders, keep_behind_leaders, measure_overlaps
-from tracklake.pipeline.transforms.reconstruction.smoothing import Series, differentiate, make_penalty, smooth_robustly
-from tracklake.schemas.arrays import Flags, Floats
-from tracklake.schemas.columns import Table
+from tracklake.pipeline.transforms.reconstruction.overlaps import measure_overlaps
+from tracklake.pipeline.transforms.reconstruction.pieces import Skip
+from tracklake.pipeline.transforms.reconstruction.platoons import Platoons
+from tracklake.pipeline.transforms.reconstruction.result_tables import (
+    Axis,
+    Tally,
+    join_unkept,
+    list_entries,
+    list_skips,
+    list_unkept,
+    summarise,
+)
+from tracklake.pipeline.transforms.reconstruction.shares import Share, Shares, add_skips
+from tracklake.pipeline.transforms.reconstruction.smoothing import differentiate
+from tracklake.pipeline.transforms.slices import list_windows
+from tracklake.schemas.arrays import Flags, expand_ranges
 from tracklake.schemas.reconstruction import (
     RECONSTRUCTED,
     RECONSTRUCTION_QUALITY,
@@ -33,13 +37,8 @@ from tracklake.schemas.reconstruction import (
 )
 
 DEFAULT_CONFIG = ReconstructionConfig()
-OUTLIER = 4.0
-"""Residuals, in standard deviations of the noise, beyond which Huber's distance is linear."""
-LEAST_OUTLIER_M = {"x_m": 1.0, "y_m": 4e-6}
-"""Least such residual by coordinate, in m. Along the road smaller ones can be motion that the penalty cuts off, such as
-hard braking, and noise that is greater for some vehicles, such as those that crawl and are recorded in steps."""
-MOVED_M = 0.001
-"""Least distance from the smoothed position, in m, at which an entry counts as moved by the bounds."""
+ALL_AT_ONCE = 2**62
+"""More points than there are."""
 
 
 @dataclass(frozen=True)
@@ -53,32 +52,10 @@ class Reconstruction:
         unkept: rows of `unkept_bounds`.
     """
 
-    entries: pl.DataFrame
-    quality: pl.DataFrame
-    skips: pl.DataFrame
-    unkept: pl.DataFrame
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One coordinate at every point of the pieces, and how it was found.
-
-    Args:
-        recorded: (N,) recorded positions, interpolated in gaps.
-        noise: their noise and the weight of smoothness; None where there are no points.
-        problem: the smoothed pieces.
-        x: (N,) positions within the bounds.
-    """
-
-    recorded: Floats
-    noise: Noise | None
-    problem: Problem
-    x: Floats
-
-    @property
-    def moved(self) -> Flags:
-        """Whether bounds moved the point, (N,)."""
-        return np.asarray(np.abs(self.x - self.problem.smoothed) > MOVED_M, np.bool_)
+    entries: pl.DataFrame = field(default_factory=RECONSTRUCTED.empty)
+    quality: pl.DataFrame = field(default_factory=RECONSTRUCTION_QUALITY.empty)
+    skips: pl.DataFrame = field(default_factory=RECONSTRUCTION_SKIPS.empty)
+    unkept: pl.DataFrame = field(default_factory=UNKEPT_BOUNDS.empty)
 
 
 def reconstruct(
@@ -95,200 +72,151 @@ def reconstruct(
         facts: the subset's row of `subsets`.
         config: settings.
     """
-    pieces, skips = cut_pieces(tracks, facts, config.max_gap_s)
-    series = Series(pieces.first, pieces.size, pieces.rate_hz)
-    runs: list[Runs] = []
-    if not pieces.points:
-        nothing = Axis(np.empty(0), None, Problem(series, np.empty(0), np.empty((4, 0)), np.empty(0)), np.empty(0))
-        along = across = nothing
-    else:
-        along, runs = _reconstruct_along(pieces, series, vehicles, config, skips)
-        across, lateral_runs = _reconstruct_across(pieces, series, config, skips)
-        runs.append(lateral_runs)
-    entries = _list_entries(pieces, series, along, across, facts)
-    outside = _find_outside(pieces, series, entries, skips)
-    if pieces.points:
-        runs.append(_list_overlaps(pieces, vehicles, replace(along, x=np.where(outside, np.nan, along.x)), across))
-    entries = entries.filter(~outside)
-    unkept = _list_unkept(pieces, [run.leave_out(outside) for run in runs], facts)
-    return Reconstruction(
-        entries,
-        _summarise(entries, vehicles, along, across, unkept.height, facts, config),
-        _list_skips(skips, facts),
-        unkept,
-    )
+    share, rest = reconstruct_shares(lambda: [tracks], vehicles, facts, config)
+    return replace(rest, entries=share.entries)
 
 
-def _smooth_axis(pieces: Pieces, series: Series, column: str, config: ReconstructionConfig) -> Axis:
-    """Smooth one coordinate of all pieces without bounds."""
-    recorded = pieces.interpolate(column)
-    set_noise, set_weight = (
-        (config.noise_x_m, config.weight_x_s6) if column == "x_m" else (config.noise_y_m, config.weight_y_s6)
-    )
-    positions = recorded - find_displacements(series, recorded, pieces.recorded) if column == "x_m" else recorded
-    noise = estimate_noise(series, positions, pieces.recorded, set_noise, set_weight, LEAST_HZ[column])
-    penalty = make_penalty(series, noise.weight_s6)
-    limit_m = max(OUTLIER * noise.noise_m, LEAST_OUTLIER_M[column])
-    x, weights = smooth_robustly(penalty, positions, pieces.recorded.astype(np.float64), limit_m)
-    return Axis(recorded, noise, Problem(series, x, penalty, weights), x)
+def reconstruct_shares(
+    read_tracks: Callable[[], Iterable[pl.DataFrame]],
+    vehicles: pl.DataFrame,
+    facts: Mapping[str, Any],
+    config: ReconstructionConfig = DEFAULT_CONFIG,
+    make_store: MakeStore = MemoryStore,
+    at_once: int = ALL_AT_ONCE,
+) -> Iterator[Reconstruction]:
+    """Yield the entries of one subset share by share, as `reconstruct` makes them of all, and then the other tables.
+
+    Args:
+        read_tracks: function that yields the tracks, whole ones in order of vehicles, as often as it is called.
+        vehicles: as `reconstruct` takes them.
+        facts: likewise.
+        config: likewise.
+        make_store: function that makes a store of numbers.
+        at_once: number of points that are held in memory besides a share.
+    """
+    shares = Shares(read_tracks, facts, config.max_gap_s)
+    skips, unkept, tally = [*shares.skips], list[pl.DataFrame](), Tally(make_store("float32"))
+    estimates = None
+    if shares.all.points:
+        estimates = make_estimates(shares, config, make_store, at_once)
+        platoons = solve_along(shares, estimates, vehicles, config, make_store, at_once)
+        points = _Points(platoons, make_store("float64"), make_store("int32"), make_store("bool"))
+        skips += _list_lacking(shares)
+    for share in shares:
+        entries = RECONSTRUCTED.empty()
+        if share.pieces.points and estimates is not None:
+            entries, broken, skipped = _write_share(share, estimates, points, facts, config)
+            unkept += [list_unkept(shares.all, run, share.first_point) for run in broken]
+            skips += skipped
+        tally.add(entries)
+        yield Reconstruction(entries)
+    if estimates is not None:
+        unkept += _list_overlaps(points, vehicles, make_store, at_once)
+    listed = join_unkept(unkept, facts)
+    noise = {} if estimates is None else estimates.noise
+    quality = summarise(tally, vehicles.height, noise, listed.height, facts, config, at_once)
+    yield Reconstruction(quality=quality, skips=list_skips(add_skips(skips), facts), unkept=listed)
 
 
-def _reconstruct_along(
-    pieces: Pieces, series: Series, vehicles: pl.DataFrame, config: ReconstructionConfig, skips: list[Skip]
-) -> tuple[Axis, list[Runs]]:
-    """Return the positions along the road, and the runs that break a bound all the same; `skips` may grow."""
-    smoothed = _smooth_axis(pieces, series, "x_m", config)
-    names = list(config.bounds)
-    classes = pieces.tracks.select("vehicle_id").join(
-        vehicles.select("vehicle_id", "class"), on="vehicle_id", how="left", maintain_order="left"
-    )["class"]
-    place = classes.fill_null(DEFAULT_CLASS).replace_strict(
-        names, range(len(names)), default=names.index(DEFAULT_CLASS)
-    )
-    kind = place.to_numpy()[pieces.row].astype(np.int64)
-    bounds = list(config.bounds.values())
+@dataclass(frozen=True)
+class _Points:
+    """The N points of a subset as they are written; the last three grow share by share.
 
-    def limit(x: Floats) -> Limits:
-        return limit_motion(bounds, kind, differentiate(series, x)[0])
+    Args:
+        along: positions along the road; NaN where they are not written.
+        y: positions across it.
+        lane: recorded lanes, -1 = none.
+        recorded: whether the point was recorded.
+    """
 
-    x, limits = bound_motion(smoothed.problem, limit)
-    leaders = find_leaders(pieces, vehicles)
-    keep_behind_leaders(smoothed.problem, x, limits, limit, leaders)
-    unknown = (leaders.point >= 0) & np.isnan(leaders.length_m) & pieces.recorded
-    if unknown.any():
-        followers = len(np.unique(pieces.tracks["vehicle_id"].to_numpy()[pieces.row[unknown]]))
-        skips.append(Skip("no_length", followers, int(unknown.sum()), "overlaps with leaders of unknown length"))
-    values = measure_motion(series, x)
-    broken = find_breaks(values, limit(x))
+    along: Platoons
+    y: NumberStore
+    lane: NumberStore
+    recorded: NumberStore
+
+
+def _write_share(
+    share: Share, estimates: Estimates, points: _Points, facts: Mapping[str, Any], config: ReconstructionConfig
+) -> tuple[pl.DataFrame, list[Runs], list[Skip]]:
+    """Return the entries of a share, the runs that break a bound, and what is left out; `points` grow."""
+    pieces, series, own, platoons = share.pieces, share.series, share.own_points, points.along
+    along = Axis(pieces.interpolate("x_m"), platoons.problem.smoothed[own], platoons.x[own])
+    values = measure_motion(series, along.x)
+    broken = find_breaks(values, platoons.limits.find(share.own_pieces, series, along.x))
     runs = [list_runs(series, bound, broken[bound], values[bound]) for bound in broken]
-    return replace(smoothed, x=x), runs
+    across = _reconstruct_across(share, estimates, config)
+    accel = differentiate(series, across.x)[1]
+    runs.append(list_runs(series, "lateral_acceleration", np.abs(accel) > config.lateral_accel_mps2, accel))
+    entries = list_entries(pieces, series, along, across, facts)
+    outside, skips = _find_outside(share, entries)
+    platoons.x[own] = np.where(outside, np.nan, along.x)
+    points.y.append(across.x)
+    points.lane.append(pieces.tracks["lane"].fill_null(-1).to_numpy()[pieces.row])
+    points.recorded.append(pieces.recorded)
+    unknown = (platoons.leader[own] >= 0) & np.isnan(platoons.find_lengths(platoons.leader[own])) & pieces.recorded
+    if unknown.any():
+        left_out = "overlaps with leaders of unknown length"
+        skips.append(Skip("no_length", _count_vehicles(share, unknown), int(unknown.sum()), left_out))
+    return entries.filter(~outside), [run.leave_out(outside) for run in runs], skips
 
 
-def _reconstruct_across(
-    pieces: Pieces, series: Series, config: ReconstructionConfig, skips: list[Skip]
-) -> tuple[Axis, Runs]:
-    """Return the positions across the road, and the runs that break their bound all the same; `skips` may grow."""
-    smoothed = _smooth_axis(pieces, series, "y_m", config)
-    if pieces.tracks["lane"].null_count() == pieces.tracks.height:
-        vehicles = pieces.tracks["vehicle_id"].n_unique()
-        left_out = "the one way through lane changes"
-        if pieces.tracks["leader_id"].null_count() == pieces.tracks.height:
-            left_out += "; overlaps with leaders"
-        skips.append(Skip("no_lanes", vehicles, pieces.tracks.height, left_out))
-    direction = find_lane_changes(pieces, series, smoothed.x)
-    y = bound_lateral(smoothed.problem, direction, config.lateral_accel_mps2)
-    accel = differentiate(series, y)[1]
-    runs = list_runs(series, "lateral_acceleration", np.abs(accel) > config.lateral_accel_mps2, accel)
-    return replace(smoothed, x=y), runs
+def _reconstruct_across(share: Share, estimates: Estimates, config: ReconstructionConfig) -> Axis:
+    """Return the positions across the road."""
+    problem = smooth_share(share, estimates, "y_m")
+    smoothed = problem.smoothed[:]
+    direction = find_lane_changes(share.pieces, share.series, smoothed)
+    y = bound_lateral(problem, direction, config.lateral_accel_mps2)
+    return Axis(share.pieces.interpolate("y_m"), smoothed, y)
 
 
-def _list_overlaps(pieces: Pieces, vehicles: pl.DataFrame, along: Axis, across: Axis) -> Runs:
-    """Return the runs that overlap the recorded leader, or another vehicle ahead; none at NaN."""
-    others = measure_overlaps(pieces, vehicles, along.x, across.x)
-    gaps = np.fmin(find_leaders(pieces, vehicles).measure_gaps(along.x), others)
-    return list_runs(along.problem.series, "overlap", gaps < 0, gaps)
+def _list_lacking(shares: Shares) -> list[Skip]:
+    """List what is left out since the source has no lanes."""
+    if shares.has_lanes:
+        return []
+    left_out = "the one way through lane changes" + ("" if shares.has_leaders else "; overlaps with leaders")
+    return [Skip("no_lanes", shares.vehicles, shares.entries, left_out)]
 
 
-def _list_entries(pieces: Pieces, series: Series, along: Axis, across: Axis, facts: Mapping[str, Any]) -> pl.DataFrame:
-    """Write the points as rows of `reconstructed`."""
-    if not pieces.points:
-        return RECONSTRUCTED.empty()
-    speed, accel = differentiate(series, along.x)
-    lateral_speed, _ = differentiate(series, across.x)
-    moved_m = np.hypot(along.x - along.recorded, across.x - across.recorded)
-    frame = pl.DataFrame(
-        {
-            "vehicle_id": pieces.tracks["vehicle_id"].to_numpy()[pieces.row],
-            "frame": pieces.frame,
-            "time_s": pieces.interpolate("time_s"),
-            "x_m": along.x,
-            "y_m": across.x,
-            "speed_mps": speed,
-            "accel_mps2": accel,
-            "lateral_speed_mps": lateral_speed,
-            "moved_m": pl.Series(np.where(pieces.recorded, moved_m, np.nan)).fill_nan(None),
-            "imputed": ~pieces.recorded,
-            "constrained": along.moved | across.moved,
-        }
-    )
-    return _conform(RECONSTRUCTED, frame, facts)
-
-
-def _find_outside(pieces: Pieces, series: Series, entries: pl.DataFrame, skips: list[Skip]) -> Flags:
-    """Find the points (N,) of pieces that the table's ranges do not admit, as at 400 m/s; `skips` may grow."""
+def _find_outside(share: Share, entries: pl.DataFrame) -> tuple[Flags, list[Skip]]:
+    """Find the points (N,) of pieces that the table's ranges do not admit, as at 400 m/s; they are left out."""
     ranges = ((name, one.ge, one.le) for name, one in RECONSTRUCTED.columns.items())
     inside = [pl.col(name).is_between(least, most) for name, least, most in ranges if None not in (least, most)]
     outside = entries.select(~pl.all_horizontal(inside)).to_series().to_numpy()
     if not outside.any():
-        return outside
-    outside = np.repeat(np.logical_or.reduceat(outside, series.first), series.size)
-    recorded = outside & pieces.recorded
-    vehicles = len(np.unique(pieces.tracks["vehicle_id"].to_numpy()[pieces.row[recorded]]))
+        return outside, []
+    outside = np.repeat(np.logical_or.reduceat(outside, share.series.first), share.series.size)
+    recorded = outside & share.pieces.recorded
     left_out = "everything: no motion near the recorded positions lies within the table's ranges"
-    skips.append(Skip("out_of_range", vehicles, int(recorded.sum()), left_out))
-    return outside
+    return outside, [Skip("out_of_range", _count_vehicles(share, recorded), int(recorded.sum()), left_out)]
 
 
-def _summarise(
-    entries: pl.DataFrame,
-    vehicles: pl.DataFrame,
-    along: Axis,
-    across: Axis,
-    unkept: int,
-    facts: Mapping[str, Any],
-    config: ReconstructionConfig,
-) -> pl.DataFrame:
-    """Write the row of `reconstruction_quality`."""
-    moved = entries["moved_m"].drop_nulls()
-    frame = pl.DataFrame(
-        {
-            "vehicles": [vehicles.height],
-            "vehicles_reconstructed": [entries["vehicle_id"].n_unique()],
-            "entries": [len(moved)],
-            "imputed_entries": [entries["imputed"].sum()],
-            "constrained_entries": [entries["constrained"].sum()],
-            "noise_x_m": [along.noise and along.noise.noise_m],
-            "noise_y_m": [across.noise and across.noise.noise_m],
-            "noise_is_set": [config.noise_x_m is not None or config.noise_y_m is not None],
-            "weight_x_s6": [along.noise and along.noise.weight_s6],
-            "weight_y_s6": [across.noise and across.noise.weight_s6],
-            "median_moved_m": [moved.median()],
-            "moved_over_half_m_share": [(moved > 0.5).mean()],
-            "moved_over_2_m_share": [(moved > 2.0).mean()],
-            "bounds_not_kept": [unkept],
-        }
-    )
-    return _conform(RECONSTRUCTION_QUALITY, frame, facts)
+def _count_vehicles(share: Share, chosen: Flags) -> int:
+    """Count the vehicles of some points."""
+    return len(np.unique(share.pieces.tracks["vehicle_id"].to_numpy()[share.pieces.row[chosen]]))
 
 
-def _list_unkept(pieces: Pieces, runs: list[Runs], facts: Mapping[str, Any]) -> pl.DataFrame:
-    """Write runs that break a bound as rows of `unkept_bounds`."""
-    ids = pieces.tracks["vehicle_id"].to_numpy()
-    frames = [
-        pl.DataFrame(
-            {
-                "vehicle_id": ids[pieces.row[run.first]],
-                "bound": [run.bound] * len(run.first),
-                "first_frame": pieces.frame[run.first],
-                "last_frame": pieces.frame[run.last],
-                "entries": run.last - run.first + 1,
-                "worst": run.worst,
-            }
-        )
-        for run in runs
-        if len(run.first)
-    ]
-    return _conform(UNKEPT_BOUNDS, pl.concat(frames), facts) if frames else UNKEPT_BOUNDS.empty()
+def _list_overlaps(
+    points: _Points, vehicles: pl.DataFrame, make_store: MakeStore, at_once: int
+) -> Iterator[pl.DataFrame]:
+    """Yield the runs that overlap the recorded leader, or another vehicle ahead, as rows of `unkept_bounds`."""
+    pieces = points.along.pieces
+    depth = _measure_depths(points, vehicles, make_store, at_once)
+    for first, end in pieces.list_ranges(at_once):
+        gaps = np.fmin(points.along.measure_gaps(first, end), depth[first:end])
+        yield list_unkept(pieces, list_runs(pieces.cut_series(first, end), "overlap", gaps < 0, gaps), first)
 
 
-def _list_skips(skips: list[Skip], facts: Mapping[str, Any]) -> pl.DataFrame:
-    """Write what was left out as rows of `reconstruction_skips`."""
-    names = ("reason", "vehicles", "entries", "left_out")
-    frame = pl.DataFrame([{name: getattr(skip, name) for name in names} for skip in skips])
-    return _conform(RECONSTRUCTION_SKIPS, frame, facts) if skips else RECONSTRUCTION_SKIPS.empty()
-
-
-def _conform(table: Table, frame: pl.DataFrame, facts: Mapping[str, Any]) -> pl.DataFrame:
-    """Add the subset's place and put a frame into its table's columns and order."""
-    place = [pl.lit(facts[name]).alias(name) for name in ("dataset", "subset")]
-    return table.conform(frame.with_columns(place).lazy()).sort(table.key).collect()
+def _measure_depths(points: _Points, vehicles: pl.DataFrame, make_store: MakeStore, at_once: int) -> NumberStore:
+    """Return how deep each recorded point is in a vehicle ahead; see `measure_overlaps`. Frames are taken in turn."""
+    pieces, depth = points.along.pieces, make_store("float64")
+    for first, end in pieces.list_ranges(at_once):
+        depth.append(np.full(end - first, np.nan))
+    length_m, width_m = (pieces.read_trait(vehicles, name) for name in ("length_m", "width_m"))
+    for chosen, before, size in list_windows(pieces.frame, pieces.series.size, at_once):
+        own, run = expand_ranges(pieces.series.first[chosen] + before, size)
+        recorded = points.recorded[own]
+        own, piece = own[recorded], chosen[run[recorded]]
+        frame = pieces.frame[piece] + own - pieces.series.first[piece]
+        x, y, lane = points.along.x[own], points.y[own], points.lane[own]
+        depth[own] = measure_overlaps(frame, lane, x, y, length_m[piece], width_m[piece])
+    return depth

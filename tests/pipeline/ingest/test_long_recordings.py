@@ -19,11 +19,22 @@ from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import SourceError
 from tracklake.pipeline.sources.csv import hash_raw
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.schemas import FINDINGS, LANE_CHANGE_EVENTS, NEIGHBORS, SAMPLES, TABLES, TRACKS
+from tracklake.schemas import (
+    FINDINGS,
+    LANE_CHANGE_EVENTS,
+    NEIGHBORS,
+    RECONSTRUCTED,
+    SAMPLES,
+    SPLIT_LEFT_OUT,
+    SPLITS,
+    TABLES,
+    TRACKS,
+    UNKEPT_BOUNDS,
+)
 
 START = 1_669_118_400 + 300 - 24
 """24 s before a period ends, in s since 1970."""
-STAGES = ("validate", "repair", "assess", "reconstruct", "revalidate", "traffic", "samples")
+STAGES = ("validate", "repair", "assess", "reconstruct", "revalidate", "traffic", "samples", "split", "tensors")
 LANES_FT = (18.0, 30.0, 42.0)
 
 
@@ -72,7 +83,8 @@ def write_corridor(folder):
 
 
 def make_lake(source, root, entries):
-    settings = Settings(slice_entries=entries, safety_thresholds={"ttc_s": 5.0}, max_backward_share=1)
+    rules = {"safety_thresholds": {"ttc_s": 5.0}, "max_backward_share": 1}
+    settings = Settings(slice_entries=entries, split="time-blocks", split_block_s=11, **rules)
     with open_for_writing(root) as writer:
         found = discover(source, recording="day", digest=hash_raw)
         for dataset, file in ingest.find_unread_files(found, writer.manifest):
@@ -97,10 +109,20 @@ def corridor(tmp_path_factory):
     return folder
 
 
+def read_tensors(root):
+    return {file.path: (root / file.path).read_bytes() for file in load(root).live("tensors")}
+
+
 @pytest.fixture(scope="module")
-def whole(corridor, tmp_path_factory):
+def undivided(corridor, tmp_path_factory):
+    """The lake of the undivided recording."""
+    return make_lake(corridor, tmp_path_factory.mktemp("whole") / "lake", 10**9)
+
+
+@pytest.fixture(scope="module")
+def whole(undivided):
     """The tables of the undivided recording."""
-    return read_tables(make_lake(corridor, tmp_path_factory.mktemp("whole") / "lake", 10**9))
+    return read_tables(undivided)
 
 
 def test_the_corridor_has_what_slices_could_spoil(whole):
@@ -114,16 +136,21 @@ def test_the_corridor_has_what_slices_could_spoil(whole):
     assert {"frame_gap", "duplicate_track", "overlap"} <= set(whole[FINDINGS]["rule"])
     assert whole[LANE_CHANGE_EVENTS].height > 2
     assert set(whole[SAMPLES]["subset"]) == {"day-east"}, "an entry of the other has no lane"
+    assert whole[RECONSTRUCTED].select("imputed", "constrained").sum().row(0) > (10, 10)
+    assert whole[UNKEPT_BOUNDS].height > 5
+    assert whole[SPLITS]["part"].n_unique() > 1
+    assert whole[SPLIT_LEFT_OUT].height > 0
 
 
 @pytest.mark.parametrize("entries", [1, 2_001])
-def test_slices_have_the_tables_of_the_whole(corridor, whole, tmp_path, entries):
+def test_slices_have_the_tables_of_the_whole(corridor, undivided, whole, tmp_path, entries):
     root = make_lake(corridor, tmp_path / "lake", entries)
     made = read_tables(root)
     assert {table.name for table in made} == {table.name for table in whole}
     for table, frame in whole.items():
         assert_frame_equal(made[table], frame, check_exact=True)
-    files = [file for table in (TRACKS, SAMPLES, NEIGHBORS) for file in load(root).live(table.name)]
+    assert read_tensors(root) == read_tensors(undivided)
+    files = [file for table in (TRACKS, RECONSTRUCTED, SAMPLES, NEIGHBORS) for file in load(root).live(table.name)]
     assert len(files) > 6
     # Files by name are slices in order of time, in the store and in the live folders.
     shown = pl.scan_parquet(root / TRACKS.name)

@@ -1,7 +1,6 @@
 """Stages that work on a long subset in slices make the tables that they make of the whole subset, value for value."""
 
 import shutil
-from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -10,9 +9,9 @@ from stage_runs import run_stage
 
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import repair, revalidate, samples, traffic, validate
+from tracklake.pipeline.stages import reconstruct, repair, revalidate, samples, traffic, validate
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.stage import Job, StageError, list_results
+from tracklake.pipeline.stages.stage import list_results
 from tracklake.schemas import SUBSETS
 
 
@@ -30,6 +29,7 @@ def make_tables(stage, reader, **values):
     ("stage", "values"),
     [
         (validate, {}),
+        (reconstruct, {}),
         (revalidate, {}),
         (samples, {}),
         (samples, {"tracks_from": "reconstructed"}),
@@ -77,12 +77,3 @@ def test_tensors_of_slices_are_those_of_the_whole(lake, tmp_path, tracks_from, s
 def find_scratch(root):
     """What stages leave in the lake's staging folder."""
     return (root / ".staging").glob("numbers-*")
-
-
-def test_work_on_all_of_a_subset_that_the_memory_cannot_hold_is_refused(lake):
-    reader = LakeReader(lake.root, load(lake.root)).open_subset("highd", "01-lower")
-    reader.require_memory(800)
-    refusal = r"at once: its [\d,]+ entries need about [\d,]+\.\d GiB .* has [\d,]+\.\d GiB\. "
-    for stage, advice in (("reconstruct", r"Leave the stage out \(reconstruct = false\)"), ("tensors", "Make shorter")):
-        with pytest.raises(StageError, match=f"{stage} works on .*{refusal}{advice}"):
-            replace(reader, job=Job(f"{stage}/highd/01", "")).require_memory(10**12)

@@ -1,14 +1,18 @@
 import numpy as np
 import pytest
 
-from tracklake.pipeline.transforms.reconstruction.jumps import find_displacements
+from tracklake.pipeline.transforms.number_store import MemoryStore
+from tracklake.pipeline.transforms.reconstruction.jumps import find_displacements, find_least_jump, measure_differences
 from tracklake.pipeline.transforms.reconstruction.smoothing import Series
 
 
 def find(z, rate_hz=10.0, recorded=None, sizes=None):
     sizes = np.array([len(z)] if sizes is None else sizes)
     series = Series(np.cumsum(sizes) - sizes, sizes, rate_hz)
-    return find_displacements(series, z, np.ones(len(z), bool) if recorded is None else recorded)
+    recorded = np.ones(len(z), bool) if recorded is None else recorded
+    differences = MemoryStore("float64")
+    differences.append(measure_differences(series, z, recorded))
+    return find_displacements(series, z, recorded, find_least_jump(differences, len(z)))[0]
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 25.0])
