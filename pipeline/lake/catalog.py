@@ -148,8 +148,10 @@ def _write_read_of_file(table: Table, file: LakeFile, locations: FileLocations, 
 
 def create_views(
     connection: "duckdb.DuckDBPyConnection", place: LakePlace, manifest: Manifest, *, stored: Collection[str] = ()
-) -> None:
-    """Create the views and the macros over them, in one transaction: each statement in its own takes a third longer.
+) -> FileLocations:
+    """Create the views and the macros over them, and return where the views read.
+
+    One transaction: each statement in its own takes a third longer.
 
     Args:
         connection: connection to an empty database.
@@ -163,11 +165,13 @@ def create_views(
     if isinstance(place, Path) and (origin := find_origin(place)) is not None:
         _admit_origin(connection, place, origin, [file for table in TABLES for file in manifest.live(table.name)])
     connection.begin()
-    for name, select in _write_selects(place, manifest).items():
+    locations = FileLocations(place)
+    for name, select in _write_selects(locations, manifest).items():
         _create(connection, place, name, f'CREATE {"TABLE" if name in stored else "VIEW"} "{name}" AS {select}')
     for macro in MACROS:
         connection.execute(macro.statement)
     connection.commit()
+    return locations
 
 
 def _admit_origin(
@@ -191,9 +195,8 @@ def describe_views(connection: "duckdb.DuckDBPyConnection") -> None:
     connection.commit()
 
 
-def _write_selects(place: LakePlace, manifest: Manifest) -> dict[str, str]:
+def _write_selects(locations: FileLocations, manifest: Manifest) -> dict[str, str]:
     """Return a SELECT of the live rows of every table, by name."""
-    locations = FileLocations(place)
     return {table.name: _write_select(table, manifest, locations) for table in TABLES}
 
 
@@ -239,7 +242,7 @@ def build_catalog(root: Path, manifest: Manifest) -> bytes:
 
 def _build_catalog(root: Path, manifest: Manifest, stored_rows: int) -> bytes:
     """Return the catalog's content; tables of at most so many rows are stored in it."""
-    selects = _write_selects(root, manifest)
+    selects = _write_selects(FileLocations(root), manifest)
     files = {table: manifest.live(table.name) for table in TABLES}
     filled = {table: sum(file.rows or 0 for file in live) for table, live in files.items() if live}
 
@@ -259,7 +262,7 @@ def _build_catalog(root: Path, manifest: Manifest, stored_rows: int) -> bytes:
 @cache
 def _make_empty_catalog() -> bytes:
     """Return a catalog of no rows. A process makes it once: most of a small catalog's time goes into the comments."""
-    selects = _write_selects(Path(), Manifest(lake_id=""))
+    selects = _write_selects(FileLocations(Path()), Manifest(lake_id=""))
 
     def create(connection: "duckdb.DuckDBPyConnection") -> None:
         for table in TABLES:

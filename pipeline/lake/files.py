@@ -19,7 +19,7 @@ from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
 from tracklake.pipeline.lake.object_access import FileLocations, get_polars_options
 from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.places import LakePlace
-from tracklake.pipeline.lake.transfers import fetch_objects
+from tracklake.pipeline.lake.transfers import READING_S, fetch_objects
 from tracklake.schemas import TABLES, Table
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.files import sync
@@ -279,7 +279,7 @@ def scan(place: LakePlace, manifest: Manifest, table: Table, **values: str) -> p
     stated = {file: own for file, own in stated.items() if values.items() <= own.items()}
     if isinstance(place, Path) and (origin := find_origin(place)) is not None:
         fetch_objects(origin, [file for file in stated if not (place / file.path).exists()])
-    locations = FileLocations(place)
+    locations = FileLocations(place, READING_S)
     by_values: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for file, own in stated.items():
         content = locations.find(file)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from tracklake.pipeline.lake.errors import StoreError
 from tracklake.pipeline.lake.manifest import LakeFile
 from tracklake.pipeline.lake.object_store import find_endpoint
-from tracklake.pipeline.lake.origin import find_origin
+from tracklake.pipeline.lake.origin import find_origin, reserve_content
 from tracklake.pipeline.lake.places import LakePlace
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ SECRET_SETTINGS = ("s3_access_key_id", "s3_secret_access_key", "s3_session_token
 """Settings into which httpfs copies credentials of the environment, where every query could read them."""
 UNSIGNED = "AWS_SKIP_SIGNATURE"
 """Environment variable: if set to true, a public bucket is read without credentials."""
+SESSION_S = 3600.0
+"""Time for which what a connection finds in a cache stays there at least, in seconds."""
 DIGEST_DIGITS = 16
 """Hex digits of a file's checksum in its object's name."""
 
@@ -54,9 +56,12 @@ class FileLocations:
 
     Args:
         place: the lake's folder, or its address.
+        kept_s: time for which what is found in a cache stays there at least, in seconds.
     """
 
-    def __init__(self, place: LakePlace) -> None:
+    def __init__(self, place: LakePlace, kept_s: float = SESSION_S) -> None:
+        self._kept_s = kept_s
+        self._found: dict[LakeFile, str] = {}
         self._is_remote = isinstance(place, str)
         self._origin = None if isinstance(place, str) else find_origin(place)
         # With slashes on Windows, too, as DuckDB takes it for partitions.
@@ -64,11 +69,13 @@ class FileLocations:
 
     def find(self, file: LakeFile) -> str:
         """Return the path or address of a file's content; in a folder with a part of a lake, where it is now."""
-        if self._origin is not None and not Path(self.root, file.path).exists():
+        if self._origin is None or Path(self.root, file.path).exists():
+            return f"{self.root}/{name_object(file) if self._is_remote else file.path}"
+        if file not in self._found:  # always the same, though others fill the cache meanwhile
             kept = self._origin.objects / name_object(file)
-            is_whole = kept.exists() and kept.stat().st_size == file.bytes
-            return kept.as_posix() if is_whole else f"{self._origin.address}/{name_object(file)}"
-        return f"{self.root}/{name_object(file) if self._is_remote else file.path}"
+            is_kept = reserve_content(kept, self._kept_s) == file.bytes
+            self._found[file] = kept.as_posix() if is_kept else f"{self._origin.address}/{name_object(file)}"
+        return self._found[file]
 
 
 def get_polars_options(address: str) -> dict[str, str]:

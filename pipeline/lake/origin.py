@@ -5,9 +5,11 @@ names files that need not be there: they are on the store, and are received when
 """
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import time_ns
 from typing import NamedTuple
 
 from tracklake.schemas.documents import read_json
@@ -73,6 +75,20 @@ class Origin(NamedTuple):
                 f"{failed} This is the cache of {self.address}: make room there, or name another folder with the "
                 "setting `cache`."
             ) from failed.__cause__
+
+
+def reserve_content(kept: Path, seconds: float) -> int | None:
+    """Keep what a cache holds from being dropped for some time, and return its size in bytes; None: it is not there.
+
+    Until when is noted in the time of the last access, which is that of the last use otherwise.
+    """
+    try:
+        status = kept.stat()  # its checksum is known by the time of its last change, which stays
+        until = max(status.st_atime_ns, time_ns() + int(seconds * 1e9))
+        os.utime(kept, ns=(until, status.st_mtime_ns))
+    except FileNotFoundError:
+        return None
+    return status.st_size
 
 
 def find_origin(root: Path) -> Origin | None:

@@ -11,7 +11,7 @@ from tracklake.pipeline.lake.errors import QueryError
 from tracklake.pipeline.lake.files import TABLE_BY_NAME
 from tracklake.pipeline.lake.history import load_as_of
 from tracklake.pipeline.lake.manifest import Manifest
-from tracklake.pipeline.lake.object_access import FileLocations, admit_place, quote
+from tracklake.pipeline.lake.object_access import admit_place, quote
 from tracklake.pipeline.lake.places import find_place
 from tracklake.pipeline.lake.results import LakeResult
 from tracklake.schemas import TABLES, Table
@@ -124,9 +124,8 @@ def connect(lake: Path | str, as_of: str | None = None) -> LakeConnection:
         },
     )
     admit_place(connection, place)
-    create_views(connection, place, manifest)
+    locations = create_views(connection, place, manifest)
     describe_views(connection)
-    locations = FileLocations(place)
     live = [locations.find(file) for table in TABLES for file in manifest.live(table.name)]
     # Files, not folders: some functions that a SELECT may call would write new files into an allowed folder.
     allowed = ", ".join(quote(path) for path in {*live, *map(escape_pattern, live)})

@@ -16,7 +16,7 @@ from tracklake.pipeline.lake.checksums import find_damage, hash_file, verify_fil
 from tracklake.pipeline.lake.errors import DamagedFileError, MissingObjectError
 from tracklake.pipeline.lake.manifest import Commit, LakeFile
 from tracklake.pipeline.lake.object_access import name_object
-from tracklake.pipeline.lake.origin import Origin, find_origin
+from tracklake.pipeline.lake.origin import Origin, find_origin, reserve_content
 from tracklake.pipeline.lake.places import open_store
 from tracklake.pipeline.lake.store import Store
 from tracklake.schemas.text import quote_shell
@@ -85,7 +85,7 @@ def fetch_objects(origin: Origin, files: Iterable[LakeFile], root: Path | None =
         root: folder in which the files get their own names, too; None: nowhere.
     """
     if root is None:
-        trim_cache(origin, READING_S)
+        trim_cache(origin)
     store = open_store(origin.address)
     advice = f"`tracklake run SOURCE --lake {quote_shell(origin.address)}` on the raw files makes it again."
 
@@ -95,7 +95,8 @@ def fetch_objects(origin: Origin, files: Iterable[LakeFile], root: Path | None =
             with origin.explain_errors(kept):
                 receive_file(store, file, kept, advice)
             _count_added(origin, file.bytes)
-        os.utime(kept, ns=(time_ns(), kept.stat().st_mtime_ns))  # its checksum is known by the time of its last change
+        if reserve_content(kept, 0.0 if root is not None else READING_S) is None:
+            raise FileNotFoundError(kept)
         if root is not None:
             _link(kept, root / file.path)
 
@@ -148,12 +149,10 @@ def seal_commit(root: Path, commit: Commit) -> Commit:
     return replace(commit, files={table: [seal(file) for file in files] for table, files in commit.files.items()})
 
 
-def trim_cache(origin: Origin, idle_s: float = 0.0) -> None:
+def trim_cache(origin: Origin) -> None:
     """Delete the contents that were used longest ago, down to the cache's limit; they are received again on use.
 
-    Args:
-        origin: the lake and the cache.
-        idle_s: time for which contents must not have been used, in seconds.
+    Those that a process reads (`reserve_content`) stay.
     """
     limit = origin.cache_gb * 1e9
     with _GUARD:
@@ -168,10 +167,12 @@ def trim_cache(origin: Origin, idle_s: float = 0.0) -> None:
                 found.append((status.st_atime_ns, status.st_size, path))
     size = sum(each[1] for each in found)
     for used, each, path in sorted(found):
-        if size <= limit or used > time_ns() - idle_s * 1e9:
+        if size <= limit or used > time_ns():
             return
-        path.unlink(missing_ok=True)
-        size -= each
+        with suppress(FileNotFoundError):
+            if path.stat().st_atime_ns == used:  # nobody has used it since
+                path.unlink()
+                size -= each
 
 
 def _count_added(origin: Origin, size: int) -> None:

@@ -1,6 +1,7 @@
 """What must hold when a store loses answers, another process was faster, or the cache of a machine is damaged."""
 
 import json
+import os
 import subprocess
 import sys
 from datetime import timedelta
@@ -12,7 +13,16 @@ from object_stores import BUSY, FORGETFUL
 from small_lake import make_status, put
 
 import tracklake
-from tracklake.pipeline.lake import Writer, connect, load, object_folder, object_store, open_for_writing
+from tracklake.pipeline.lake import (
+    Writer,
+    connect,
+    load,
+    object_folder,
+    object_store,
+    open_for_writing,
+    scan,
+    transfers,
+)
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import LakeLockedError, StoreError
 from tracklake.pipeline.lake.history import name_root
@@ -20,6 +30,7 @@ from tracklake.pipeline.lake.object_store import ObjectStore
 from tracklake.pipeline.lake.origin import Origin
 from tracklake.pipeline.lake.transfers import send_commits
 from tracklake.pipeline.lake.working_copy import hold_copy, locate_origin, refresh_copy
+from tracklake.schemas import SUBSET_STATUS
 from tracklake.schemas.errors import FileAccessError
 
 
@@ -138,6 +149,26 @@ def test_a_content_of_the_cache_that_was_cut_is_read_from_the_store(origin):
     kept.write_bytes(kept.read_bytes()[:50])
     with connect(refresh_copy(origin)) as connection:
         assert connection.sql("SELECT subset, backward_vehicles FROM subset_status").fetchall() == [("01", 4)]
+
+
+def test_what_is_read_stays_in_the_cache_however_small_that_is(origin):
+    """Another process on the same cache drops what it does not need, and may have a smaller limit."""
+    commit(origin, ("01", 4), ("02", 6))
+    root, statement = refresh_copy(origin), "SELECT subset, backward_vehicles FROM subset_status ORDER BY 1"
+    scanned = scan(root, load(root), SUBSET_STATUS, subset="01")
+    with connect(root) as connection:
+        drop_contents(origin)
+        assert connection.sql(statement).fetchall() == [("01", 4), ("02", 6)]
+    assert scanned.collect()["backward_vehicles"].to_list() == [4]
+    for kept in origin.objects.rglob("*.parquet"):
+        os.utime(kept, (0, kept.stat().st_mtime))  # an hour later
+    drop_contents(origin)
+    assert [*origin.objects.rglob("*.parquet")] == []
+
+
+def drop_contents(origin: Origin) -> None:
+    transfers._ADDED.clear()
+    transfers.trim_cache(origin._replace(cache_gb=0.0))
 
 
 @pytest.mark.usefixtures("bucket")
