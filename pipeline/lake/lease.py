@@ -61,6 +61,14 @@ def hold_lease(store: Store, holder: str, lease_s: float = LEASE_S) -> Iterator[
         _release(store, own)
 
 
+def is_held(store: Store) -> bool:
+    """Return whether a coordinator works on a lake, or died a short while ago."""
+    try:
+        return _read(store.get(LEASE)[0])[1] > datetime.now(UTC)
+    except MissingObjectError:
+        return False
+
+
 def _acquire(store: Store, own: str, holder: str, lease_s: float) -> str:
     """Create the lease, or take over one that has ended, and return its tag."""
     try:

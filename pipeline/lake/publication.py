@@ -23,6 +23,7 @@ from tracklake.pipeline.lake.errors import (
     StoreError,
 )
 from tracklake.pipeline.lake.files import STORE, TENSORS
+from tracklake.pipeline.lake.lease import is_held
 from tracklake.pipeline.lake.manifest import MANIFEST, Commit, LakeFile, Manifest, load, read_root
 from tracklake.pipeline.lake.object_access import name_object
 from tracklake.pipeline.lake.object_folder import claim_place, sweep_objects
@@ -94,7 +95,8 @@ def publish_lake(root: Path, address: str, *, replace_other: bool = False, expec
         after = log.replace(after)
     if after.commits == sealed.commits:
         _record_agreement(root, address, local, log.digest)
-    return Transfer(len(sent), sum(file.bytes for file in sent), sweep_objects(address), after.generation)
+    deleted = 0 if is_held(store) else sweep_objects(address)  # who holds it may have sent for days, and will sweep
+    return Transfer(len(sent), sum(file.bytes for file in sent), deleted, after.generation)
 
 
 def fetch_lake(address: str, root: Path) -> Transfer:

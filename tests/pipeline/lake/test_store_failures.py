@@ -26,8 +26,10 @@ from tracklake.pipeline.lake import (
 from tracklake.pipeline.lake.commit_log import CommitLog
 from tracklake.pipeline.lake.errors import LakeLockedError, StoreError
 from tracklake.pipeline.lake.history import name_root
+from tracklake.pipeline.lake.object_access import name_object
 from tracklake.pipeline.lake.object_store import ObjectStore
 from tracklake.pipeline.lake.origin import Origin
+from tracklake.pipeline.lake.publication import fetch_lake, publish_lake
 from tracklake.pipeline.lake.transfers import send_commits
 from tracklake.pipeline.lake.working_copy import hold_copy, locate_origin, refresh_copy
 from tracklake.schemas import SUBSET_STATUS
@@ -104,6 +106,20 @@ def test_a_lake_in_a_folder_of_another_is_not_swept_with_it(bucket, origin, tmp_
     commit(origin, ("02", 8))
     assert read_status(bucket) == [("02", 8)]
     assert read_status(inner.address) == [("01", 4)]
+
+
+def test_a_publication_deletes_nothing_of_a_rebuild_that_takes_more_than_a_day(bucket, origin, tmp_path, monkeypatch):
+    commit(origin, ("01", 4))
+    fetch_lake(bucket, tmp_path / "lake")
+    monkeypatch.setattr(object_folder, "GRACE", timedelta(seconds=-5))
+    with hold_copy(origin, is_rebuild=True) as root, open_for_writing(root, rebuild=True) as writer:
+        add(writer, "02", 6)
+        assert publish_lake(tmp_path / "lake", bucket).deleted == 0
+    (file,) = load(bucket).live("subset_status")
+    assert ObjectStore(bucket).get(name_object(file))[0]
+    ObjectStore(bucket).put_new("tensors/left.0123456789abcdef.npy", b"")
+    fetch_lake(bucket, tmp_path / "other")
+    assert publish_lake(tmp_path / "other", bucket).deleted >= 1
 
 
 def test_half_a_rebuild_is_not_seen_on_the_machine_that_makes_it(bucket, origin):
