@@ -274,27 +274,33 @@ def scan(place: LakePlace, manifest: Manifest, table: Table, **values: str) -> p
     others = values.keys() - set(table.partition)
     if others:
         raise ValueError(f"{table.name} has no partition {', '.join(sorted(others))}; filter its rows instead")
-    # Not by the reader's hive option: that takes `name=value` folders above the lake for partitions, too.
     stated = {file: read_partition(table, file.path) for file in manifest.live(table.name)}
     stated = {file: own for file, own in stated.items() if values.items() <= own.items()}
     if isinstance(place, Path) and (origin := find_origin(place)) is not None:
         fetch_objects(origin, [file for file in stated if not (place / file.path).exists()])
     locations = FileLocations(place, READING_S)
-    by_values: dict[tuple[tuple[str, str], ...], list[str]] = {}
-    for file, own in stated.items():
-        content = locations.find(file)
-        if isinstance(place, Path) and not Path(content).is_file():
+    contents = {file: locations.find(file) for file in stated}
+    for content in contents.values():
+        if isinstance(place, Path) and not os.path.isfile(content):  # noqa: PTH113  (thousands; a path each is slow)
             raise DamagedFileError(
                 f"{content}: a live file of the lake is missing; `tracklake run SOURCE --lake {quote_shell(place)}` on "
                 "the raw files makes it again"
             )
-        by_values.setdefault(tuple(own.items()), []).append(content)
+    by_values: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    for file, own in stated.items():
+        by_values.setdefault(tuple(own.items()), []).append(contents[file])
     if not by_values:
         return table.empty().lazy()
     stored = {name: dtype for name, dtype in table.dtypes.items() if name not in table.partition}
     options: dict[str, Any] = {"schema": stored, "missing_columns": "insert"} if table.added else {}
     if isinstance(place, str):
         options |= {"storage_options": get_polars_options(place), "credential_provider": None}
+    if len(by_values) > 1 and all(content.count("=") == file.path.count("=") for file, content in contents.items()):
+        # One scan of thousands of partitions takes a fiftieth of the time of a scan of each.
+        options["hive_schema"] = {name: table.dtypes[name] for name in table.partition}
+        found = pl.scan_parquet([*contents.values()], hive_partitioning=True, glob=False, **options)
+        return found.select(*table.dtypes)
+    # Not by the reader's hive option, which takes `name=value` folders above the lake for partitions, too.
     return pl.concat(
         pl.scan_parquet(paths, hive_partitioning=False, glob=False, **options)
         .with_columns(pl.lit(value).cast(table.dtypes[name]).alias(name) for name, value in own)

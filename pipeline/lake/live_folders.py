@@ -27,14 +27,15 @@ def list_names(commits: Iterable[Commit]) -> dict[str, str]:
     names: dict[str, str] = {}
     for commit in commits:
         recording = escape_name(commit.tail.partition("/")[2] or "0")
-        by_folder: dict[PurePosixPath, list[str]] = {}
+        by_folder: dict[str, list[str]] = {}
         for file in commit.all_files:
-            by_folder.setdefault(PurePosixPath(file.path).parent, []).append(file.path)
-        for folders, paths in by_folder.items():
-            if folders.parts[0] == STORE:
+            by_folder.setdefault(file.path.rpartition("/")[0], []).append(file.path)
+        for folder, paths in by_folder.items():
+            top, _, shown = folder.partition("/")
+            if top == STORE:
                 for number, path in enumerate(paths, 1):
                     part = f",{number:04d}" if len(paths) > 1 else ""
-                    names[f"{folders.relative_to(STORE)}/part-{recording}{part}.parquet"] = path
+                    names[f"{shown}/part-{recording}{part}.parquet"] = path
     return names
 
 
@@ -61,7 +62,7 @@ def is_shown(root: Path, manifest: Manifest) -> bool:
     """Return whether the live folders show exactly what is live."""
     names = list_names(manifest.commits.values())
     return list_files(root, _list_folders(root)) == names.keys() and all(
-        _is_same(root / path, root / name) for name, path in names.items()
+        _is_same(f"{root}/{path}", f"{root}/{name}") for name, path in names.items()
     )
 
 
@@ -117,17 +118,17 @@ def _list_folders(root: Path) -> set[str]:
     return {*TABLE_BY_NAME, *(folder.name for folder in (root / STORE).glob("*"))}
 
 
-def _is_linked(stored: Path, shown: Path) -> bool:
+def _is_linked(stored: Path | str, shown: Path | str) -> bool:
     try:
-        return stored.samefile(shown)
+        return os.path.samefile(stored, shown)  # noqa: PTH121  (twice as fast, and there are thousands)
     except OSError:
         return False
 
 
-def _is_same(stored: Path, shown: Path) -> bool:
+def _is_same(stored: Path | str, shown: Path | str) -> bool:
     """Return whether a name leads to a stored file, or to a copy of it where hard links are not to be had."""
     try:
-        one, other = os.stat(stored), os.stat(shown)  # noqa: PTH116  (twice as fast, and there are thousands)
+        one, other = os.stat(stored), os.stat(shown)  # noqa: PTH116  (as above)
     except (FileNotFoundError, NotADirectoryError):
         return False
     if os.path.samestat(one, other):
@@ -137,8 +138,10 @@ def _is_same(stored: Path, shown: Path) -> bool:
 
 def _link(root: Path, path: str, name: str) -> None:
     """Give a stored file a name, replacing what has it; readers that have the former file open keep reading it."""
+    if _is_linked(f"{root}/{path}", f"{root}/{name}"):
+        return
     stored, shown = root / path, root / name
-    if _is_linked(stored, shown) or not stored.exists():
+    if not stored.exists():
         return  # damage to the store is the readers' matter
     aside = root / STAGING / f"{uuid.uuid4().hex}.tmp"
     aside.parent.mkdir(parents=True, exist_ok=True)
