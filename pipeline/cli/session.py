@@ -15,7 +15,7 @@ from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import require_choice
 from tracklake.pipeline.cli.summary import show_assessment, show_headline, show_result
 from tracklake.pipeline.ingest.discovery import Discovery
-from tracklake.pipeline.lake import LakeError, LakeFile, load, refuse_foreign, refuse_if_busy
+from tracklake.pipeline.lake import LakeError, LakeFile, load_recent, refuse_foreign, refuse_if_busy
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.lake.origin import Origin
 from tracklake.pipeline.lake.transfers import fetch_files
@@ -65,7 +65,7 @@ def run_steps(
     except SourceError as error:
         raise SourceError(f"{error}{_explain_no_prune(request.root)}" if prune else str(error)) from None
     if discovery is None:
-        load(request.root)  # raises where there is no lake to work on
+        load_recent(request.root)  # raises where there is no lake to work on
     if discovery is not None and not discovery.units:
         # No file is usable, so no lake is created.
         for message in discovery.refusals:
@@ -113,7 +113,7 @@ def work_in_folder(terminal: Terminal, settings: Settings, *, rebuild: bool = Fa
 
 def _list_files(lake: Path) -> set[LakeFile]:
     with suppress(LakeError):
-        return {file for commit in load(lake).commits.values() for file in commit.all_files}
+        return {file for commit in load_recent(lake).commits.values() for file in commit.all_files}
     return set()
 
 
@@ -139,7 +139,7 @@ def _explain_interrupt(lake: Path) -> Iterator[None]:
 def _list_commits(lake: Path) -> set[tuple[str, str]]:
     """Return keys and fingerprints of what is in the lake."""
     try:
-        return {(key, commit.fingerprint) for key, commit in load(lake).commits.items()}
+        return {(key, commit.fingerprint) for key, commit in load_recent(lake).commits.items()}
     except LakeError:
         return set()
 
@@ -187,7 +187,7 @@ def report_result(
     show_result(terminal, result)
     reports = settings.lake / REPORTS
     record: dict[str, Any] = {"lake": settings.lake, **asdict(result)}
-    manifest = load(settings.lake)
+    manifest = load_recent(settings.lake)
     usable = bool(manifest.of_stage("ingest"))
     if usable and headline and (reports / DOCUMENT).exists():
         fetch_files(settings.lake, list_report(manifest))

@@ -7,7 +7,7 @@ from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal, find_command
 from tracklake.pipeline.cli.drives import list_drives
-from tracklake.pipeline.lake import connect, load
+from tracklake.pipeline.lake import connect, load_recent
 from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.orchestration.run_plan import RunResult
 from tracklake.pipeline.stages.drive_score import collect_drive_scores
@@ -54,7 +54,7 @@ def show_result(terminal: Terminal, result: RunResult) -> None:
 def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lake: Path) -> None:
     """Print the report's figures, its path, and two commands to try next."""
     terminal.print_origin(describe_subset_origins(quality))
-    head, drives = quality["headline"], list_drives(lake, load(lake))
+    head, drives = quality["headline"], list_drives(lake, load_recent(lake))
     excluded, judged = _format_count(head["excluded_subsets"]), head["eligible_starts"]
     late = "starts not judged" if judged is None else f"{head['late_starts']:,} late starts of {judged:,} judged"
     lines = {
@@ -77,7 +77,9 @@ def show_headline(terminal: Terminal, quality: dict[str, Any], report: Path, lak
         radial = any(row["rmse_m"] is not None for row in score["rows"])
         name, figure = ("RMSE", "rmse_m") if radial else ("longitudinal RMSE", "rmse_longitudinal_m")
         lines[f"{name}, m ({score['model']})"] = _format_errors(score["rows"], figure)
-    of_drives = collect_drive_scores(lake, load(lake), lambda message: terminal.print_problem(message, label="skipped"))
+    of_drives = collect_drive_scores(
+        lake, load_recent(lake), lambda message: terminal.print_problem(message, label="skipped")
+    )
     lines |= {f"MAE, m ({score['model']}, drives)": _format_errors(score["rows"], "mae_m") for score in of_drives}
     width = max(map(len, lines)) + 2
     for name, value in lines.items():

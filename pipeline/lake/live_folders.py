@@ -13,7 +13,15 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from tracklake.pipeline.lake.checksums import hash_file
-from tracklake.pipeline.lake.files import STAGING, STORE, TABLE_BY_NAME, escape_name, list_files, remove_files
+from tracklake.pipeline.lake.files import (
+    STAGING,
+    STORE,
+    TABLE_BY_NAME,
+    escape_name,
+    list_files,
+    remove_empty_folders,
+    remove_files,
+)
 from tracklake.pipeline.lake.manifest import Commit, LakeFile, Manifest
 
 
@@ -53,9 +61,8 @@ def show_manifest(root: Path, manifest: Manifest) -> None:
     for name, path in names.items():
         _link(root, path, name)
     remove_files(root, (root / name for name in list_files(root, _list_folders(root)) - names.keys()))
-    for folder, _, files in (found for top in _list_folders(root) for found in os.walk(root / top, topdown=False)):
-        if not files and not os.listdir(folder):  # noqa: PTH208  (for thousands of folders, a path each is slow)
-            os.rmdir(folder)  # noqa: PTH106  (as above)
+    for top in _list_folders(root):
+        remove_empty_folders(root / top)
 
 
 def is_shown(root: Path, manifest: Manifest) -> bool:

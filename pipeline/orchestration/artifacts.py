@@ -11,7 +11,7 @@ import httpx
 from prefect.artifacts import create_table_artifact
 from prefect.context import FlowRunContext
 
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import load_recent
 from tracklake.pipeline.lake.files import REPORTS
 from tracklake.pipeline.orchestration.run_plan import RunRequest, RunResult
 from tracklake.pipeline.stages.report import PAGE, read_quality
@@ -50,7 +50,7 @@ def summarise_report(root: Path) -> tuple[list[FigureTable], dict[str, Any]]:
         OSError: the lake has no report.
     """
     quality = read_quality(root)
-    make_key = partial(_make_key, root=root, lake_id=load(root).lake_id)
+    make_key = partial(_make_key, root=root, lake_id=load_recent(root).lake_id)
     figures = (
         ("findings", "Per rule: what breaks it in the whole lake.", _list_findings(quality)),
         ("subsets", "Per subset: its size, and the entries that break each rule.", _list_subsets(quality)),
