@@ -22,6 +22,9 @@ from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS, RECORDED, TracksFr
 CLEAN_CONTEXT_S = 3.0
 """Time before and after an entry, in s, on which its row depends besides its reconstructed position: the sides of a
 filled gap of at most 2 s, and differences over 0.2 s."""
+CLEAN_SHARE = 2
+"""Tracks whose positions are replaced are read in slices of half as many entries: all their columns and both positions
+are in memory then."""
 
 
 @dataclass(frozen=True)
@@ -116,21 +119,26 @@ class SubsetReader(LakeReader):
         """Return whether the subset has more entries than a worker holds at once."""
         return bool(self.facts["entries"] > settings.slice_entries)
 
-    def cut(self, settings: Settings, context_s: float) -> Iterator["SubsetReader"]:
-        """Yield readers of slices with their context, in order; the subset itself where it is not long."""
+    def cut(
+        self, settings: Settings, context_s: float, *, tracks_from: TracksFrom = RECORDED, share: int = 1
+    ) -> Iterator["SubsetReader"]:
+        """Yield readers of slices with their context, in order; the subset itself where it is not long.
+
+        A slice has the entries that a worker holds at once, divided by `share`.
+        """
         if not self.is_long(settings):
             yield self
             return
         counts = self.scan(TRACKS).group_by("frame").agg(rows=pl.len()).sort("frame").collect(engine="streaming")
         context = ceil(context_s * self.facts["frame_rate_hz"])
         frames, rows = (counts[name].cast(pl.Int64).to_numpy() for name in ("frame", "rows"))
-        for each in cut_frames(frames, rows, settings.slice_entries, context):
+        for each in cut_frames(frames, rows, _count_at_once(settings, tracks_from, share), context):
             yield replace(self, slice=each)
 
     def read_whole_tracks(
-        self, settings: Settings, *columns: str, tracks_from: TracksFrom = RECORDED
+        self, settings: Settings, *columns: str, tracks_from: TracksFrom = RECORDED, share: int = 1
     ) -> Iterator[pl.DataFrame]:
-        """Yield columns of whole tracks in order of vehicles, as many at once as a worker holds of entries.
+        """Yield columns of whole tracks in order of vehicles, with as many entries as `cut` gives a slice.
 
         Of filtered and reconstructed tracks, columns that depend on other vehicles (`gap_m`) are not among them.
         """
@@ -138,7 +146,7 @@ class SubsetReader(LakeReader):
             yield self.read_tracks_from(tracks_from, *columns)
             return
         vehicles = self.table(VEHICLES, "vehicle_id", "entries", "first_frame", "last_frame").sort("vehicle_id")
-        group = pl.col("entries").cast(pl.Int64).cum_sum() // settings.slice_entries
+        group = pl.col("entries").cast(pl.Int64).cum_sum() // _count_at_once(settings, tracks_from, share)
         for _, some in vehicles.group_by(group, maintain_order=True):
             # Frames, too: the files of slices are sorted by these.
             is_own = pl.col("vehicle_id").is_between(some["vehicle_id"].min(), some["vehicle_id"].max())
@@ -189,3 +197,8 @@ class SubsetReader(LakeReader):
     def clock(self) -> dict[str, Any]:
         """First frame and frame rate (Hz), as transforms take them."""
         return {name: self.facts[name] for name in ("first_frame", "frame_rate_hz")}
+
+
+def _count_at_once(settings: Settings, tracks_from: TracksFrom, share: int) -> int:
+    """Return how many entries of tracks are read at once."""
+    return max(1, settings.slice_entries // (share * (1 if tracks_from == RECORDED else CLEAN_SHARE)))

@@ -46,10 +46,9 @@ def build(reader: SubsetReader, settings: Settings) -> Iterator[StageResult]:
         yield _gather(made)
         return
     at_once = max(1, settings.slice_entries // SHARE)
-    shared = settings.model_copy(update={"slice_entries": at_once})
     with open_scratch(reader.root) as make_store:
         shares = reconstruct_shares(
-            lambda: reader.read_whole_tracks(shared, *TRACK_COLUMNS),
+            lambda: reader.read_whole_tracks(settings, *TRACK_COLUMNS, share=SHARE),
             vehicles,
             reader.facts,
             config,

@@ -30,7 +30,8 @@ def build(reader: SubsetReader, settings: Settings) -> Iterator[StageResult]:
     has_lanes = None
     drawn: list[dict[Table, pl.DataFrame]] = []
     # Filtered positions depend on all that was before.
-    for each in [reader] if settings.tracks_from == FILTERED_TRACKS else reader.cut(settings, context_s):
+    is_whole = settings.tracks_from == FILTERED_TRACKS
+    for each in [reader] if is_whole else reader.cut(settings, context_s, tracks_from=settings.tracks_from):
         if each.slice is not None and has_lanes is None:
             has_lanes = not reader.scan(TRACKS).select(pl.col("lane").null_count()).collect(engine="streaming").item()
         made = draw_samples(

@@ -20,6 +20,8 @@ from tracklake.schemas.protocols import RECORDED, TracksFrom
 LONGEST_WINDOW_S = 2.0
 """Time before and after an entry on which rules depend, in s, besides the stay of `lane_flicker`: reversals of jerk
 look back 1.1 s."""
+SHARE = 2
+"""A slice has half of the entries that a worker holds at once: rules take about 700 bytes for each."""
 
 
 def describe_rules(settings: Settings) -> dict[str, Any]:
@@ -68,7 +70,8 @@ def judge_tracks(
     Also returns a speed for each entry, or of a long subset the least one of each vehicle.
     """
     limits = _select(settings)
-    slices = list(reader.cut(settings, LONGEST_WINDOW_S + resolve(RULES, limits)["lane_flicker_s"]))
+    context_s = LONGEST_WINDOW_S + resolve(RULES, limits)["lane_flicker_s"]
+    slices = list(reader.cut(settings, context_s, tracks_from=tracks_from, share=SHARE))
     if slices[0].slice is not None:
         return _judge_slices(slices, tracks_from, ignored, limits)
     tracks = reader.read_tracks_from(tracks_from, *tracks_needed())
