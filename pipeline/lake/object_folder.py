@@ -103,7 +103,7 @@ def sweep_objects(address: str) -> int:
         except DamagedShardError:
             if document is present:
                 raise
-            continue  # nobody can read this earlier state
+            continue  # this earlier state cannot be read
         needed |= {name_object(file) for commit in commits for file in commit.all_files}
     inner = tuple(f"{item.path.rpartition('/')[0]}/" for item in objects if item.path.endswith(TOPS))
     old = {item for item in objects if item.path not in needed | young and OWN_OBJECTS.fullmatch(item.path)}

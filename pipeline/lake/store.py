@@ -77,7 +77,7 @@ class Store(Protocol):
 def swap_own(store: Store, path: str, data: bytes, tag: str | None) -> str:
     """Swap content that no other writer makes: found there after an error, it was stored, and the answer lost.
 
-    A client repeats a request without an answer, and is then told that another writer was first. Raises as `swap`.
+    A client repeats a request without an answer, and then learns that another writer was first. Raises as `swap`.
     """
     try:
         return store.swap(path, data, tag)

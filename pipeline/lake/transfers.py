@@ -170,7 +170,7 @@ def trim_cache(origin: Origin) -> None:
         if size <= limit or used > time_ns():
             return
         with suppress(FileNotFoundError):
-            if path.stat().st_atime_ns == used:  # nobody has used it since
+            if path.stat().st_atime_ns == used:  # not used since
                 path.unlink()
                 size -= each
 
