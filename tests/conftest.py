@@ -1,9 +1,14 @@
 """What several test packages share: Prefect kept to itself, a generated sample, and a lake made of it."""
 
+import os
+
+from lake_sources import EXCERPTS, SAME_BITS, SAMPLE
+
+os.environ |= SAME_BITS  # before anything imports NumPy
+
 import gc
 import http.client
 import json
-import os
 import shutil
 import socket
 import sqlite3
@@ -22,7 +27,6 @@ import pytest
 import vl_convert
 from cloud_stores import cloud as cloud
 from hypothesis import HealthCheck, settings
-from lake_sources import EXCERPTS, SAMPLE
 from object_stores import bucket as bucket
 from object_stores import object_store_server as object_store_server
 from object_stores import role as role

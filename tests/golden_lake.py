@@ -15,8 +15,9 @@ What is hashed is content: names, dtypes, shapes and values, the rows of a table
 tensor files are encoded, where the lake is, when it was made and what its fingerprints are does not matter. A digest is
 the first 16 hexadecimal digits of a SHA-256.
 
-Losses are not hashed. The bits of float sums differ between types of CPU, and training carries them on. The numbers
-themselves are kept, with 6 significant digits, and compared with LOSS_TOLERANCE.
+Lakes are made with the same kernels of OpenBLAS on every CPU (SAME_BITS). Losses are not hashed: the bits of PyTorch's
+float sums differ between types of CPU, and training carries them on. The numbers themselves are kept, with 6
+significant digits, and compared with LOSS_TOLERANCE.
 
 `files` is the digest of the raw input itself. Where it differs (another version of SUMO, other excerpts), so does
 everything else, and the code is not to blame.
@@ -40,7 +41,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from lake_sources import EXCERPTS, SAMPLE
+from lake_sources import EXCERPTS, SAME_BITS, SAMPLE
 from scipy.io import loadmat
 
 from tracklake.pipeline.lake import load, scan
@@ -252,7 +253,7 @@ def find_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 def measure_all(folder: Path) -> dict[str, Digests]:
     """All groups, of new lakes in an empty folder; without the excerpts where they are not at hand."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("TRACKLAKE_", "PREFECT_"))}
-    environment = {**kept, "PREFECT_HOME": str(folder / "prefect")}
+    environment = {**kept, **SAME_BITS, "PREFECT_HOME": str(folder / "prefect")}
 
     def run(*arguments: str | Path) -> None:
         command = [sys.executable, "-m", "tracklake.pipeline.cli.app", *map(str, arguments)]

@@ -11,3 +11,7 @@ EXCERPTS = next((folder for folder in _BESIDE if folder.is_dir()), _BESIDE[0])
 
 They stand beside the repository, or one folder further up, where a git worktree finds them.
 """
+
+SAME_BITS = {"OPENBLAS_CORETYPE": "Haswell"}
+"""Environment in which all x86 processors since 2013 compute the same: OpenBLAS, the linear algebra of NumPy and SciPy,
+adds in another order on each type, and its last bits reach the reconstructed tracks. It is read at the first import."""
