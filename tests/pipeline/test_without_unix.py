@@ -12,6 +12,7 @@ from highd_files import write_recording
 
 from tracklake.pipeline.lake import catalog
 from tracklake.pipeline.lake.files import escape_name, list_files, read_partition
+from tracklake.pipeline.lake.object_access import FileLocations
 from tracklake.schemas import TRACKS
 
 ROOT = Path(__file__).parents[2]
@@ -91,7 +92,8 @@ def test_a_folder_above_the_lake_is_no_partition_with_backslashes_either():
     """Otherwise DuckDB would take every row's data set from the folder in which the lake lies."""
     file = SimpleNamespace(path=".files/tracks/dataset=highd/subset=01-upper/part-1.parquet")
     manifest, root = SimpleNamespace(live=lambda _table: [file], commits={}), PureWindowsPath("C:\\dataset=ngsim\\lake")
-    select = catalog._write_selects(SimpleNamespace(resolve=lambda: root), manifest)["tracks"]
+    locations = FileLocations(SimpleNamespace(resolve=lambda: root))
+    select = catalog._write_selects(locations, manifest)["tracks"]
     assert "CAST('highd' AS VARCHAR)" in select
     assert "hive_partitioning = true" not in select
 

@@ -121,7 +121,9 @@ def slow_cells(tracks, cell_m, cell_s):
             middle = (begin + end) / 2
             key = lane, math.floor((x0 + middle * (x1 - x0)) / cell_m), math.floor((t0 + middle * (t1 - t0)) / cell_s)
             distance, time, who = cells.get(key, (0, 0, set()))
-            cells[key] = distance + (end - begin) * (x1 - x0), time + (end - begin) * (t1 - t0), who | {vehicle}
+            took = (end - begin) * (t1 - t0)
+            seen = {vehicle} if took > 1e-9 else set()  # else it only touches the cell's border, as far as floats tell
+            cells[key] = distance + (end - begin) * (x1 - x0), time + took, who | seen
     return {key: (distance, time, len(who)) for key, (distance, time, who) in cells.items() if time > 1e-9}
 
 
