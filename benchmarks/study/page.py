@@ -9,7 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from study.figure import draw_curves, draw_errors, draw_prices
 from study.pieces import PIECES
 from study.plan import Arm
-from study.results import FEW, Results, find_dataset, grid, judge
+from study.results import FEW, Results, grid, judge
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
@@ -33,9 +33,8 @@ def write_pages(docs: Path) -> None:
             table.write_csv(docs / f"results-{name}.csv")
     for name, content in render_pages(results).items():
         write_file(docs / name, content.encode())
-    arms = {name: find_dataset(name) for name in results.tables["seeds"]["arm"].unique()}
-    shown = pl.col("dataset") == pl.col("arm").replace_strict(arms, return_dtype=pl.String)
-    drawn = results.tables["seeds"].filter(shown, group=EVERYTHING)
+    own = [arm.name for piece in PIECES for arm in piece.arms if not any(learner.label for learner in arm.learners)]
+    drawn = results.tables["seeds"].filter(pl.col("arm").is_in(own), dataset=EVERYTHING, group=EVERYTHING)
     if drawn.height:
         write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
     if prices := results.list_prices():
