@@ -122,7 +122,8 @@ def run_commands(raw: Path, lake: str, cache: Path, environment: dict[str, str])
     for step in STEPS:
         source = [str(raw)] if step == "ingest" else []
         command = [sys.executable, __file__, "--command", str(counts), step, *source, "--lake", lake, "--quiet"]
-        process = subprocess.Popen(command, env={**os.environ, "TRACKLAKE_CACHE": str(cache), **environment})
+        own = {"TRACKLAKE_CACHE": str(cache), "PYTHONDONTWRITEBYTECODE": ""}  # modules are compiled once
+        process = subprocess.Popen(command, env={**os.environ, **own, **environment})
         watcher = threading.Thread(target=watch_memory, args=(process.pid, most))
         watcher.start()
         if process.wait():
