@@ -10,17 +10,12 @@ from study.figure import draw_curves, draw_errors, draw_prices
 from study.pieces import PIECES
 from study.plan import Arm
 from study.results import FEW, Results, grid, judge
+from study.tables import FIGURES, RADIUS_LEVEL
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
 from tracklake.training.onboard.as_published import CONSTANT, DIFFERENCE, OURS, PUBLISHED
 
-FIGURES = {
-    "rmse_m": "RMSE, m",
-    "rmse_longitudinal_m": "RMSE along the road, m",
-    "rmse_lateral_m": "RMSE across the road, m",
-    "nll_nats": "negative log-likelihood, nats",
-}
 SHOWN_BY_DENSITY = ("rmse_longitudinal_m", "sigma_longitudinal_m", "radius_m", "coverage")
 PAGES = ("results.md", "results-discussion.md")
 
@@ -157,7 +152,11 @@ def lay_out_by_density(results: Results, arm: Arm) -> str:
         errors.filter(last, pl.col("n") >= FEW)
         .group_by(key, maintain_order=True)
         .agg(pl.col("n").sum(), *squares)
-        .join(radii.filter(last, level=0.9).group_by(key).agg(_pool("radius_m"), _pool("coverage")), on=key, how="left")
+        .join(
+            radii.filter(last, level=RADIUS_LEVEL).group_by(key).agg(_pool("radius_m"), _pool("coverage")),
+            on=key,
+            how="left",
+        )
     )
     body = [
         [

@@ -58,8 +58,17 @@ NOTHING = "-"
 """What a model is compared with where the interval is that of its own error."""
 SUMS = pl.col("squared_longitudinal_m2", "squared_lateral_m2", "distance_m", "nll_nats")
 
-LEVELS = (0.5, 0.9, 0.95)
-"""Probabilities of regions that are kept."""
+FIGURES = {
+    "rmse_m": "RMSE, m",
+    "rmse_longitudinal_m": "RMSE along the road, m",
+    "rmse_lateral_m": "RMSE across the road, m",
+    "nll_nats": "negative log-likelihood, nats",
+}
+"""Figures that the pages show, and in which models are compared, with their titles."""
+RADIUS_LEVEL = 0.9
+"""Probability of the conformal radii that the pages show."""
+LEVELS = {"calibration": (0.5, RADIUS_LEVEL, 0.95), "conformal_radii": (RADIUS_LEVEL,)}
+"""Probabilities of regions that are kept, by table."""
 DIGITS = 5
 """Decimals of the committed tables."""
 
@@ -161,7 +170,8 @@ def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dic
         others = errors[model].with_columns(SUMS * 0.0) if against == NOTHING else errors[against]
         for dataset, own, other in pair_datasets(errors[model], others):
             named = {"arm": arm.name, "model": model, "against": against, "dataset": dataset}
-            for figure, sums in COMPARED_FIGURES.items():
+            for figure in FIGURES:
+                sums = COMPARED_FIGURES[figure]
                 if not any(each[column].has_nulls() for each in (own, other) for column in sums):
                     rows = compare_errors(own, other, figure).to_dicts()
                     yield from (named | {"figure": figure} | row for row in rows)
@@ -185,7 +195,7 @@ def read_evidence(jobs: Iterable[Job], name: str) -> pl.DataFrame:
             schema = EVIDENCE_TABLES[name].dtypes
             table = pl.read_csv(file, schema_overrides=schema, infer_schema_length=None)
             if "level" in table.columns:
-                table = table.filter(pl.col("level").is_in(LEVELS))
+                table = table.filter(pl.col("level").is_in(LEVELS[name]))
             named = {"arm": job.lake.arm.name, "model": job.model, "seed": job.seed, "lake": job.lake.name}
             tables.append(table.with_columns(pl.lit(own, TABLES[name][key]).alias(key) for key, own in named.items()))
     return pl.concat([table.select(*TABLES[name]) for table in tables])
