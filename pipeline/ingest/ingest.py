@@ -4,7 +4,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,8 @@ _PLANNING_FACTS = ("subset", "freeway")
 """Columns of `subsets` that stages are planned with."""
 Files = dict[str, list[LakeFile]]
 """Files by table."""
+Sources = Mapping[str, Mapping[str, Any]]
+"""What the manifest knows of raw files, by sha256."""
 SOURCE_BY_NAME: dict[str, Source] = {source.name: source for source in SOURCES}
 
 
@@ -214,16 +216,21 @@ def list_spilled(job: Job) -> list[RawFile]:
     return [] if source.spill is None else [file for file in list_files(job) if file.dialect not in source.beside]
 
 
-def build(root: Path, job: Job, slice_entries: int = 2_000_000) -> Commit:
+def build(root: Path, job: Job, slice_entries: int = 2_000_000, manifest: Manifest | None = None) -> Commit:
     """Make one recording's tables and account for the rows of its files.
 
-    `slice_entries` is the setting: entries of a subset that are held at once, where its source can do with that.
+    Args:
+        root: folder of the lake.
+        job: the recording.
+        slice_entries: the setting: entries of a subset that are held at once, where its source can do with that.
+        manifest: the lake's manifest, or what it knows of the job's files; None: it is read.
 
     Raises:
         SourceError, schemas.StructureError: the recording cannot be used.
     """
     started = time.perf_counter()
     recording, files, spilled = job.inputs["recording"], list_files(job), list_spilled(job)
+    known = (manifest or load_recent(root)).sources
     for file in spilled:
         if not locate_spill(root, file).exists():  # a worker on another machine has read it
             read_file(root, job.inputs["dataset"], file)
@@ -232,15 +239,15 @@ def build(root: Path, job: Job, slice_entries: int = 2_000_000) -> Commit:
     elif spilled:
         parts = [_open_spilled(root, file, recording) if file in spilled else Part(file) for file in files]
         parts = [replace(part, slice_entries=slice_entries) for part in parts]
-        tables, info = _build_recording(root, job, parts)
+        tables, info = _build_recording(root, job, parts, known)
     else:
         with MEMORY_BUDGET.reserve(sum(map(measure_unpacked, files))):
-            tables, info = _build_recording(root, job, [Part(file) for file in files])
+            tables, info = _build_recording(root, job, [Part(file) for file in files], known)
     facts = {"dataset": job.inputs["dataset"], "recording": recording, ADDED: sorted(VEHICLES.added)}
     return make_commit(job, tables, {**facts, **info}, started)
 
 
-def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files, dict[str, Any]]:
+def _build_recording(root: Path, job: Job, parts: Sequence[Part], known: Sources) -> tuple[Files, dict[str, Any]]:
     dataset, recording = job.inputs["dataset"], job.inputs["recording"]
     source = SOURCE_BY_NAME[dataset]
     canonical = source.to_canonical(parts, recording)
@@ -248,9 +255,9 @@ def _build_recording(root: Path, job: Job, parts: Sequence[Part]) -> tuple[Files
         raise SourceError(_explain_emptiness(recording, canonical, source.lacking))
     tables = _write_tables(root, job, canonical)
     of_batches = (note for drive in canonical.drives for note in drive.describe_batches())
-    suspicions = _suspect_truncation(root, list_files(job), canonical)
+    suspicions = _suspect_truncation(list_files(job), canonical, known)
     info = {
-        "notes": [*_recall_notes(root, job), *canonical.notes, *of_batches, *suspicions],
+        "notes": [*_recall_notes(job, known), *canonical.notes, *of_batches, *suspicions],
         "subsets": [subset.facts.select(*_PLANNING_FACTS).row(0, named=True) for subset in canonical.subsets],
         "drives": [drive.name for drive in canonical.drives],
         "row_order": canonical.row_order,
@@ -285,9 +292,8 @@ def _explain_emptiness(recording: str, canonical: Canonical, lacking: str) -> st
     )
 
 
-def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonical) -> list[str]:
+def _suspect_truncation(files: Sequence[RawFile], canonical: Canonical, known: Sources) -> list[str]:
     """Return notes about files of exactly as many rows as a spreadsheet can hold, whose end may be missing."""
-    known = load_recent(root).sources
     rows = dict(canonical.log.select("sha256", "rows_read").iter_rows())
     rows |= {file.sha256: known[file.sha256]["rows_read"] for file in files if file.sha256 in known}
     return [
@@ -298,9 +304,8 @@ def _suspect_truncation(root: Path, files: Sequence[RawFile], canonical: Canonic
     ]
 
 
-def _recall_notes(root: Path, job: Job) -> list[str]:
+def _recall_notes(job: Job, known: Sources) -> list[str]:
     """Return the notes about how files were read, with the first recording of each file."""
-    known = load_recent(root).sources
     contents = [known[file.sha256] for file in list_files(job) if file.sha256 in known]
     named = (found for found in contents if found["recordings"][:1] == [job.inputs["recording"]])
     return [note for found in named for note in found.get("notes", ())]

@@ -21,7 +21,7 @@ from tracklake.pipeline.lake.transfers import send_commits
 from tracklake.pipeline.lake.working_copy import locate_origin, open_workspace
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.sources import RawFile
-from tracklake.pipeline.stages.planner import build_jobs
+from tracklake.pipeline.stages import planner
 from tracklake.pipeline.stages.registry import STAGE_BY_NAME
 from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas.errors import FileAccessError
@@ -126,31 +126,31 @@ def build_group(
         stage: name of the stage.
         jobs: recordings, or one job over the whole lake, which is done in a folder.
         settings: settings of the run.
-        part: what the jobs read of the manifest (`select_part`), where the lake is an address.
+        part: what jobs on recordings read of the manifest (`select_part`); None, of a lake in a folder: it is read.
     """
     origin = find_own_origin(lake)
-    if origin is None or not any(job.tail for job in jobs):
-        return send_commits(Path(lake), _build(Path(lake), stage, jobs, settings))
-    with open_workspace(origin, part or select_part(load(Path(lake)), stage, jobs, settings)) as root:
-        return send_commits(root, _build(root, stage, jobs, settings))
+    if not any(job.tail for job in jobs):
+        return send_commits(Path(lake), _build(Path(lake), stage, jobs, settings, None))
+    part = part or select_part(load(Path(lake)), stage, jobs, settings)
+    if origin is None:
+        return _build(Path(lake), stage, jobs, settings, part)
+    with open_workspace(origin, part) as root:
+        return send_commits(root, _build(root, stage, jobs, settings, part))
 
 
-def _build(root: Path, stage: str, jobs: Sequence[Job], settings: Settings) -> list[Commit]:
+def _build(root: Path, stage: str, jobs: Sequence[Job], settings: Settings, part: Manifest | None) -> list[Commit]:
     if stage == INGEST:
-        return try_again(lambda: [ingest.build(root, job, settings.slice_entries) for job in jobs])
-    return try_again(lambda: build_jobs(STAGE_BY_NAME[stage], root, jobs, settings))
+        return try_again(lambda: [ingest.build(root, job, settings.slice_entries, part) for job in jobs])
+    return try_again(lambda: planner.build_jobs(STAGE_BY_NAME[stage], root, jobs, settings, part))
 
 
 def select_part(manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Manifest:
     """Return the part of a manifest that jobs on recordings read; it is small, and fit to be sent to a worker."""
-    if stage == INGEST:
-        files = {file.sha256 for job in jobs for file in ingest.list_files(job)}
-        known = {sha256: found for sha256, found in manifest.sources.items() if sha256 in files}
-        return replace(manifest, commits={}, sources=known, retired=(), ingested_from=())
-    before = STAGE_BY_NAME[stage].list_inputs(settings) or (INGEST, *STAGE_BY_NAME)
-    keys = {key for name in before for job in jobs for key in (name, f"{name}/{job.tail}")}
-    commits = {key: manifest.commits[key] for key in sorted(keys & manifest.commits.keys())}
-    return replace(manifest, commits=commits, sources={}, retired=(), ingested_from=())
+    if stage != INGEST:
+        return planner.select_part(manifest, STAGE_BY_NAME[stage], jobs, settings)
+    files = {file.sha256 for job in jobs for file in ingest.list_files(job)}
+    known = {sha256: manifest.sources[sha256] for sha256 in files & manifest.sources.keys()}
+    return replace(manifest, commits={}, sources=known, retired=(), ingested_from=())
 
 
 def locate_for_workers(root: Path, settings: Settings) -> str:
@@ -161,12 +161,14 @@ def locate_for_workers(root: Path, settings: Settings) -> str:
 
 
 def make_group_call(lake: str, manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Call:
-    """Return the call that builds a group of jobs of the lake that `locate_for_workers` returns."""
-    titles = tuple(job.title for job in jobs)
-    if find_address(lake) is None:
-        return Call(build_group, (lake, stage, jobs, settings), titles)
-    elsewhere = settings.model_copy(update={"lake": Path(lake), "cache": None})  # no folder of this machine
-    return Call(build_group, (lake, stage, jobs, elsewhere, select_part(manifest, stage, jobs, settings)), titles)
+    """Return the call that builds a group of jobs of the lake that `locate_for_workers` returns.
+
+    It carries what the jobs read of the manifest: reading thousands of commits takes longer than a small job.
+    """
+    part = select_part(manifest, stage, jobs, settings) if any(job.tail for job in jobs) else None
+    if find_address(lake) is not None:
+        settings = settings.model_copy(update={"lake": Path(lake), "cache": None})  # no folder of this machine
+    return Call(build_group, (lake, stage, jobs, settings, part), tuple(job.title for job in jobs))
 
 
 def find_own_origin(lake: str) -> Origin | None:

@@ -166,12 +166,14 @@ def group_jobs(stage: Stage, manifest: Manifest, jobs: Sequence[Job], workers: i
     return groups
 
 
-def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings) -> list[Commit]:
-    """Build jobs that were grouped, and return their commits in the same order; raises as `build_job` does."""
+def build_jobs(
+    stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings, manifest: Manifest | None = None
+) -> list[Commit]:
+    """Build jobs that were grouped, and return their commits in the same order; see `build_job`."""
     if not stage.batch_entries:
-        return [build_job(stage, root, job, settings) for job in jobs]
+        return [build_job(stage, root, job, settings, manifest) for job in jobs]
     started = time.perf_counter()
-    manifest = _load_inputs(stage, root, jobs, settings)
+    manifest = select_part(manifest or load_recent(root), stage, jobs, settings)
     _prepare_files(root, [file for job in jobs for file in _list_inputs(stage, manifest, job, settings)], jobs)
     results = stage.build([LakeReader(root, manifest, stage.list_inputs(settings), job) for job in jobs], settings)
     assert isinstance(results, list)
@@ -182,8 +184,15 @@ def build_jobs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings
     ]
 
 
-def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
+def build_job(stage: Stage, root: Path, job: Job, settings: Settings, manifest: Manifest | None = None) -> Commit:
     """Build what a job asks for, validate and write its tables, and return the commit to make.
+
+    Args:
+        stage: stage of the job.
+        root: folder of the lake.
+        job: what is to be built.
+        settings: settings of the run.
+        manifest: the lake's manifest, or what the job reads of it (`select_part`); None: it is read.
 
     Raises:
         DamagedFileError: a file that it reads is not as it was written.
@@ -191,9 +200,9 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings) -> Commit:
         schemas.StructureError: a frame breaks its table's rules.
     """
     if stage.batch_entries:
-        return build_jobs(stage, root, [job], settings)[0]
+        return build_jobs(stage, root, [job], settings, manifest)[0]
     started = time.perf_counter()
-    manifest = _load_inputs(stage, root, [job], settings)
+    manifest = select_part(manifest or load_recent(root), stage, [job], settings)
     _prepare_files(root, _list_inputs(stage, manifest, job, settings), [job])
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
@@ -224,17 +233,27 @@ def _prepare_files(root: Path, files: Iterable[LakeFile], jobs: Sequence[Job]) -
     verify_files(root, needed)
 
 
-def _load_inputs(stage: Stage, root: Path, jobs: Sequence[Job], settings: Settings) -> Manifest:
-    """Return the manifest with what was made of the whole lake and of the recordings of some jobs.
+def select_part(manifest: Manifest, stage: Stage, jobs: Sequence[Job], settings: Settings) -> Manifest:
+    """Return what jobs may read of a manifest: what was made of the whole lake, and of their recordings.
 
-    They are found by their keys: looking at thousands of other commits would take longer than a small job.
+    It is small, and fit to be sent to a worker: looking at thousands of other commits would take longer than a small
+    job. Of what they do not read, a file of each table stays, so that reading it is an error; a stage that comes after
+    none reads all tables, and no other file: that of a report alone has thousands.
     """
-    manifest = load_recent(root)
     if stage.scope == "lake":
         return manifest
-    stages = dict.fromkeys((INGEST, *(each.name for each in STAGES), *stage.list_inputs(settings)))
+    read = stage.list_inputs(settings)
+
+    def keep(commit: Commit) -> Commit:
+        if commit.stage in read:
+            return commit
+        tables = {name: [file for file in files if file.rows is not None] for name, files in commit.files.items()}
+        return replace(commit, files={name: files[:1] if read else files for name, files in tables.items() if files})
+
+    stages = dict.fromkeys((INGEST, *(each.name for each in STAGES), *read))
     keys = (key for name in stages for key in (name, *(f"{name}/{job.tail}" for job in jobs)))
-    return replace(manifest, commits={key: manifest.commits[key] for key in keys if key in manifest.commits})
+    commits = {key: keep(manifest.commits[key]) for key in keys if key in manifest.commits}
+    return replace(manifest, commits=commits, sources={}, retired=(), ingested_from=())
 
 
 def _list_inputs(stage: Stage, manifest: Manifest, job: Job, settings: Settings) -> Iterator[LakeFile]:

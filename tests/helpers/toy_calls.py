@@ -18,7 +18,7 @@ def die(*_anything: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def build_or_die(lake: str, stage: str, jobs: list, settings: object) -> list:
+def build_or_die(lake: str, stage: str, jobs: list, settings: object, part: object) -> list:
     """Build a group; 02 kills its worker while it writes, at the first try, and 03 at each."""
     (job,) = jobs
     deaths = Path(lake).parent / f"deaths-{job.title}"
@@ -26,16 +26,16 @@ def build_or_die(lake: str, stage: str, jobs: list, settings: object) -> list:
         with deaths.open("a") as file:
             file.write("died\n")
         with mock.patch.object(files, "sync", die):  # what was written has no name yet
-            batches.build_group(lake, stage, jobs, settings)
-    return batches.build_group(lake, stage, jobs, settings)
+            batches.build_group(lake, stage, jobs, settings, part)
+    return batches.build_group(lake, stage, jobs, settings, part)
 
 
-def build_until_03(lake: str, stage: str, jobs: list, settings: object) -> list:
+def build_until_03(lake: str, stage: str, jobs: list, settings: object, part: object) -> list:
     """Build a group; 03 ends this process, in which the scheduler is as well."""
     if jobs[0].title == "03":
         time.sleep(0.3)  # what was built before has been committed by then
         die()
-    return batches.build_group(lake, stage, jobs, settings)
+    return batches.build_group(lake, stage, jobs, settings, part)
 
 
 def add(first: int, second: int) -> int:

@@ -1,5 +1,7 @@
 """A toy stage, declared in 20 lines: planned, run, skipped, redone and refused by the one planner."""
 
+from dataclasses import replace
+
 import polars as pl
 import pytest
 from small_recordings import write_highd
@@ -7,10 +9,11 @@ from stage_runs import find_outstanding, plan_stage, run_stage
 
 from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
-from tracklake.pipeline.lake import load, open_for_writing, scan
+from tracklake.pipeline.lake import Commit, LakeFile, load, open_for_writing, scan
 from tracklake.pipeline.settings import Settings
+from tracklake.pipeline.stages.planner import build_job, select_part
 from tracklake.pipeline.stages.stage import Stage, StageError, StageResult
-from tracklake.schemas import BSM, SUBSET_STATUS, TRACKS, VEHICLES, StructureError
+from tracklake.schemas import BSM, SPLITS, SUBSET_STATUS, TRACKS, VEHICLES, StructureError
 
 
 def build_status(reader, settings):
@@ -179,3 +182,23 @@ def test_tables_are_checked_and_undeclared_reads_are_found(root):
     run(root, "toy")
     with pytest.raises(LookupError, match=r"total reads `vehicles`, which ingest makes; expected .* got toy"):
         run(root, "total", stages=(TOY, hidden))
+
+
+def test_a_part_of_the_manifest_is_what_jobs_may_read(root):
+    """Of another stage's tables a file stays, so that reading them raises; pages of a report do not."""
+    manifest = load(root)
+    pages = [LakeFile(f"reports/{number}.html", None, 10) for number in range(3)]
+    splits = [LakeFile(f"splits/{number}.parquet", 5, 10) for number in range(3)]
+    made = Commit("report", "f", {"reports": pages, SPLITS.name: splits})
+    manifest = replace(manifest, commits={**manifest.commits, made.key: made})
+    (job, _) = plan_stage(root, "toy", SETTINGS, STAGES)
+    part = select_part(manifest, TOY, [job], SETTINGS)
+    assert sorted(part.commits) == ["ingest/highd/01", "report"]
+    assert part.commits["ingest/highd/01"] == manifest.commits["ingest/highd/01"]
+    assert part.commits["report"].files == {SPLITS.name: splits[:1]}
+    page = Stage(**{**vars(TOY), "name": "page", "after": ()})
+    assert select_part(manifest, page, [job], SETTINGS).commits["report"].files == {SPLITS.name: splits}
+    assert select_part(manifest, TOTAL, [], SETTINGS) is manifest
+    hidden = Stage(**{**vars(TOY), "build": lambda reader, _: {SUBSET_STATUS: reader.table(SPLITS)}})
+    with pytest.raises(LookupError, match=r"reads `splits`, which report makes"):
+        build_job(hidden, root, job, SETTINGS, manifest)
