@@ -165,6 +165,12 @@ def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_pat
         row | {"forest": forest, "value": value, "low": value - 0.1, "high": value + 0.1}
         for forest, value in ((OURS, 0.5), (PUBLISHED, 0.7), (DIFFERENCE, 0.2), (CONSTANT, 0.4))
     ]
+    points = [
+        {"drawn": drawn, "train_accuracy": train, "train_n": drawn, "eval_accuracy": scored, "eval_n": 50}
+        for drawn, train, scored in ((100, 1.0, 0.5), (2000, 0.9, 0.8))
+    ]
+    decoder = {"best": 1, "converged": False, "losses": [2.0, 1.0], "validation_losses": [3.0, 2.5]}
+    record = {"shares": shares, "learning_curve": points, "decoder": decoder}
     said = []
 
     def call(words, _):
@@ -172,7 +178,7 @@ def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_pat
         if words[0] == "lane-forest":
             out = Path(words[words.index("--lake") + 1]) / "models" / "lane-forest"
             out.mkdir()
-            (out / "lane_forest.json").write_text(json.dumps({"as_published": {"shares": shares}}))
+            (out / "lane_forest.json").write_text(json.dumps({"as_published": record}))
         return 0
 
     other = Workshop(shutil.copytree(workshop.work, tmp_path / "work"), workshop.data, at_once=1, call=call)
@@ -185,11 +191,14 @@ def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_pat
     assert [words[0] for words in said] == ["run", "lane-forest", "run"]
     assert "--as-published" in said[1]
     table = read_table(docs, "forests")
-    assert (table.height, table["arm"].unique().to_list()) == (4, ["woods"])
+    assert (table.height, table["arm"].unique().to_list()) == (8, ["woods"])
     page = render_pages(Results.read(docs))["results.md"]
     assert "| 40.0 (30.0 to 50.0) | 50.0 (40.0 to 60.0) | 70.0 (60.0 to 80.0) | **+20.00 (+10.00 to +30.00)** |" in page
     assert "| cell | 2 s, ctrv, around the place now | 50 | 7 |" in page
-    assert "none has been run" not in page
+    assert "not run with all seeds" not in page
+    assert "| 100 | 100.0 | 50.0 |\n| 2,000 | 90.0 | 80.0 |" in page
+    assert "| 0 | 2.000 | 3.000 |\n| 1 | 1.000 | 2.500 |" in page
+    assert not (docs / "results-curves.svg").exists()  # of networks alone
     assert read_table(docs, "lakes")["arm"].to_list() == ["woods"]
 
 

@@ -8,8 +8,17 @@ from pathlib import Path
 import polars as pl
 import pytest
 from study.figure import draw_curves, draw_prices
-from study.page import lay_out_differences, lay_out_errors, lay_out_leakage, lay_out_prices, render_pages
-from study.pieces import PIECES
+from study.page import (
+    lay_out_by_density,
+    lay_out_differences,
+    lay_out_errors,
+    lay_out_feasibility,
+    lay_out_leakage,
+    lay_out_prices,
+    lay_out_stops,
+    render_pages,
+)
+from study.pieces import CONTROL, PIECES
 from study.plan import Arm, Learner, Source
 from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES
@@ -62,15 +71,33 @@ def test_the_price_of_leakage_is_what_constant_velocity_does_not_share():
             ("lstm", "constant-velocity", differences[2], 0.3 if arm == "csp-2018" else 0.1),
         )
     ]
-    seeds = [{"arm": "csp-2018", "model": model, "seconds": 5.0} for model in ("constant-velocity", "lstm")]
-    results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds)})
+    # A half of the samples brakes under the leaking split, a quarter under the other, and errors are as large in both.
+    blank = dict.fromkeys(TABLES["seeds"]) | {"dataset": "all", "seconds": 5.0}
+    seeds = [
+        blank | {"arm": arm, "model": model, "seed": seed, "group": group, "n": n, "rmse_m": rmse}
+        for arm, braking in (("csp-2018", 200), ("generated", 100))
+        for model, seed, brake, normal in (("constant-velocity", None, 8.0, 2.0), ("lstm", 0, 6.0, 1.0))
+        for group, n, rmse in (
+            ("all", 400, 9.9),
+            ("longitudinal=brake", braking, brake),
+            ("longitudinal=normal", 400 - braking, normal),
+        )
+    ]
+    results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds, schema=TABLES["seeds"])})
     half = math.sqrt(0.3**2 + 0.1**2)
     price = results.price_leakage("lstm")
     assert price == pytest.approx({"difference": -0.4, "low": -0.4 - half, "high": -0.4 + half})
+    assert results.find_braking("csp-2018") == 0.5
+    assert results.weigh_braking("generated", "lstm", 0.5) == pytest.approx(math.sqrt((36 + 1) / 2))
+    assert results.price_at_share("lstm", "generated") == results.price_at_share("lstm", "csp-2018") == 0.0
     (arm,) = next(piece.arms for piece in PIECES if piece.name == "leakage")
     *_, own = lay_out_leakage(results, arm).splitlines()
-    assert own.startswith("| `lstm` | +2.00 (+0.59 to +3.41) | -0.40 (-0.72 to -0.08) |")
-    assert own.endswith("| shows 0.40 m too little |")
+    assert own.startswith("| `lstm` | +2.00 (+0.59 to +3.41) | -0.40 (-0.72 to -0.08) | +0.00 | +0.00 |")
+    assert own.endswith("| shows 0.40 m too little; with equal braking +0.00 or +0.00 m |")
+    seeds[-1]["rmse_m"] = 3.0  # lstm, which does not brake, under the fair split: 1.0 before
+    results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds, schema=TABLES["seeds"])})
+    # Of a quarter that brakes: lstm has sqrt(36 / 4 + 3 / 4) and sqrt(36 / 4 + 27 / 4), the other model is unchanged.
+    assert results.price_at_share("lstm", "generated") == pytest.approx(math.sqrt(9.75) - math.sqrt(15.75))
 
 
 def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
@@ -78,16 +105,70 @@ def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     (arm,) = next(piece.arms for piece in PIECES if piece.name == "defects")
     clean, damaged, mended = arm.learners[:3]
     rows = [
-        {"arm": arm.name, "model": own.name, "against": clean.name, "dataset": "all", "figure": figure, "seconds": 5.0}
+        {"arm": arm.name, "model": own.name, "against": other.name, "dataset": "all", "figure": figure, "seconds": 5.0}
         | {"difference": value, "low": value - 0.1, "high": value + 0.1}
-        for own, value in ((damaged, 0.4), (mended, 0.05))
+        for own, other, value in ((damaged, clean, 0.4), (mended, clean, 9.0), (mended, CONTROL, 0.05))
         for figure in ("rmse_m", "nll_nats")
     ]
     seeds = pl.DataFrame({"arm": [arm.name], "seconds": [5.0]})
-    page = lay_out_prices(Results({"comparisons": pl.DataFrame(rows), "seeds": seeds}), arm)
-    *_, first, second = page.splitlines()
-    assert first.endswith("| worse +0.40 (+0.30 to +0.50) | +0.0200 | +0.0200 | costs 0.40 m |")
-    assert second.endswith("| +0.05 (-0.05 to +0.15) | +0.0025 | +0.0025 | no cost shown |")
+    results = Results({"comparisons": pl.DataFrame(rows), "seeds": seeds})
+    *_, first, second = lay_out_prices(results, arm).splitlines()
+    per_cent = "+0.0200 (+0.0150 to +0.0250)"
+    assert first.endswith(f"| `v-lstm` | worse +0.40 (+0.30 to +0.50) | {per_cent} | {per_cent} | costs 0.40 m |")
+    # Reconstructed tracks are compared with reconstructed ones, which are smooth as they are.
+    per_cent = "+0.0025 (-0.0025 to +0.0075)"
+    assert second.endswith(f"| `{CONTROL.name}` | +0.05 (-0.05 to +0.15) | {per_cent} | {per_cent} | no cost shown |")
+    assert [price["what"] for price in results.list_prices()] == [damaged.name, mended.name]
+
+
+def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_trained():
+    (arm,) = next(piece.arms for piece in PIECES if piece.name == "published")
+    own, published = arm.learners[0], arm.learners[len(arm.learners) // 2]
+    assert (published.epochs, published.seeds) == (24, 5)
+    seeds = [{"arm": arm.name, "model": own.name, "seed": seed} for seed in range(own.seeds)]
+    seeds += [{"arm": arm.name, "model": published.name, "seed": seed} for seed in (0, 1)]
+    curves = [
+        {"arm": arm.name, "model": published.name, "seed": seed, "epoch": epoch}
+        for seed, epochs in ((0, 24), (1, 9))
+        for epoch in range(epochs)
+    ]
+    runs = [
+        {"arm": arm.name, "model": published.name, "best_epoch": best, "validation_loss": loss}
+        for best, loss in ((23.0, 2.0), (5.0, 3.0))
+    ]
+    results = Results(
+        {name: pl.DataFrame(rows) for name, rows in (("seeds", seeds), ("curves", curves), ("runs", runs))}
+    )
+    missing = results.list_missing(arm.name)
+    assert missing[:2] == ["`stacked-lstm` (0 of 5 seeds)", "`attention-h4` (0 of 5 seeds)"]
+    assert f"`{published.name}` (2 of 5 seeds)" in missing
+    assert not any(own.name in each.split("`") for each in missing)
+    *_, row = lay_out_stops(results, arm).splitlines()
+    assert row == f"| `{published.name}` | 9 to 24 | 5 to 23 | 2.50 | 1 of 2 |"
+
+
+def test_shares_of_blocks_that_differ_are_shown_and_densities_are_in_order():
+    (arm,) = next(piece.arms for piece in PIECES if piece.name == "i-80")
+    arm = replace(arm, name="generated")  # with lateral positions
+    blank = {"arm": "generated", "model": "v-lstm", "seconds": 5.0, "n": 100}
+    rows = [
+        blank | {"lake": lake, "rule": "overlap", "share": share, "true_share": 0.0, "n": n}
+        for lake, share, n in (("block 0", 0.1, 300), ("block 2", 0.5, 100))
+    ]
+    seeds = [blank | dict.fromkeys(("rmse_m", "rmse_longitudinal_m"), 1.0)]
+    densities = [
+        blank | {"density": name, "rmse_longitudinal_m": 1.0, "sigma_longitudinal_m": 2.0}
+        for name in ("28 or more", "7 to 11", "0 to 7", "11 to 16")
+    ]
+    radii = [blank | {"density": "7 to 11", "level": 0.9, "radius_m": 3.0, "coverage": 0.5}]
+    tables = {"feasibility": rows, "seeds": seeds, "density_errors": densities, "conformal_radii": radii}
+    results = Results({name: pl.DataFrame(own) for name, own in tables.items()})
+    *_, true, own = lay_out_feasibility(results, arm).splitlines()
+    assert true == "| true futures | 0.00 |"
+    assert own == "| `v-lstm` | 20.00 (10.00 to 50.00) |"  # (0.1 * 300 + 0.5 * 100) / 400
+    _, _, *body = lay_out_by_density(results, arm).splitlines()
+    assert [row.split(" | ")[1] for row in body] == ["0 to 7", "7 to 11", "11 to 16", "28 or more"]
+    assert body[1].endswith("| 1.00 | 2.00 | 3.00 | 0.50 |")
 
 
 def test_losses_are_drawn_by_model_and_phase_and_prices_by_their_intervals():
@@ -108,7 +189,7 @@ def test_losses_are_drawn_by_model_and_phase_and_prices_by_their_intervals():
     doubtful = price | {"what": "gaps", "low": -0.1}
     svg = draw_prices([price | {"what": "jumps"}, doubtful]).render(".svg").decode()
     assert all(f">{name}<" in svg for name in ("jumps", "gaps"))
-    assert "Leakage" not in svg  # nothing of it was measured
+    assert "time-blocks" not in svg  # nothing of it was measured
     assert re.findall(r'<line [^>]*stroke="([^"]+)" stroke-width="2"', svg) == [ORANGE, BLUE]
 
 
@@ -134,6 +215,48 @@ def price_leaks_by_hand(comparisons):
     return said
 
 
+def brake_alike_by_hand(seeds):
+    """Prices of leakage at 5 s if as many samples braked under both splits, as printed."""
+    rows = seeds.filter(pl.col("arm").is_in(["csp-2018", "generated"]), seconds=5.0, dataset="all").to_dicts()
+    found = {(row["arm"], row["model"], row["group"], row["seed"]): row for row in rows}
+    said = set()
+    for share_of in ("csp-2018", "generated"):
+        counts = [found[share_of, "constant-velocity", group, None]["n"] for group in ("longitudinal=brake", "all")]
+        share = counts[0] / counts[1]
+        errors = {}
+        for arm, model, group, seed in found:
+            if group == "longitudinal=brake":
+                brake = found[arm, model, group, seed]["rmse_m"]
+                other = found[arm, model, "longitudinal=normal", seed]["rmse_m"]
+                error = math.sqrt(share * brake**2 + (1 - share) * other**2)
+                errors.setdefault((arm, model), []).append(error)
+        mean = {key: sum(own) / len(own) for key, own in errors.items()}
+        for arm, model in mean:
+            if arm == "csp-2018":
+                gains = [mean[each, model] - mean[each, "constant-velocity"] for each in (arm, "generated")]
+                said.add(f"{gains[0] - gains[1]:+.2f}")
+    return said
+
+
+def pool_shares_by_hand(tables):
+    """Shares of predictions that break a rule, of positions in regions, and of right maneuvers, in per cent."""
+    sums = {}
+    for name, key, columns in (
+        ("feasibility", ("arm", "model", "rule"), ("share", "true_share")),
+        ("calibration", ("arm", "model", "level"), ("coverage",)),
+    ):
+        for row in tables[name].filter(seconds=5.0).to_dicts():
+            for column in columns:
+                if row[column] is not None:
+                    own = sums.setdefault((name, column, *(row[part] for part in key)), [0.0, 0])
+                    own[0] += 100 * row[column] * row["n"]
+                    own[1] += row["n"]
+    said = {f"{total / n:.1f}" for total, n in sums.values()}
+    for row in tables["forests"].filter(pl.col("low").is_not_null()).to_dicts():
+        said |= {f"{100 * row['value']:.1f}", *(f"{100 * row[name]:+.2f}" for name in ("value", "low", "high"))}
+    return said
+
+
 def test_every_number_of_the_discussion_is_in_the_tables():
     """Decimals alone: numbers of seconds, sites and shares of intervals are whole."""
     tables = Results.read(DOCS).tables
@@ -143,7 +266,8 @@ def test_every_number_of_the_discussion_is_in_the_tables():
     differences = tables["comparisons"].select("difference", "low", "high")
     known = {f"{value:.2f}" for row in means.drop(key).rows() for value in row if value is not None}
     known |= {f"{value:+.2f}" for row in differences.rows() for value in row if value is not None}
-    known |= price_leaks_by_hand(tables["comparisons"])
+    known |= price_leaks_by_hand(tables["comparisons"]) | brake_alike_by_hand(tables["seeds"])
+    known |= pool_shares_by_hand(tables)
     said = re.findall(r"(?<![\w.])[+-]?\d+\.\d+", (DOCS / "results-discussion.md").read_text())
     assert set(said) <= known
 

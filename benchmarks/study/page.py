@@ -1,5 +1,6 @@
 """docs/results.md, its figures and docs/results-discussion.md, made of the committed tables and nothing else."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -7,10 +8,10 @@ import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.figure import draw_curves, draw_errors, draw_prices
-from study.pieces import PIECES
+from study.pieces import AXES, DOSE, PIECES
 from study.plan import Arm
-from study.results import FEW, Results, grid, judge
-from study.tables import FIGURES, RADIUS_LEVEL
+from study.results import BRAKE, FEW, Results, grid, is_price, judge
+from study.tables import FIGURES, LEARNED, NOTHING, RADIUS_LEVEL
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.schemas.files import write_file
@@ -34,7 +35,7 @@ def write_pages(docs: Path) -> None:
         write_file(docs / "results.svg", draw_errors(drawn, FIGURES).render(".svg"))
     if prices := results.list_prices():
         write_file(docs / "results-prices.svg", draw_prices(prices).render(".svg"))
-    if (curves := results.tables["curves"]).height:
+    if (curves := results.tables["curves"].filter(pl.col("seed").is_not_null())).height:
         write_file(docs / "results-curves.svg", draw_curves(curves).render(".svg"))
 
 
@@ -50,6 +51,8 @@ def render_pages(results: Results) -> dict[str, str]:
         "has": has,
         "figures": FIGURES,
         "prices": results.list_prices(),
+        "anchored": [own.name for own in AXES],
+        **{"BRAKE": BRAKE, "CONSTANT": CONSTANT, "OURS": OURS, "PUBLISHED": PUBLISHED, "DIFFERENCE": DIFFERENCE},
         **{own.__name__: partial(own, results) for own in TABLES_OF_ARM},
     }
     return {name: templates.get_template(f"{name}.j2").render(given) for name in PAGES}
@@ -64,14 +67,14 @@ def lay_out_lakes(results: Results, arm: Arm) -> str:
 
 def lay_out_training(results: Results, arm: Arm) -> str:
     """Lay out what each model learned from, as means over its runs."""
-    columns = ("weights", "steps", "samples_seen", "supervised_positions", "seconds", "samples_per_s")
+    columns = ("weights", "steps", "samples_seen", "supervised_positions")
     body = []
     for model in results.list_models(arm.name):
         runs = results.of_arm("runs", arm.name).filter(model=model)
         if runs.height:
             means = runs.select(pl.col(columns).mean()).row(0)
             body.append([f"`{model}`", str(runs["seed"].n_unique()), *map(_format, means)])
-    heads = ("weights", "steps", "samples seen", "positions supervised", "s", "samples a second")
+    heads = ("weights", "steps", "samples seen", "positions supervised")
     return grid(["model", "seeds", *heads], body) if body else ""
 
 
@@ -87,6 +90,9 @@ def lay_out_errors(results: Results, arm: Arm, figure: str) -> str:
     first = results.list_models(arm.name)[0]
     counts = [results.select(arm.name, first, at)["n"] for at in seconds]
     body.append(["samples", *(_format(count[0]) for count in counts)])
+    compared = [results.compare(arm.name, first, NOTHING, at, figure) for at in seconds]
+    if all(compared):
+        body.append(["vehicles", *(_format(own["vehicles"]) for own in compared if own)])
     return grid(["model", *(f"{at:g} s" for at in seconds)], body)
 
 
@@ -152,10 +158,16 @@ def lay_out_by_density(results: Results, arm: Arm) -> str:
         errors.filter(last, pl.col("n") >= FEW)
         .group_by(key, maintain_order=True)
         .agg(pl.col("n").sum(), *squares)
+        .sort(
+            pl.col("model").replace_strict({name: at for at, name in enumerate(results.list_models(arm.name))}),
+            pl.col("density").str.extract(r"(\d+)").cast(pl.Int64),
+            nulls_last=False,
+        )
         .join(
             radii.filter(last, level=RADIUS_LEVEL).group_by(key).agg(_pool("radius_m"), _pool("coverage")),
             on=key,
             how="left",
+            maintain_order="left",
         )
     )
     body = [
@@ -176,19 +188,24 @@ def lay_out_feasibility(results: Results, arm: Arm) -> str:
     rows = results.of_arm("feasibility", arm.name).filter(pl.col("seconds") == pl.col("seconds").max())
     if arm.dataset != EVERYTHING:  # as above
         return ""
+    folds = rows.group_by("model", "rule", "lake", maintain_order=True).agg(pl.col("share").first())
+    spread = {key: (own["share"].min(), own["share"].max()) for key, own in folds.group_by("model", "rule")}
     pooled = rows.group_by("model", "rule", maintain_order=True).agg(_pool("share"), _pool("true_share"))
     unknown = ["overlap", "negative_headway", ANY_RULE] if arm.source.lacks_vehicles else []
     if choose_headline(results, arm) != "rmse_m":  # lane centres in place of lateral positions
         unknown += ["off_road", ANY_RULE]
     rules = [rule for rule in pooled["rule"].unique(maintain_order=True) if rule not in unknown]
-    shares = {
-        (model, rule): f"{100 * value:.2f}"
-        for model, rule, share, floor in pooled.rows()
-        for model, value in ((f"`{model}`", share), ("true futures", floor))
-        if value is not None
-    }
-    models = sorted({model for model, _ in shares}, key=lambda name: (name != "true futures", name))
-    body = [[model, *(shares.get((model, rule), "-") for rule in rules)] for model in models]
+    shares = {}
+    for model, rule, share, floor in pooled.rows():
+        if share is not None:
+            low, high = spread[model, rule]
+            blocks = f" ({100 * low:.2f} to {100 * high:.2f})" if low < high else ""
+            shares[f"`{model}`", rule] = f"{100 * share:.2f}{blocks}"
+        if floor is not None:
+            shares["true futures", rule] = f"{100 * floor:.2f}"
+    models = ["true futures", *(f"`{model}`" for model in results.list_models(arm.name))]
+    known = [model for model in models if any((model, rule) in shares for rule in rules)]
+    body = [[model, *(shares.get((model, rule), "-") for rule in rules)] for model in known]
     return grid(["% of predictions", *rules], body) if body else ""
 
 
@@ -196,48 +213,66 @@ def lay_out_prices(results: Results, arm: Arm) -> str:
     """Lay out what each per cent of damaged vehicles costs, at the last horizon, in words and figures."""
     at = results.list_seconds(arm.name)[-1]
     body = []
-    for own in arm.learners:
-        found = {
-            figure: results.compare(arm.name, own.name, arm.learners[0].name, at, figure)
-            for figure in ("rmse_m", "nll_nats")
-        }
-        error, nll = found["rmse_m"], found["nll_nats"]
-        if own.source is not None and error is not None and nll is not None:
-            per_cent = 100 * float(own.source.sample[own.source.sample.index("--dose") + 1])
+    for own, against in arm.pairs:
+        error, nll = (results.compare(arm.name, own, against, at, figure) for figure in ("rmse_m", "nll_nats"))
+        if is_price(own, against) and error is not None and nll is not None:
             says = judge(error["low"], error["high"])
             costs = {"worse": f"costs {error['difference']:.2f} m", "better": f"gains {-error['difference']:.2f} m"}
-            parts = (error["difference"] / per_cent, nll["difference"] / per_cent)
-            row = (_format_difference(error), *(f"{part:+.4f}" for part in parts), costs.get(says, "no cost shown"))
-            body.append([f"`{own.name}`", *row])
-    return grid(["trained on", f"RMSE at {at:g} s, m", "m per %", "nats per %", "in words"], body) if body else ""
+            parts = [_format_difference(each, per=100 * DOSE, digits=4, is_judged=False) for each in (error, nll)]
+            row = (_format_difference(error), *parts, costs.get(says, "no cost shown"))
+            body.append([f"`{own}`", f"`{against}`", *row])
+    heads = ("trained on", "against", f"RMSE at {at:g} s, m", "m per %", "nats per %", "in words")
+    return grid(heads, body) if body else ""
 
 
 def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
     """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart.
 
-    The price, in the last columns, is what is left of it beside constant velocity, which learns nothing.
+    The price is what is left of it beside constant velocity, which learns nothing; the columns after it are the price
+    if the share of braking vehicles were equal: that of either arm.
     """
     seconds = results.list_seconds(arm.name)
     body = []
     for own in results.list_models(arm.name):
-        price = results.price_leakage(own, fair, arm.name) if own in results.list_networks(arm.name) else None
+        learns = own in results.list_networks(arm.name)
+        price = results.price_leakage(own, fair, arm.name) if learns else None
+        equal = [results.price_at_share(own, of, fair, arm.name) if learns else None for of in (fair, arm.name)]
         found = (*(results.subtract(arm.name, fair, own, at) for at in seconds), price)
-        body.append([f"`{own}`", *(_format_difference(each, is_judged=False) for each in found), _say_leakage(price)])
-    return grid(["model", *(f"{at:g} s" for at in seconds), f"price at {seconds[-1]:g} s", "in words"], body)
+        shown = ["-" if each is None else f"{each:+.2f}" for each in equal]
+        words = _say_leakage(price, shown)
+        body.append([f"`{own}`", *(_format_difference(each, is_judged=False) for each in found), *shown, words])
+    heads = [f"price at {seconds[-1]:g} s", f"braking as in `{fair}`", f"as in `{arm.name}`", "in words"]
+    return grid(["model", *(f"{at:g} s" for at in seconds), *heads], body)
 
 
-def _say_leakage(price: dict[str, float] | None) -> str:
-    """Say what a split that leaks does to the error that is shown of a model."""
+def _say_leakage(price: dict[str, float] | None, equal: Sequence[str]) -> str:
+    """Say what a split that leaks does to the error that is shown of a model, and what other traffic has done of it."""
     if price is None:
         return "-"
     metres = abs(price["difference"])
     shown = {"better": f"shows {metres:.2f} m too little", "worse": f"shows {metres:.2f} m too much"}
-    return shown.get(judge(price["low"], price["high"]), "no price shown")
+    says = shown.get(judge(price["low"], price["high"]))
+    return f"{says}; with equal braking {' or '.join(equal)} m" if says else "no price shown"
+
+
+def lay_out_stops(results: Results, arm: Arm) -> str:
+    """Lay out how long networks were trained that stop by their validation loss, over seeds."""
+    curves, runs = results.of_arm("curves", arm.name), results.of_arm("runs", arm.name)
+    body = []
+    for own in arm.learners:
+        epochs = curves.filter(model=own.name).group_by("seed").agg(pl.col("epoch").n_unique())["epoch"]
+        if len(epochs):
+            best, loss = (runs.filter(model=own.name)[name] for name in ("best_epoch", "validation_loss"))
+            capped = f"{(epochs >= own.epochs).sum()} of {len(epochs)}"
+            ranges = (f"{each.min():.0f} to {each.max():.0f}" for each in (epochs, best))
+            body.append([f"`{own.name}`", *ranges, f"{loss.mean():.2f}", capped])
+    heads = ("model", "epochs run", "epoch of the smallest loss", "that loss", "seeds that ran all epochs")
+    return grid(heads, body) if body else ""
 
 
 def lay_out_forests(results: Results, arm: Arm) -> str:
     """Lay out shares of right maneuvers and cells by both forests, in per cent, with intervals over vehicles."""
-    rows = results.of_arm("forests", arm.name)
+    rows = results.of_arm("forests", arm.name).filter(~pl.col("figure").is_in(list(LEARNED.values())))
     key = ["figure", "model", "grid", "seconds"]
     body = []
     for (figure, model, grid_name, seconds), own in rows.group_by(key, maintain_order=True):
@@ -248,6 +283,22 @@ def lay_out_forests(results: Results, arm: Arm) -> str:
         body.append([figure.replace("_", " "), at, *counts, *shares, _format_bounds(by_forest[DIFFERENCE], "+.2f")])
     heads = ["right", "cells", "n", "vehicles", CONSTANT, OURS, PUBLISHED, "as published - ours"]
     return grid(heads, body) if body else ""
+
+
+def lay_out_learning(results: Results, arm: Arm) -> str:
+    """Lay out the shares of right maneuvers of the forest as published by its number of examples."""
+    rows = results.of_arm("forests", arm.name)
+    parts = [rows.filter(figure=figure).select("grid", "value") for figure in LEARNED.values()]
+    points = parts[0].join(parts[1], on="grid", maintain_order="left").rows()
+    body = [[f"{int(drawn):,}", f"{100 * train:.1f}", f"{100 * scored:.1f}"] for drawn, train, scored in points]
+    return grid(["examples", "right on the training part, %", "on the scored part, %"], body) if body else ""
+
+
+def lay_out_course(results: Results, arm: Arm) -> str:
+    """Lay out the losses by epoch of a decoder; those on vehicles that were held back decide when it stops."""
+    rows = results.of_arm("curves", arm.name).select("epoch", "loss", "validation_loss").rows()
+    body = [[f"{epoch}", f"{loss:.3f}", f"{held_back:.3f}"] for epoch, loss, held_back in rows]
+    return grid(["epoch", "loss in training", "on vehicles held back"], body) if body else ""
 
 
 def _format_bounds(row: dict[str, float] | None, form: str) -> str:
@@ -272,6 +323,7 @@ TABLES_OF_ARM = (
     choose_headline,
     lay_out_lakes,
     lay_out_training,
+    lay_out_stops,
     lay_out_errors,
     lay_out_differences,
     lay_out_maneuvers,
@@ -281,6 +333,8 @@ TABLES_OF_ARM = (
     lay_out_prices,
     lay_out_leakage,
     lay_out_forests,
+    lay_out_learning,
+    lay_out_course,
 )
 """Functions that the templates call with an arm."""
 
@@ -302,12 +356,15 @@ def _format_figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _format_difference(found: dict[str, float] | None, *, is_judged: bool = True) -> str:
-    """Format a difference and its interval, after the verdict where there is one to be made."""
+def _format_difference(
+    found: dict[str, float] | None, *, is_judged: bool = True, per: float = 1.0, digits: int = 2
+) -> str:
+    """Format a difference and its interval, or a part of them, after the verdict where there is one to be made."""
     if found is None:
         return "-"
     if found["low"] is None:
-        return f"{found['difference']:+.2f}"
+        return f"{found['difference'] / per:+.{digits}f}"
     says = judge(found["low"], found["high"])
     verdict = f"{says} " if is_judged and says in ("better", "worse") else ""
-    return f"{verdict}{found['difference']:+.2f} ({found['low']:+.2f} to {found['high']:+.2f})"
+    value, low, high = (f"{found[name] / per:+.{digits}f}" for name in ("difference", "low", "high"))
+    return f"{verdict}{value} ({low} to {high})"

@@ -23,7 +23,7 @@ I_80 = Source(
     "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "
     "Next Generation Simulation (NGSIM) vehicle trajectory dataset, Transportation Research Part B 105: 2,283 vehicles "
     "with lanes and neighbors, but without lateral positions and sizes: every vehicle is 4.27 m long and 1.83 m wide. "
-    "Errors along the road alone mean anything.",
+    "Only errors along the road mean anything.",
     file="i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz",
 )
 
@@ -91,12 +91,14 @@ def pair_with(own: Learner, others: tuple[Learner, ...]) -> tuple[tuple[str, str
 
 OURS = (V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER)
 PUBLISHED = tuple(map(publish, OURS))
+EGO_ONLY = ablate(ATTENTION, "ego-only loss", "ego_only=true")
+SHORT_SIGHTED = ablate(ATTENTION, "27 m", "range_m=27.432")
 ABLATED = (
-    ablate(ATTENTION, "ego-only loss", "ego_only=true"),
+    EGO_ONLY,
     ablate(ATTENTION, "no sizes", "sizes=false"),
     ablate(ATTENTION, "no lanes", "lanes=none"),
     ablate(ATTENTION, "two vehicles", "nearest=2"),
-    ablate(ATTENTION, "27 m", "range_m=27.432"),
+    SHORT_SIGHTED,
 )
 LONG_GRID = replace(CS_LSTM, label="cs-lstm, cells of 9 m", settings={"TRACKLAKE_GRID_CELL_M": "9.144"}, at_home=True)
 AXES = tuple(ablate(V_LSTM, f"anchored {axis}", f"anchoring={axis}") for axis in ("none", "longitudinal", "lateral"))
@@ -133,6 +135,9 @@ DAMAGED = tuple(
     for defect in DOSED
     for title, settings in (("", {}), (", reconstructed", REPAIRED))
 )
+RESTORED = tuple(own for own in DAMAGED if own.settings)
+CONTROL = next(own for own in RESTORED if "acceleration_spike" in own.name)
+"""Reconstructed tracks of a defect that moves no position: what reconstruction does without one to repair."""
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
 FOREST = Arm("forest", IDM, (), (), protocol="grid-2021", settings={"TRACKLAKE_RECONSTRUCT": "false"})
 FOREST_TEXT = (
@@ -173,8 +178,8 @@ PIECES = (
         "i-80",
         1,
         "Real traffic with neighbors: I-80",
-        "Four blocks of 240 s with 8 s between them; the first and the third are each predicted by models that were "
-        "trained on the other three.",
+        "Four blocks of 240 s with 8 s between them; the first and the third, two for the sake of time, are each "
+        "predicted by models that were trained on the other three.",
         (
             Arm(
                 "I-80",
@@ -210,11 +215,14 @@ PIECES = (
     Piece(
         "ablations",
         3,
-        "What attention and social pooling owe to what",
-        "The same recordings. One setting of a model is changed: attention learns from the predicted vehicle alone as "
-        "the others do, is not given sizes or lanes, is trained with two vehicles around, or sees no farther than the "
-        "grid does; the grid's cells are twice as long; V-LSTM counts one axis or both from where they stand, not from "
-        "constant velocity; V-LSTM learns from mirrored samples, CS-LSTM from mirrored and shifted ones.",
+        "Ablations: attention, social pooling, anchoring, augmentation",
+        "The same recordings. One setting of a model is changed: attention learns from the predicted vehicle alone "
+        "as the others do, is not given sizes or lanes, is trained with two vehicles around, or sees no farther than "
+        "the grid does; the grid's cells are twice as long; V-LSTM counts one axis or both from where they stand, "
+        "not from constant velocity; V-LSTM learns from mirrored samples, CS-LSTM from mirrored and shifted ones. "
+        "Attention learns from every vehicle that it looks at: with the ego-only loss, two vehicles or 27 m it has "
+        "fewer positions to learn from, too, which stand in the table. The one that is trained with two is scored "
+        "with ten.",
         (
             replace(
                 GENERATED,
@@ -231,7 +239,8 @@ PIECES = (
                 ),
                 pairs=(
                     *pair_with(ATTENTION, ABLATED),
-                    *pair_with(CS_LSTM, (LONG_GRID, AUGMENTED)),
+                    *pair_with(CS_LSTM, (LONG_GRID, AUGMENTED, ATTENTION, EGO_ONLY, SHORT_SIGHTED)),
+                    (ATTENTION.name, LONG_GRID.name),
                     *pair_with(V_LSTM, (*AXES, MIRRORED)),
                 ),
             ),
@@ -241,11 +250,11 @@ PIECES = (
         "published",
         3,
         "Networks as published",
-        "The same recordings. Each network has the inputs, the outputs and the loss of its publication "
-        "([models.md](models.md)) and is trained until three epochs of its last phase bring no smaller loss on the "
-        "validation part, or for 24 epochs; the weights with the smallest loss are kept. Ours are trained for 8 epochs "
-        "of twice as many samples, and the last weights are kept. Losses by epoch are in "
-        "[results-curves.csv](results-curves.csv).",
+        "The same recordings. Each network has the inputs, the outputs and the loss of its publication as far as "
+        "these samples have them ([models.md](models.md) lists what differs even then) and is trained until three "
+        "epochs of its last phase bring no smaller loss on the validation part, or for 24 epochs; the weights with "
+        "the smallest loss are kept. Ours are trained for 8 epochs of twice as many samples, and the last weights "
+        "are kept. Losses by epoch are in [results-curves.csv](results-curves.csv).",
         (
             replace(
                 GENERATED,
@@ -260,7 +269,8 @@ PIECES = (
         4,
         "One data set at a time",
         "Models that are trained and scored on one kind of recordings alone, against models that are trained on both "
-        "and are scored on that kind here, too. Both see as many samples, so that the former see each more often.",
+        "and are scored on that kind here, too. Both are given as many epochs of at most as many samples, so that the "
+        "former see each more often; how many they saw stands in the table.",
         tuple(
             replace(
                 GENERATED,
@@ -279,7 +289,9 @@ PIECES = (
         4,
         "Trained on one simulator, scored on another",
         "Models that are trained on drivers who follow Krauss's model and scored on drivers who follow IDM, against "
-        "models that are trained on the latter.",
+        "models that are trained on the latter. These have learned on other blocks of the recordings that are "
+        "scored, the former on recordings of their own: a difference is that of simulators and of familiar "
+        "recordings together.",
         (
             replace(
                 GENERATED,
@@ -296,8 +308,9 @@ PIECES = (
         "The split of convolutional social pooling's code (`csp-2018`) cuts every recording by the vehicles' numbers: "
         "vehicles that drive side by side are in different parts. Errors under it are compared with those on the same "
         "recordings parted by blocks of time. Other vehicles are scored: differences are not paired. Constant velocity "
-        "learns nothing, so its difference is what the other vehicles make; the rest is the price. It is not leakage "
-        "alone: where constant velocity errs more there is more to gain, and `csp-2018` trains on more samples.",
+        "learns nothing, so its difference is what the other vehicles make. What is left is no pure price of leakage: "
+        "vehicles that brake are another share of what is scored, constant velocity errs most there, and where it errs "
+        "more there is more to gain; and `csp-2018` trains on more samples. The last columns make the shares equal.",
         (
             replace(
                 GENERATED,
@@ -313,14 +326,19 @@ PIECES = (
         6,
         "The price of defects",
         "One defect of a fifth of the vehicles in otherwise clean traffic; a network is trained on it, or on its "
-        "reconstructed tracks, and scored on the same traffic without defects.",
+        "reconstructed tracks, and scored on the same traffic without defects. Reconstruction smooths what the network "
+        "learns from, and not what it is scored on. So reconstructed tracks are compared with those of a defect that "
+        "moves no position, `acceleration_spike`, too: networks read positions alone.",
         (
             replace(
                 GENERATED,
                 name="defects",
                 source=CLEAN,
                 learners=(LEARNER, *DAMAGED),
-                pairs=pair_with(LEARNER, DAMAGED),
+                pairs=(
+                    *pair_with(LEARNER, DAMAGED),
+                    *pair_with(CONTROL, tuple(own for own in RESTORED if own is not CONTROL)),
+                ),
             ),
         ),
     ),
@@ -329,7 +347,7 @@ PIECES = (
         3,
         "Lane changes by a forest, as published and ours",
         FOREST_TEXT,
-        (replace(FOREST, forest=("--as-published",)),),
+        (replace(FOREST, forest=("--as-published", "--learning-curve")),),
     ),
     Piece(
         "decoder",

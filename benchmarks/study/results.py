@@ -1,18 +1,23 @@
 """Figures of the committed tables as the pages print them; differences are called better or worse by interval alone."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
-from study.pieces import PIECES
+from study.pieces import CONTROL, PIECES, RESTORED
 from study.plan import Arm
 from study.tables import NOTHING, TABLES, read_table
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVERYTHING
+from tracklake.training.onboard.as_published import DIFFERENCE
 
 UNITS = {"nll_nats": " nats"}
+BRAKE, NORMAL = "longitudinal=brake", "longitudinal=normal"
+"""Groups of samples by their true longitudinal maneuver."""
 FEW = 30
 """Figures over fewer samples are not shown."""
 
@@ -59,6 +64,13 @@ class Results:
         """List the networks among them."""
         return [name for name in self.list_models(arm) if name not in find_arm(arm).plain]
 
+    def list_missing(self, arm: str) -> list[str]:
+        """List the planned networks of an arm that were not run in all blocks, or not with all seeds."""
+        found = dict(self.of_arm("seeds", arm).group_by("model").agg(pl.col("seed").n_unique()).rows())
+        planned = {own.name: own.seeds for own in find_arm(arm).learners}
+        lacking = {name: seeds for name, seeds in planned.items() if found.get(name, 0) < seeds}
+        return [f"`{name}` ({found.get(name, 0)} of {seeds} seeds)" for name, seeds in lacking.items()]
+
     def list_seconds(self, arm: str) -> list[float]:
         """List an arm's horizons."""
         seconds: list[float] = self.of_arm("seeds", arm)["seconds"].unique().sort().to_list()
@@ -78,6 +90,21 @@ class Results:
             return "-"
         spread = f" ± {rows[figure].std():.2f}" if rows.height > 1 else ""
         return f"{rows[figure].mean():.2f}{spread}"
+
+    def show_seen(self, arm: str, model: str) -> str:
+        """Show how many samples a model was trained on, in the mean over its trainings."""
+        return f"{self.of_arm('runs', arm).filter(model=model)['samples_seen'].mean():,.0f}"
+
+    def show_share(self, table: str, arm: str, column: str, **part: object) -> str:
+        """Show a share at an arm's last horizon in per cent, in the mean over folds weighted by their samples."""
+        rows = self.of_arm(table, arm).filter(pl.col("seconds") == pl.col("seconds").max(), **part)
+        return f"{100 * (rows[column] * rows['n']).sum() / rows['n'].sum():.1f} %"
+
+    def show_forest(self, arm: str, figure: str, forest: str) -> str:
+        """Show the share of right maneuvers of a forest in per cent; a difference of two with its interval."""
+        row = self.of_arm("forests", arm).filter(figure=figure, forest=forest).row(0, named=True)
+        value, low, high = (100 * row[name] for name in ("value", "low", "high"))
+        return f"{value:+.2f} ({low:+.2f} to {high:+.2f})" if forest == DIFFERENCE else f"{value:.1f} %"
 
     def find_baseline(self, arm: str, seconds: float, figure: str) -> str | None:
         """Find the plain model with the smallest error at a horizon; None where none has the figure."""
@@ -102,6 +129,10 @@ class Results:
         made = self.of_arm("comparisons", arm).select("model", "against").unique().rows()
         return [pair for pair in own.pairs if pair in made and pair[0] not in own.plain]
 
+    def list_priced(self) -> list[tuple[str, str]]:
+        """List the pairs that price a defect."""
+        return [pair for pair in self.list_pairs("defects") if is_price(*pair)]
+
     def subtract(
         self, arm: str, other: str, model: str, seconds: float, against: str = NOTHING
     ) -> dict[str, float] | None:
@@ -121,13 +152,39 @@ class Results:
         seconds = self.list_seconds(leaking)
         return self.subtract(leaking, fair, model, seconds[-1], "constant-velocity") if seconds else None
 
+    def find_braking(self, arm: str) -> float | None:
+        """Find the share of an arm's samples, at its last horizon, whose vehicles brake; None where it is unknown."""
+        rows = self.select(arm, "constant-velocity", self.list_seconds(arm)[-1], group=EVERYTHING)
+        brake = self.select(arm, "constant-velocity", self.list_seconds(arm)[-1], group=BRAKE)
+        return brake["n"][0] / rows["n"][0] if rows.height and brake.height else None
+
+    def weigh_braking(self, arm: str, model: str, share: float) -> float | None:
+        """Return a model's RMSE at the last horizon, if that share of the samples braked; in the mean over seeds."""
+        at = self.list_seconds(arm)[-1]
+        brake, other = (self.select(arm, model, at, group=name).sort("seed")["rmse_m"] for name in (BRAKE, NORMAL))
+        if len(brake) != len(other) or brake.is_empty():
+            return None
+        return float(np.sqrt(share * brake.to_numpy() ** 2 + (1 - share) * other.to_numpy() ** 2).mean())
+
+    def price_at_share(
+        self, model: str, share_of: str, fair: str = "generated", leaking: str = "csp-2018"
+    ) -> float | None:
+        """Price a split that leaks if the same share of samples braked under both splits: that of one of the arms."""
+        share = self.find_braking(share_of)
+        if share is None:
+            return None
+        found = [self.weigh_braking(arm, own, share) for arm in (leaking, fair) for own in (model, "constant-velocity")]
+        own, plain, own_fair, plain_fair = (math.nan if value is None else value for value in found)
+        price = own - plain - (own_fair - plain_fair)
+        return None if math.isnan(price) else price
+
     def list_prices(self) -> list[dict[str, object]]:
         """List the prices of leakage by model, and of defects by training, that were measured with an interval."""
         found: list[tuple[str, str, dict[str, float] | None]] = []
         if self.list_seconds("csp-2018"):
             found += (("leakage", model, self.price_leakage(model)) for model in self.list_networks("csp-2018"))
         for at in self.list_seconds("defects")[-1:]:
-            pairs = self.list_pairs("defects")
+            pairs = self.list_priced()
             found += (("defects", own, self.compare("defects", own, clean, at, "rmse_m")) for own, clean in pairs)
         keys = ("difference", "low", "high")
         return [
@@ -155,6 +212,11 @@ class Results:
         unit = UNITS.get(figure, " m")
         bounds = " to ".join(f"{found[name]:+.2f}" for name in ("low", "high"))
         return f"{judge(found['low'], found['high'])} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
+
+
+def is_price(own: str, other: str) -> bool:
+    """Return whether a comparison prices a defect: reconstructed tracks are compared with reconstructed ones."""
+    return (own in [learner.name for learner in RESTORED]) == (other == CONTROL.name)
 
 
 def find_dataset(arm: str) -> str:

@@ -13,6 +13,7 @@ from study.plan import Arm
 from tracklake.schemas.comparisons import CALIBRATION, COMPARED_FIGURES, CONFORMAL_RADII, DENSITY_ERRORS, FEASIBILITY
 from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.training.comparison.bootstrap import compare_errors
+from tracklake.training.onboard.as_published import PUBLISHED
 
 TEXT, WHOLE, NUMBER = pl.String(), pl.Int64(), pl.Float64()
 KEY = {"arm": TEXT, "model": TEXT, "seed": WHOLE}
@@ -54,6 +55,8 @@ TABLES |= {
 """Columns of docs/results-NAME.csv. `seeds` has one row per arm, model, seed, part of the data and horizon; the seed is
 null where nothing was drawn."""
 
+LEARNED = {"train": "maneuver, training part", "eval": "maneuver, scored part"}
+"""Figures of a forest's learning curve by part; the number of examples stands in the column `grid`."""
 NOTHING = "-"
 """What a model is compared with where the interval is that of its own error."""
 SUMS = pl.col("squared_longitudinal_m2", "squared_lateral_m2", "distance_m", "nll_nats")
@@ -84,7 +87,7 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
     done = select_complete(jobs, max(1, len(arm.folds)))
     if not done:
         return
-    lakes = {lake.root: lake for job in done for lake in (job.lake, job.trained_in)}.values()
+    lakes = {(lake.root, lake.name): lake for job in done for lake in (job.lake, job.trained_in)}.values()
     errors = read_errors(done)
     found = {
         "seeds": pool_scores(done),
@@ -100,9 +103,28 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
 def update_forests(docs: Path, lake: Lake, file: Path) -> None:
     """Replace the rows of an arm of forests by the scores of its lake."""
     record = json.loads(file.read_text(encoding="utf-8"))["as_published"]
-    rows = [{"arm": lake.arm.name, **row} for row in record["shares"]]
-    found = {"forests": pl.DataFrame(rows, schema=TABLES["forests"])}
-    replace_rows(docs, lake.arm, found | {"lakes": pl.DataFrame([describe_lake(lake)], schema=TABLES["lakes"])})
+    named = {"arm": lake.arm.name}
+    rows = [named | row for row in record["shares"]]
+    for point in record["learning_curve"]:
+        drawn = named | {"forest": PUBLISHED, "grid": str(point["drawn"])}
+        rows += [
+            drawn | {"figure": figure, "n": point[f"{part}_n"], "value": point[f"{part}_accuracy"]}
+            for part, figure in LEARNED.items()
+        ]
+    found = {
+        "forests": pl.DataFrame(rows, schema=TABLES["forests"]),
+        "curves": pl.DataFrame(list(describe_course(lake, record["decoder"])), schema=TABLES["curves"]),
+        "lakes": pl.DataFrame([describe_lake(lake)], schema=TABLES["lakes"]),
+    }
+    replace_rows(docs, lake.arm, found)
+
+
+def describe_course(lake: Lake, course: Mapping[str, Any] | None) -> Iterator[dict[str, Any]]:
+    """Describe the losses by epoch of a decoder; of none, nothing."""
+    if course is not None:
+        for epoch, (loss, held_back) in enumerate(zip(course["losses"], course["validation_losses"], strict=True)):
+            named = {"arm": lake.arm.name, "model": "decoder", "lake": lake.name, "phase": "places"}
+            yield named | {"epoch": epoch, "loss": loss, "validation_loss": held_back}
 
 
 def replace_rows(docs: Path, arm: Arm, found: Mapping[str, pl.DataFrame]) -> None:
