@@ -18,7 +18,7 @@ from study.page import (
     lay_out_stops,
     render_pages,
 )
-from study.pieces import CONTROL, PIECES
+from study.pieces import PIECES
 from study.plan import Arm, Learner, Source
 from study.results import Results, UnprovenError, judge
 from study.tables import NOTHING, TABLES
@@ -103,11 +103,16 @@ def test_the_price_of_leakage_is_what_constant_velocity_does_not_share():
 def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     """0.4 m more with a defect of 20 % of the vehicles: 0.02 m per per cent."""
     (arm,) = next(piece.arms for piece in PIECES if piece.name == "defects")
-    clean, damaged, mended = arm.learners[:3]
+    by_name = {own.name: own for own in arm.learners}
+    clean, damaged = by_name["v-lstm"], by_name["v-lstm, late_start 20%"]
+    mended, control = (by_name[f"v-lstm, {name} 20%, reconstructed"] for name in ("late_start", "acceleration_spike"))
+    assert (damaged.name, clean.name) in arm.pairs
+    assert (mended.name, control.name) in arm.pairs
+    assert all(own.partition(",")[0] == other.partition(",")[0] for own, other in arm.pairs), "of one network"
     rows = [
         {"arm": arm.name, "model": own.name, "against": other.name, "dataset": "all", "figure": figure, "seconds": 5.0}
         | {"difference": value, "low": value - 0.1, "high": value + 0.1}
-        for own, other, value in ((damaged, clean, 0.4), (mended, clean, 9.0), (mended, CONTROL, 0.05))
+        for own, other, value in ((damaged, clean, 0.4), (mended, clean, 9.0), (mended, control, 0.05))
         for figure in ("rmse_m", "nll_nats")
     ]
     seeds = pl.DataFrame({"arm": [arm.name], "seconds": [5.0]})
@@ -117,7 +122,7 @@ def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     assert first.endswith(f"| `v-lstm` | worse +0.40 (+0.30 to +0.50) | {per_cent} | {per_cent} | costs 0.40 m |")
     # Reconstructed tracks are compared with reconstructed ones, which are smooth as they are.
     per_cent = "+0.0025 (-0.0025 to +0.0075)"
-    assert second.endswith(f"| `{CONTROL.name}` | +0.05 (-0.05 to +0.15) | {per_cent} | {per_cent} | no cost shown |")
+    assert second.endswith(f"| `{control.name}` | +0.05 (-0.05 to +0.15) | {per_cent} | {per_cent} | no cost shown |")
     assert [price["what"] for price in results.list_prices()] == [damaged.name, mended.name]
 
 

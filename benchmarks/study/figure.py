@@ -57,7 +57,7 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
         rows: those of `Results.list_prices`.
     """
     titles = {
-        "leakage": "RMSE beside constant velocity's at 5 s, csp-2018 minus time-blocks: leakage and other traffic together",
+        "leakage": "RMSE beside constant velocity's at 5 s, csp-2018 minus time-blocks: leakage and other traffic",
         "defects": "Defects of a fifth of the vehicles: RMSE at 5 s, minus that of training on clean traffic",
     }
     panels = []
@@ -74,7 +74,9 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
             point = base.mark_point(filled=True, size=60, opacity=1).encode(x=alt.X("difference:Q", title="m"))
             zero = alt.Chart(alt.NamedData("prices")).mark_rule(color=INK, strokeDash=[4, 3]).encode(x=alt.datum(0))
             panels.append((zero + interval + point).properties(width=560, height=24 * len(shown)))
-    heading = alt.Title("What a split that leaks, and defects, cost", subtitle="points and 95 % intervals, m", offset=10)
+    heading = alt.Title(
+        "The price of a split that leaks, and of defects", subtitle="points and 95 % intervals, m", offset=10
+    )
     return Drawing(alt.vconcat(*panels, title=heading), {"prices": [dict(row) for row in rows]})
 
 

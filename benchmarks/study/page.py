@@ -215,7 +215,7 @@ def lay_out_prices(results: Results, arm: Arm) -> str:
     body = []
     for own, against in arm.pairs:
         error, nll = (results.compare(arm.name, own, against, at, figure) for figure in ("rmse_m", "nll_nats"))
-        if is_price(own, against) and error is not None and nll is not None:
+        if is_price(own, against) and error is not None:
             says = judge(error["low"], error["high"])
             costs = {"worse": f"costs {error['difference']:.2f} m", "better": f"gains {-error['difference']:.2f} m"}
             parts = [_format_difference(each, per=100 * DOSE, digits=4, is_judged=False) for each in (error, nll)]

@@ -89,6 +89,13 @@ def pair_with(own: Learner, others: tuple[Learner, ...]) -> tuple[tuple[str, str
     return tuple((other.name, own.name) for other in others)
 
 
+def pair_by_model(firsts: tuple[Learner, ...], others: tuple[Learner, ...]) -> tuple[tuple[str, str], ...]:
+    """Pair each of the others with the one of the same model."""
+    return tuple(
+        pair for own in firsts for pair in pair_with(own, tuple(o for o in others if o.model == own.model and o != own))
+    )
+
+
 OURS = (V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER)
 PUBLISHED = tuple(map(publish, OURS))
 EGO_ONLY = ablate(ATTENTION, "ego-only loss", "ego_only=true")
@@ -124,19 +131,21 @@ DOSED = ("late_start", "frame_gap", "position_jump", "second_track", "accelerati
 DOSE = 0.2
 """Share of the vehicles that get a defect."""
 REPAIRED = {"TRACKLAKE_RECONSTRUCT": "true", "TRACKLAKE_TRACKS_FROM": "reconstructed"}
-LEARNER = Learner("v-lstm", 5, 12_500)
+CLEANLY = (Learner("v-lstm", 5, 12_500), Learner("lstm", 5, 25_000))
+"""Networks that are trained on traffic with and without defects: one with a density, and one that learns fast."""
 DAMAGED = tuple(
     replace(
-        LEARNER,
-        label=f"v-lstm, {defect} {DOSE:.0%}{title}",
+        own,
+        label=f"{own.model}, {defect} {DOSE:.0%}{title}",
         source=generate("varied-idm", 0, "", "--defect", defect, "--dose", str(DOSE)),
         settings=settings,
     )
+    for own in CLEANLY
     for defect in DOSED
     for title, settings in (("", {}), (", reconstructed", REPAIRED))
 )
 RESTORED = tuple(own for own in DAMAGED if own.settings)
-CONTROL = next(own for own in RESTORED if "acceleration_spike" in own.name)
+CONTROLS = tuple(own for own in RESTORED if "acceleration_spike" in own.name)
 """Reconstructed tracks of a defect that moves no position: what reconstruction does without one to repair."""
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
 FOREST = Arm("forest", IDM, (), (), protocol="grid-2021", settings={"TRACKLAKE_RECONSTRUCT": "false"})
@@ -325,8 +334,8 @@ PIECES = (
         "defects",
         6,
         "The price of defects",
-        "One defect of a fifth of the vehicles in otherwise clean traffic; a network is trained on it, or on its "
-        "reconstructed tracks, and scored on the same traffic without defects. Reconstruction smooths what the network "
+        "One defect of a fifth of the vehicles in otherwise clean traffic; networks are trained on it, or on its "
+        "reconstructed tracks, and scored on the same traffic without defects. Reconstruction smooths what a network "
         "learns from, and not what it is scored on. So reconstructed tracks are compared with those of a defect that "
         "moves no position, `acceleration_spike`, too: networks read positions alone.",
         (
@@ -334,11 +343,8 @@ PIECES = (
                 GENERATED,
                 name="defects",
                 source=CLEAN,
-                learners=(LEARNER, *DAMAGED),
-                pairs=(
-                    *pair_with(LEARNER, DAMAGED),
-                    *pair_with(CONTROL, tuple(own for own in RESTORED if own is not CONTROL)),
-                ),
+                learners=(*CLEANLY, *DAMAGED),
+                pairs=(*pair_by_model(CLEANLY, DAMAGED), *pair_by_model(CONTROLS, RESTORED)),
             ),
         ),
     ),

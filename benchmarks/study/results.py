@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from study.pieces import CONTROL, PIECES, RESTORED
+from study.pieces import CONTROLS, PIECES, RESTORED
 from study.plan import Arm
 from study.tables import NOTHING, TABLES, read_table
 from tracklake.schemas.errors import TracklakeError
@@ -216,7 +216,8 @@ class Results:
 
 def is_price(own: str, other: str) -> bool:
     """Return whether a comparison prices a defect: reconstructed tracks are compared with reconstructed ones."""
-    return (own in [learner.name for learner in RESTORED]) == (other == CONTROL.name)
+    restored, controls = ([learner.name for learner in group] for group in (RESTORED, CONTROLS))
+    return (own in restored) == (other in controls)
 
 
 def find_dataset(arm: str) -> str:
