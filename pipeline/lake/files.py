@@ -79,9 +79,10 @@ def write_table(
 ) -> list[LakeFile]:
     """Validate a frame and put it into the lake under its own name; nothing is visible before it is complete.
 
-    A whole file with this fingerprint in its name came from the same inputs and is kept, unless a rebuild made it void
-    (see `find_free_path`). A frame of no rows gives no file: a table without files is an empty table. Batches that
-    follow one another in the key's order are written one after the other, so that they need not fit into the memory.
+    A whole file with this fingerprint in its name came from the same inputs and is kept if it has as many rows, unless
+    a rebuild made it void (see `find_free_path`). A frame of no rows gives no file: a table without files is an empty
+    table. Batches that follow one another in the key's order are written one after the other, so that they need not fit
+    into the memory.
 
     Raises:
         schemas.StructureError: the frame breaks the table's structural rules.
@@ -151,13 +152,11 @@ def _describe_file(root: Path, file: Path, rows: int | None) -> LakeFile:
 
 
 def _is_as_written(root: Path, path: str, rows: int) -> bool:
-    """Return whether a file is there with the committed bytes, or whole, where it was never committed."""
-    if not (root / path).is_file():
+    """Return whether a file is there with so many rows, and with the committed bytes, where it was committed."""
+    if not (root / path).is_file() or not _has_rows(root / path, rows):
         return False
     checksum = _load_checksums(root).get(path)
-    if checksum is None:
-        return _has_rows(root / path, rows)
-    return hash_file(root / path, again=True) == checksum
+    return checksum is None or hash_file(root / path, again=True) == checksum
 
 
 def _load_checksums(root: Path) -> dict[str, str]:

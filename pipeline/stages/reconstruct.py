@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+import polars as pl
+
 from tracklake.pipeline.lake.scratch import open_scratch
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import SubsetReader
@@ -55,8 +57,20 @@ def build(reader: SubsetReader, settings: Settings) -> Iterator[StageResult]:
             make_store,
             at_once,
         )
-        for number, made in enumerate(shares):
-            yield replace(_gather(made), part=f"{number:06d}")
+        for made in shares:
+            yield replace(_gather(made), part=_name_share(made.entries))
+
+
+def _name_share(entries: pl.DataFrame) -> str:
+    """Return the name of a share's files; nothing for what is of the whole subset.
+
+    The first and the last vehicle tell what is in a share, whose number does not: how many entries it has is a setting
+    on which the fingerprint does not depend. Names in order are shares in order of vehicles.
+    """
+    if entries.is_empty():
+        return ""
+    first, last = entries.select(first=pl.col("vehicle_id").min(), last=pl.col("vehicle_id").max()).row(0)
+    return f"{first:010d}-{last:010d}"
 
 
 def _gather(made: Reconstruction) -> StageResult:

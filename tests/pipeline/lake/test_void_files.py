@@ -3,15 +3,16 @@
 import json
 from pathlib import Path
 
+import polars as pl
 import pytest
-from small_lake import find_files, put_round
+from small_lake import find_files, make_starts, put, put_round
 from stage_runs import build_one
 
 from tracklake.pipeline.lake import load, open_for_writing
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
 from tracklake.pipeline.stages.stage import Job
-from tracklake.schemas import SPLIT_LEFT_OUT
+from tracklake.schemas import SPLIT_LEFT_OUT, VEHICLE_STARTS
 from tracklake.schemas.tensors import INDEX_FILE
 
 
@@ -37,6 +38,17 @@ def test_what_a_rebuild_found_is_neither_used_again_nor_replaced(tmp_path: Path)
 
 def read_live(root: Path) -> dict[str, bytes]:
     return {path: (root / path).read_bytes() for path in load(root).live_paths()}
+
+
+def test_a_file_with_another_number_of_rows_is_not_kept(tmp_path: Path):
+    """Two divisions of a subset may not share a name; should they, the file is that of the frame."""
+    values = {"dataset": "highd", "subset": "01-upper"}
+    for rows in (2, 3):
+        with open_for_writing(tmp_path) as writer:
+            commit = put(tmp_path, "validate/highd/01", 1, make_starts("01-upper", rows), VEHICLE_STARTS, **values)
+            writer.commit(commit)
+        (file,) = commit.all_files
+        assert (file.rows, pl.read_parquet(tmp_path / file.path).height) == (rows, rows)
 
 
 def test_the_tensors_of_a_rebuild_are_those_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -7,12 +7,12 @@ import pytest
 from polars.testing import assert_frame_equal
 from stage_runs import run_stage
 
-from tracklake.pipeline.lake import load
+from tracklake.pipeline.lake import load, scan
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import reconstruct, repair, revalidate, samples, traffic, validate
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import list_results
-from tracklake.schemas import SUBSETS
+from tracklake.schemas import RECONSTRUCTED, SUBSETS
 
 
 def make_tables(stage, reader, **values):
@@ -72,6 +72,28 @@ def test_tensors_of_slices_are_those_of_the_whole(lake, tmp_path, tracks_from, s
     assert sliced == info
     assert info["samples"] > 1000
     assert parts == files
+
+
+def test_shares_of_another_division_are_not_taken_for_those_of_this_one(lake, tmp_path):
+    """Setting a value back gives the fingerprint of before, whose files are there; shares have other vehicles now."""
+    root, key = tmp_path / "lake", "reconstruct/highd/01"
+    shutil.copytree(lake.root, root)
+    entries = scan(root, load(root), SUBSETS).filter(subset="01-lower").collect()["entries"].item()
+    made = []
+    for noise_m, slice_entries in ((0.2, entries - 1), (0.3, entries - 1), (0.2, entries // 2)):
+        values = {"reconstruct_noise_m": noise_m, "slice_entries": slice_entries}
+        (commit,) = run_stage(root, "reconstruct", Settings(lake=root, **values), key)
+        made.append((commit, scan(root, load(root), RECONSTRUCTED, dataset="highd", subset="01-lower").collect()))
+    (before, whole), (other, _), (again, rows) = made
+    assert before.fingerprint == again.fingerprint != other.fingerprint
+    assert 1 < len(list_own(before)) < len(list_own(again)), "it is divided otherwise"
+    assert_frame_equal(rows, whole, check_exact=True)  # by name, files are in order of vehicles
+    assert whole.select("vehicle_id", "frame").is_unique().all()
+    assert whole.select("vehicle_id", "frame").equals(whole.select("vehicle_id", "frame").sort("vehicle_id", "frame"))
+
+
+def list_own(commit):
+    return [file for file in commit.files[RECONSTRUCTED.name] if "subset=01-lower" in file.path]
 
 
 def find_scratch(root):
