@@ -15,7 +15,7 @@ import polars as pl
 
 from tracklake.pipeline.lake.checksums import hash_file
 from tracklake.pipeline.lake.errors import DamagedFileError, LakeMissingError
-from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load
+from tracklake.pipeline.lake.manifest import LakeFile, Manifest, load_recent
 from tracklake.pipeline.lake.object_access import FileLocations, get_polars_options
 from tracklake.pipeline.lake.origin import find_origin
 from tracklake.pipeline.lake.places import LakePlace
@@ -161,7 +161,7 @@ def _is_as_written(root: Path, path: str, rows: int) -> bool:
 
 def _load_checksums(root: Path) -> dict[str, str]:
     try:
-        return load(root).list_checksums()
+        return load_recent(root).checksums
     except LakeMissingError:
         return {}
 
@@ -183,12 +183,12 @@ def find_free_path(root: Path, path: str) -> str:
     if not (root / path).exists():
         return path
     try:
-        void = {item.path for item in load(root).retired if item.void}
+        void = load_recent(root).void_paths
     except LakeMissingError:
         return path
     first = PurePosixPath(path)
     for number in count(2):
-        if path not in void and not any(item.startswith(f"{path}/") for item in void):
+        if path not in void:
             break
         path = str(first.with_name(f"{first.stem}-{number}{first.suffix}"))
     return path

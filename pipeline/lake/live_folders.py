@@ -75,7 +75,7 @@ def is_shown(root: Path, manifest: Manifest) -> bool:
 
 def find_false_copies(root: Path, manifest: Manifest) -> list[str]:
     """Return the names in the live folders that are no links to their contents, and hold other bytes."""
-    checksums = manifest.list_checksums()
+    checksums = manifest.checksums
     return [
         name
         for name, path in list_names(manifest.commits.values()).items()

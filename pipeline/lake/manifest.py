@@ -3,6 +3,8 @@
 import uuid
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -135,8 +137,15 @@ class Manifest:
         """Return the paths of all live files."""
         return {file.path for commit in self.commits.values() for file in commit.all_files}
 
-    def list_checksums(self) -> dict[str, str]:
-        """Return the checksums that live and retired files were committed with, by path, as far as they are known."""
+    @cached_property
+    def void_paths(self) -> set[str]:
+        """Paths of files that must not be used again, and of all folders that hold some."""
+        parts = (item.path.split("/") for item in self.retired if item.void)
+        return {path for names in parts for path in accumulate(names, "{}/{}".format)}
+
+    @cached_property
+    def checksums(self) -> dict[str, str]:
+        """Checksums that live and retired files were committed with, by path, as far as they are known."""
         known = {item.path: item.sha256 for item in self.retired}
         known |= {file.path: file.sha256 for commit in self.commits.values() for file in commit.all_files}
         return {path: sha256 for path, sha256 in known.items() if sha256 is not None}

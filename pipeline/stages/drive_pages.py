@@ -16,17 +16,13 @@ def _find_inputs(_root: Path, manifest: Manifest, _settings: Settings) -> dict[s
     """Return by recording all that was made of its drives, and the names of their pages."""
     drives = {commit.tail: commit.info.get("drives", ()) for commit in manifest.of_stage(INGEST)}
     names = name_pages([{"dataset": "v2v", "subset": name} for own in drives.values() for name in own])
+    made: dict[str, dict[str, str]] = {tail: {} for tail, own in drives.items() if own}
+    for commit in manifest.commits.values():
+        if commit.tail in made and commit.stage != "drive_pages":
+            made[commit.tail][commit.key] = commit.fingerprint
     return {
-        tail: {
-            "commits": {
-                commit.key: commit.fingerprint
-                for commit in manifest.commits.values()
-                if commit.tail == tail and commit.stage != "drive_pages"
-            },
-            "pages": {name: names["v2v", name] for name in own},
-        }
-        for tail, own in drives.items()
-        if own
+        tail: {"commits": commits, "pages": {name: names["v2v", name] for name in drives[tail]}}
+        for tail, commits in made.items()
     }
 
 

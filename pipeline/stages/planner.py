@@ -238,13 +238,15 @@ def select_part(manifest: Manifest, stage: Stage, jobs: Sequence[Job], settings:
 
     It is small, and fit to be sent to a worker: looking at thousands of other commits would take longer than a small
     job. Of what they do not read, a file of each table stays, so that reading it is an error; a stage that comes after
-    none reads all tables, and no other file: that of a report alone has thousands.
+    none reads all tables, and no other file: that of a report alone has thousands. What commits over the whole lake
+    were built from, which names every recording, is left out.
     """
     if stage.scope == "lake":
         return manifest
     read = stage.list_inputs(settings)
 
     def keep(commit: Commit) -> Commit:
+        commit = commit if commit.tail else replace(commit, built_from={})
         if commit.stage in read:
             return commit
         tables = {name: [file for file in files if file.rows is not None] for name, files in commit.files.items()}

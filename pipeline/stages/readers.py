@@ -1,6 +1,6 @@
 """What build functions read the lake with: the tables of all recordings, or of one subset."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
@@ -9,10 +9,10 @@ from typing import Any
 
 import polars as pl
 
-from tracklake.pipeline.lake import Manifest, scan
+from tracklake.pipeline.lake import Commit, Manifest, scan
 from tracklake.pipeline.lake.files import name_folder
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.stage import Job
+from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.pipeline.transforms.reconstruction.causal import filter_tracks
 from tracklake.pipeline.transforms.reconstruction.clean_tracks import replace_positions
 from tracklake.pipeline.transforms.slices import Slice, cut_frames
@@ -34,6 +34,7 @@ class LakeReader:
     Args:
         after: stages whose tables may be read; None for all.
         partition: values of the partition columns of what is read and made; none for the whole lake.
+        makers: stages that make each table, where the manifest is only a part of the lake's; None: as it says.
     """
 
     root: Path
@@ -41,6 +42,7 @@ class LakeReader:
     after: tuple[str, ...] | None = None
     job: Job = field(default_factory=lambda: Job("", ""))
     partition: dict[str, Any] = field(default_factory=dict)
+    makers: Mapping[str, Collection[str]] | None = None
 
     @property
     def title(self) -> str:
@@ -53,13 +55,12 @@ class LakeReader:
         Raises:
             LookupError: the stage that made the table is not declared among those that this one comes after.
         """
-        if self.after is not None:
-            makers = {commit.stage for commit in self.manifest.commits.values() if table.name in commit.files}
-            if undeclared := sorted(makers - {*self.after}):
-                raise LookupError(
-                    f"{self.job.key} reads `{table.name}`, which {', '.join(undeclared)} makes; expected that stage "
-                    f"among those it comes after, got {', '.join(self.after) or 'none'}"
-                )
+        undeclared = sorted({*self._makers.get(table.name, ())} - {*(self.after or ())})
+        if undeclared and self.after is not None:
+            raise LookupError(
+                f"{self.job.key} reads `{table.name}`, which {', '.join(undeclared)} makes; expected that stage "
+                f"among those it comes after, got {', '.join(self.after) or 'none'}"
+            )
         return scan(self.root, self.manifest, table, **self.partition)
 
     def table(self, table: Table, *columns: str) -> pl.DataFrame:
@@ -68,9 +69,34 @@ class LakeReader:
         return (rows.select(columns) if columns else rows).collect()
 
     def open_subset(self, dataset: str, subset: str) -> "SubsetReader":
-        """Return the reader of one subset."""
+        """Return the reader of one subset, whose manifest has what was made of its recording and of the whole lake."""
         partition = {"dataset": dataset, "subset": subset}
-        return SubsetReader(self.root, self.manifest, self.after, self.job, partition)
+        manifest = self._parts.get((dataset, subset), self.manifest)
+        return SubsetReader(self.root, manifest, self.after, self.job, partition, self._makers)
+
+    @cached_property
+    def _makers(self) -> Mapping[str, Collection[str]]:
+        """Stages that make each table."""
+        if self.makers is not None:
+            return self.makers
+        makers: dict[str, set[str]] = {}
+        for commit in self.manifest.commits.values():
+            for name in commit.files:
+                makers.setdefault(name, set()).add(commit.stage)
+        return makers
+
+    @cached_property
+    def _parts(self) -> Mapping[tuple[str, str], Manifest]:
+        """The manifest's part for each (dataset, subset): a job over the whole lake opens thousands of subsets."""
+        by_tail: dict[str, dict[str, Commit]] = {"": {}}
+        for key, commit in self.manifest.commits.items():
+            by_tail.setdefault(commit.tail, {})[key] = commit
+        own: dict[tuple[str, str], dict[str, Commit]] = {}
+        for commit in self.manifest.of_stage(INGEST):
+            info = commit.info
+            for name in (*(each["subset"] for each in info.get("subsets", ())), *info.get("drives", ())):
+                own.setdefault((info["dataset"], name), {**by_tail[""]}).update(by_tail[commit.tail])
+        return {subset: replace(self.manifest, commits=commits) for subset, commits in own.items()}
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import platform
 import shlex
+from collections import Counter
 from dataclasses import asdict
 from functools import cache
 from importlib.metadata import version
@@ -89,11 +90,12 @@ def _find_thresholds(manifest: Manifest, settings: Settings) -> dict[str, dict[s
         commit.tail: {name: commit.built_from["thresholds"].get(name, defaults[name]) for name in defaults}
         for commit in manifest.of_stage("validate")
     }
-    usual = max(
-        used.values(),
-        key=list(used.values()).count,
-        default=resolve(RULES, select_thresholds(RULES, settings.thresholds)),
-    )
+    counts = Counter(tuple(values.values()) for values in used.values())
+    if counts:
+        ((most, _),) = counts.most_common(1)  # the first of those that are as common
+        usual = dict(zip(defaults, most, strict=True))
+    else:
+        usual = resolve(RULES, select_thresholds(RULES, settings.thresholds))
     return {
         "thresholds": {name: value for name, value in usual.items() if value != defaults[name]},
         "thresholds_elsewhere": {

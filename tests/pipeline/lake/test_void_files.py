@@ -5,10 +5,10 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from small_lake import find_files, make_starts, put, put_round
+from small_lake import SUBSETS, find_files, make_starts, put, put_round, write_round
 from stage_runs import build_one
 
-from tracklake.pipeline.lake import load, open_for_writing
+from tracklake.pipeline.lake import load, manifest, open_for_writing
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import tensors
 from tracklake.pipeline.stages.stage import Job
@@ -49,6 +49,18 @@ def test_a_file_with_another_number_of_rows_is_not_kept(tmp_path: Path):
             writer.commit(commit)
         (file,) = commit.all_files
         assert (file.rows, pl.read_parquet(tmp_path / file.path).height) == (rows, rows)
+
+
+def test_a_rebuild_reads_the_manifest_once_for_all_files_of_a_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_round(tmp_path, 1)
+    reads, real = [], manifest.read_shards
+    monkeypatch.setattr(manifest, "read_shards", lambda *given: reads.append(given) or real(*given))
+    with open_for_writing(tmp_path, rebuild=True):
+        reads.clear()
+        made = [file.path for subset in SUBSETS for file in put_round(tmp_path, subset, 1).all_files]
+    assert len(made) == 10
+    assert all(f"{1:016x}-2" in path for path in made), "each was there, and is void"
+    assert len(reads) == 1
 
 
 def test_the_tensors_of_a_rebuild_are_those_it_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

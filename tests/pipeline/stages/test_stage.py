@@ -185,19 +185,28 @@ def test_tables_are_checked_and_undeclared_reads_are_found(root):
 
 
 def test_a_part_of_the_manifest_is_what_jobs_may_read(root):
-    """Of another stage's tables a file stays, so that reading them raises; pages of a report do not."""
+    """Of another stage's tables a file stays, so that reading them raises; pages of a report do not.
+
+    What a commit over the whole lake was built from names every recording, and is left out.
+    """
     manifest = load(root)
     pages = [LakeFile(f"reports/{number}.html", None, 10) for number in range(3)]
     splits = [LakeFile(f"splits/{number}.parquet", 5, 10) for number in range(3)]
-    made = Commit("report", "f", {"reports": pages, SPLITS.name: splits})
+    made = Commit(
+        "report", "f", {"reports": pages, SPLITS.name: splits}, {"commits": {"ingest/highd/01": "0"}}, {"n": 1}
+    )
     manifest = replace(manifest, commits={**manifest.commits, made.key: made})
     (job, _) = plan_stage(root, "toy", SETTINGS, STAGES)
     part = select_part(manifest, TOY, [job], SETTINGS)
     assert sorted(part.commits) == ["ingest/highd/01", "report"]
     assert part.commits["ingest/highd/01"] == manifest.commits["ingest/highd/01"]
-    assert part.commits["report"].files == {SPLITS.name: splits[:1]}
+    assert part.commits["report"] == Commit("report", "f", {SPLITS.name: splits[:1]}, {}, {"n": 1})
     page = Stage(**{**vars(TOY), "name": "page", "after": ()})
-    assert select_part(manifest, page, [job], SETTINGS).commits["report"].files == {SPLITS.name: splits}
+    read = select_part(manifest, page, [job], SETTINGS).commits["report"]
+    assert (read.files, read.built_from) == ({SPLITS.name: splits}, {})
+    after_it = Stage(**{**vars(TOY), "after": ("ingest", "report")})
+    read = select_part(manifest, after_it, [job], SETTINGS).commits["report"]
+    assert (read.files, read.built_from) == (made.files, {})
     assert select_part(manifest, TOTAL, [], SETTINGS) is manifest
     hidden = Stage(**{**vars(TOY), "build": lambda reader, _: {SUBSET_STATUS: reader.table(SPLITS)}})
     with pytest.raises(LookupError, match=r"reads `splits`, which report makes"):
