@@ -49,18 +49,18 @@ def build(reader: LakeReader, settings: Settings) -> StageResult:
     drops = drops_cut_samples(settings, split)
     cut_samples = np.zeros(len(PARTS), np.int64)
 
-    def build_one(subset: SubsetReader, make_store: MakeStore) -> Iterator[SubsetTensors]:
+    def build_one(subset: SubsetReader) -> Iterator[SubsetTensors]:
         vehicles = left_out.filter(**subset.partition)["vehicle_id"]
         blocks = splits.filter(**subset.partition)
-        for tensors in build_subset(subset, blocks, vehicles, settings, make_store, drop_cut=drops):
-            yield tensors
+        with open_scratch(root) as make_store:  # of one subset: that of all could fill the disk
+            for tensors in build_subset(subset, blocks, vehicles, settings, make_store, drop_cut=drops):
+                yield tensors
         cut_samples[:] += tensors.cut_samples
 
     def write(folder: Path) -> None:
         recipe = {**_describe_recipe(settings, split), "left_out_vehicles": left_out.height}
-        with open_scratch(root) as make_store:
-            tensors = ((subset.facts, build_one(subset, make_store)) for subset in included)
-            write_tensors(folder, tensors, splits, protocol, storage=storage, split_recipe=recipe)
+        tensors = ((subset.facts, build_one(subset)) for subset in included)
+        write_tensors(folder, tensors, splits, protocol, storage=storage, split_recipe=recipe)
 
     path = find_free_path(root, f"{TENSORS}/{split}/{reader.job.fingerprint}")
     files = write_folder(root, path, write)

@@ -9,7 +9,7 @@ from stage_runs import run_stage
 
 from tracklake.pipeline.lake import load, scan
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages import reconstruct, repair, revalidate, samples, traffic, validate
+from tracklake.pipeline.stages import reconstruct, repair, revalidate, samples, tensors, traffic, validate
 from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import list_results
 from tracklake.schemas import RECONSTRUCTED, SUBSETS
@@ -94,6 +94,25 @@ def test_shares_of_another_division_are_not_taken_for_those_of_this_one(lake, tm
 
 def list_own(commit):
     return [file for file in commit.files[RECONSTRUCTED.name] if "subset=01-lower" in file.path]
+
+
+def test_what_a_long_subset_keeps_in_files_is_deleted_before_the_next_one(lake, tmp_path, monkeypatch):
+    root = tmp_path / "lake"
+    shutil.copytree(lake.root, root)
+    found, real = [], tensors.build_subset
+
+    def build_subset(*given, **named):
+        found.append([sorted(file.name for file in folder.iterdir()) for folder in find_scratch(root)])
+        yield from real(*given, **named)
+        found.append([len(list(folder.iterdir())) for folder in find_scratch(root)])
+
+    monkeypatch.setattr(tensors, "build_subset", build_subset)
+    for stage in ("samples", "split", "tensors"):
+        run_stage(root, stage, Settings(lake=root, slice_entries=2_000, tensor_positions="int16-decimetres"))
+    before, after = found[::2], found[1::2]
+    assert len(before) > 1
+    assert before == [[[]]] * len(before), "one folder, still empty"
+    assert max(after) > [0], "some subset is long"
 
 
 def find_scratch(root):
