@@ -72,7 +72,8 @@ def _make_time_blocks(recipe: SplitRecipe, inputs: SplitInputs) -> SplitResult:
             visits.append(find_visits(part.table(TRACKS, "vehicle_id", "frame"), own))
             rows = reader.scan(SAMPLES).filter(pl.col("protocol") == inputs.protocol.name)
             if part.slice is not None:
-                rows = rows.filter(part.slice.is_own(facts["first_frame"] + pl.col("tick") * stride))
+                is_own = part.slice.is_own_tick(pl.col("tick"), first_frame=facts["first_frame"], stride=stride)
+                rows = rows.filter(is_own)
             weights.append(
                 count_samples(
                     rows.select("vehicle_id", "tick").collect(),

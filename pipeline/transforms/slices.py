@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import ceil, floor
 
 import numpy as np
 import polars as pl
@@ -32,6 +33,21 @@ class Slice:
     def is_own(self, frame: pl.Expr) -> pl.Expr:
         """Return whether the slice owns a frame."""
         return (frame >= self.first_frame) & (frame < self.end_frame)
+
+    def is_own_tick(self, tick: pl.Expr, *, first_frame: int, stride: float) -> pl.Expr:
+        """Return whether the slice owns the frame of a tick.
+
+        Bounds in whole ticks, one wider on each side, come first: unlike the frames, which need not be whole, they tell
+        from the statistics of a file that all its ticks are of other times, and it is not read.
+
+        Args:
+            tick: whole numbers.
+            first_frame: frame of tick 0.
+            stride: number of frames that make a tick.
+        """
+        low = floor((self.first_frame - first_frame) / stride) - 1
+        high = ceil((self.end_frame - first_frame) / stride) + 1
+        return tick.is_between(low, high) & self.is_own(first_frame + tick * stride)
 
     def is_read(self, frame: pl.Expr) -> pl.Expr:
         """Return whether a frame is the slice's own or of its context."""

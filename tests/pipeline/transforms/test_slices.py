@@ -1,10 +1,12 @@
 """Slices: every frame is owned once, and what is read around it is complete and within the bound."""
 
 import numpy as np
+import polars as pl
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tracklake.pipeline.transforms.slices import cut_frames, list_windows
+from tracklake.pipeline.transforms.slices import Slice, cut_frames, list_windows
 
 COUNTS = st.dictionaries(st.integers(0, 60), st.integers(1, 9), min_size=1)
 
@@ -44,6 +46,29 @@ def test_a_bound_beyond_all_numbers_is_one_slice():
 def test_names_in_order_are_slices_in_order_of_time():
     names = [each.name for each in cut_frames(np.arange(0, 3000, 40), np.ones(75, np.int64), 1, 0)]
     assert names == sorted(names)
+
+
+@pytest.mark.parametrize("stride", [5.0, 2.5, 25 / 3, 29.97 / 5, 0.4])
+def test_ticks_of_a_slice_are_those_whose_frames_it_owns(stride):
+    ticks = pl.DataFrame({"tick": range(-20, 300)}, schema={"tick": pl.Int32})
+    for first, end in ((20, 30), (30, 31), (31, 80)):
+        own = Slice(first, end, 3).is_own_tick(pl.col("tick"), first_frame=10, stride=stride)
+        expected = [tick for tick in range(-20, 300) if first <= 10 + tick * stride < end]
+        assert ticks.filter(own)["tick"].to_list() == expected
+
+
+def test_a_file_with_ticks_of_other_times_is_not_read(tmp_path):
+    for name, first in (("a", 0), ("b", 100)):
+        rows = pl.DataFrame({"tick": range(first, first + 100)}, schema={"tick": pl.Int32})
+        rows.write_parquet(tmp_path / f"{name}.parquet")
+    content = bytearray((tmp_path / "b.parquet").read_bytes())
+    footer = int.from_bytes(content[-8:-4], "little") + 8
+    content[4:-footer] = bytes(len(content) - 4 - footer)
+    (tmp_path / "b.parquet").write_bytes(content)
+    own = Slice(0, 50, 0).is_own_tick(pl.col("tick"), first_frame=0, stride=2.5)
+    assert pl.scan_parquet(tmp_path / "*.parquet").filter(own).collect()["tick"].to_list() == list(range(20))
+    with pytest.raises(pl.exceptions.PolarsError):
+        pl.read_parquet(tmp_path / "b.parquet")
 
 
 @given(st.lists(st.tuples(st.integers(-5, 40), st.integers(1, 12)), max_size=8), st.integers(1, 30))
