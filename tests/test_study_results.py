@@ -20,7 +20,7 @@ from study.page import (
 )
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source
-from study.results import Results, UnprovenError, judge
+from study.results import Results, UnprovenError, is_price, judge
 from study.tables import NOTHING, TABLES
 from verdicts import check_verdicts
 
@@ -124,6 +124,8 @@ def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
     per_cent = "+0.0025 (-0.0025 to +0.0075)"
     assert second.endswith(f"| `{control.name}` | +0.05 (-0.05 to +0.15) | {per_cent} | {per_cent} | no cost shown |")
     assert [price["what"] for price in results.list_prices()] == [damaged.name, mended.name]
+    assert is_price(control.name, clean.name)
+    assert not is_price(mended.name, clean.name)
 
 
 def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_trained():

@@ -215,9 +215,12 @@ class Results:
 
 
 def is_price(own: str, other: str) -> bool:
-    """Return whether a comparison prices a defect: reconstructed tracks are compared with reconstructed ones."""
+    """Return whether a comparison prices a defect, or reconstruction alone.
+
+    Reconstructed tracks with a defect are compared with reconstructed ones without.
+    """
     restored, controls = ([learner.name for learner in group] for group in (RESTORED, CONTROLS))
-    return (own in restored) == (other in controls)
+    return own in controls or (own in restored) == (other in controls)
 
 
 def find_dataset(arm: str) -> str:

@@ -184,14 +184,15 @@ def read_errors(jobs: Iterable[Job]) -> dict[str, pl.DataFrame]:
 
 
 def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dict[str, Any]]:
-    """Compare models with nothing, networks with plain models, and the arm's pairs, on everything and by dataset."""
+    """Compare models with nothing, networks with plain models, and the arm's pairs, on the part that the arm shows."""
     learned = [own.name for own in arm.learners]
     for model, against in (*product(errors, (NOTHING,)), *product(learned, arm.plain), *arm.pairs):
         if model not in errors or against not in (*errors, NOTHING):
             continue
         others = errors[model].with_columns(SUMS * 0.0) if against == NOTHING else errors[against]
-        for dataset, own, other in pair_datasets(errors[model], others):
-            named = {"arm": arm.name, "model": model, "against": against, "dataset": dataset}
+        own, other = (select_part(each, arm.dataset) for each in (errors[model], others))
+        if set(own["dataset"]) == set(other["dataset"]):
+            named = {"arm": arm.name, "model": model, "against": against, "dataset": arm.dataset}
             for figure in FIGURES:
                 sums = COMPARED_FIGURES[figure]
                 if not any(each[column].has_nulls() for each in (own, other) for column in sums):
@@ -199,13 +200,9 @@ def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dic
                     yield from (named | {"figure": figure} | row for row in rows)
 
 
-def pair_datasets(own: pl.DataFrame, other: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame, pl.DataFrame]]:
-    """Pair errors of two models on everything, where both have it, and on each dataset that both have."""
-    first, second = (set(each["dataset"]) for each in (own, other))
-    if first == second:
-        yield EVERYTHING, own, other
-    for dataset in sorted(first & second) if len(first | second) > 1 else ():
-        yield dataset, own.filter(dataset=dataset), other.filter(dataset=dataset)
+def select_part(errors: pl.DataFrame, dataset: str) -> pl.DataFrame:
+    """Select the errors on a part of the data."""
+    return errors if dataset == EVERYTHING else errors.filter(dataset=dataset)
 
 
 def read_evidence(jobs: Iterable[Job], name: str) -> pl.DataFrame:
