@@ -136,7 +136,11 @@ def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_tra
     seeds += [{"arm": arm.name, "model": published.name, "seed": seed} for seed in (0, 1)]
     curves = [
         {"arm": arm.name, "model": published.name, "seed": seed, "epoch": epoch}
-        for seed, epochs in ((0, 24), (1, 9))
+        | {
+            "phase": "mse" if epoch < 4 else "nll",
+            "validation_loss": 100.0 if epoch < 3 else last if epoch == 3 else 2.0,
+        }
+        for seed, epochs, last in ((0, 24, 50.0), (1, 9, 70.0))
         for epoch in range(epochs)
     ]
     runs = [
@@ -151,7 +155,9 @@ def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_tra
     assert f"`{published.name}` (2 of 5 seeds)" in missing
     assert not any(own.name in each.split("`") for each in missing)
     *_, row = lay_out_stops(results, arm).splitlines()
-    assert row == f"| `{published.name}` | 9 to 24 | 5 to 23 | 2.50 | 1 of 2 |"
+    assert row == f"| `{published.name}` | 9 to 24 | 5 to 23 | 2.50 | 40 % | 1 of 2 |"
+    said = "1 of 2 seeds ran all epochs, the validation loss fell by 40% in the last epoch of the first phase"
+    assert results.describe_stop(arm.name, published.name) == said
 
 
 def test_shares_of_blocks_that_differ_are_shown_and_densities_are_in_order():

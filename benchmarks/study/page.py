@@ -257,17 +257,17 @@ def _say_leakage(price: dict[str, float] | None, equal: Sequence[str]) -> str:
 
 def lay_out_stops(results: Results, arm: Arm) -> str:
     """Lay out how long networks were trained that stop by their validation loss, over seeds."""
-    curves, runs = results.of_arm("curves", arm.name), results.of_arm("runs", arm.name)
     body = []
     for own in arm.learners:
-        epochs = curves.filter(model=own.name).group_by("seed").agg(pl.col("epoch").n_unique())["epoch"]
-        if len(epochs):
-            best, loss = (runs.filter(model=own.name)[name] for name in ("best_epoch", "validation_loss"))
-            capped = f"{(epochs >= own.epochs).sum()} of {len(epochs)}"
-            ranges = (f"{each.min():.0f} to {each.max():.0f}" for each in (epochs, best))
-            body.append([f"`{own.name}`", *ranges, f"{loss.mean():.2f}", capped])
-    heads = ("model", "epochs run", "epoch of the smallest loss", "that loss", "seeds that ran all epochs")
-    return grid(heads, body) if body else ""
+        stops = results.find_stops(arm.name, own.name)
+        if stops.height:
+            runs = results.of_arm("runs", arm.name).filter(model=own.name)
+            ranges = (f"{each.min():.0f} to {each.max():.0f}" for each in (stops["epochs"], runs["best_epoch"]))
+            loss, fall = f"{runs['validation_loss'].mean():.2f}", f"{100 * stops['fall'].mean():.0f} %"
+            capped = f"{stops['is_capped'].sum()} of {stops.height}"
+            body.append([f"`{own.name}`", *ranges, loss, fall, capped])
+    heads = ("epochs run", "epoch of the smallest loss", "that loss", "last fall in the first phase", "ran all epochs")
+    return grid(["model", *heads], body) if body else ""
 
 
 def lay_out_forests(results: Results, arm: Arm) -> str:
