@@ -144,8 +144,8 @@ def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_tra
         for epoch in range(epochs)
     ]
     runs = [
-        {"arm": arm.name, "model": published.name, "best_epoch": best, "validation_loss": loss}
-        for best, loss in ((23.0, 2.0), (5.0, 3.0))
+        {"arm": arm.name, "model": published.name, "best_epoch": best, "validation_loss": loss, "steps": steps}
+        for best, loss, steps in ((23.0, 2.0, 240), (5.0, 3.0, 90))
     ]
     results = Results(
         {name: pl.DataFrame(rows) for name, rows in (("seeds", seeds), ("curves", curves), ("runs", runs))}
@@ -155,9 +155,10 @@ def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_tra
     assert f"`{published.name}` (2 of 5 seeds)" in missing
     assert not any(own.name in each.split("`") for each in missing)
     *_, row = lay_out_stops(results, arm).splitlines()
-    assert row == f"| `{published.name}` | 9 to 24 | 5 to 23 | 2.50 | 40 % | 1 of 2 |"
+    assert row == f"| `{published.name}` | 9 to 24 | 5 to 23 | 2.50 | -40 % | 1 of 2 |"
     said = "1 of 2 seeds ran all epochs, the validation loss fell by 40% in the last epoch of the first phase"
     assert results.describe_stop(arm.name, published.name) == said
+    assert results.show_steps(arm.name, published.name) == "9 to 24 epochs of 10 steps"
 
 
 def test_shares_of_blocks_that_differ_are_shown_and_densities_are_in_order():

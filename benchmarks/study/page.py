@@ -263,10 +263,16 @@ def lay_out_stops(results: Results, arm: Arm) -> str:
         if stops.height:
             runs = results.of_arm("runs", arm.name).filter(model=own.name)
             ranges = (f"{each.min():.0f} to {each.max():.0f}" for each in (stops["epochs"], runs["best_epoch"]))
-            loss, fall = f"{runs['validation_loss'].mean():.2f}", f"{100 * stops['fall'].mean():.0f} %"
+            loss, change = f"{runs['validation_loss'].mean():.2f}", f"{100 * stops['change'].mean():+.0f} %"
             capped = f"{stops['is_capped'].sum()} of {stops.height}"
-            body.append([f"`{own.name}`", *ranges, loss, fall, capped])
-    heads = ("epochs run", "epoch of the smallest loss", "that loss", "last fall in the first phase", "ran all epochs")
+            body.append([f"`{own.name}`", *ranges, loss, change, capped])
+    heads = (
+        "epochs run",
+        "epoch of the smallest loss",
+        "that loss",
+        "change in the last epoch of the first phase",
+        "ran all epochs",
+    )
     return grid(["model", *heads], body) if body else ""
 
 

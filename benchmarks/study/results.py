@@ -109,22 +109,28 @@ class Results:
     def find_stops(self, arm: str, model: str) -> pl.DataFrame:
         """Find how each seed's training by patience went, one row by seed.
 
-        Columns: `epochs`; `fall`, the share by which the loss on the validation part fell in the last epoch of the
+        Columns: `epochs`; `change`, the share by which the loss on the validation part changed in the last epoch of the
         first phase; `is_capped`, whether all planned epochs were run.
         """
         (planned,) = (own.epochs for own in find_arm(arm).learners if own.name == model)
         curves = self.of_arm("curves", arm).filter(model=model).sort("seed", "epoch")
         loss = pl.col("validation_loss").filter(pl.col("phase") == pl.col("phase").first())
         stops = curves.group_by("seed", maintain_order=True).agg(
-            pl.len().alias("epochs"), (1 - loss.last() / loss.tail(2).first()).alias("fall")
+            pl.len().alias("epochs"), (loss.last() / loss.tail(2).first() - 1).alias("change")
         )
         return stops.with_columns((pl.col("epochs") >= planned).alias("is_capped"))
 
     def describe_stop(self, arm: str, model: str) -> str:
         """Describe when the trainings of a model ended, and how its loss changed at the end of its first phase."""
         stops = self.find_stops(arm, model)
-        fell = f"the validation loss fell by {stops['fall'].mean():.0%} in the last epoch of the first phase"
-        return f"{stops['is_capped'].sum()} of {stops.height} seeds ran all epochs, {fell}"
+        change = stops["change"].mean()
+        moved = f"{'rose' if change > 0 else 'fell'} by {abs(change):.0%} in the last epoch of the first phase"
+        return f"{stops['is_capped'].sum()} of {stops.height} seeds ran all epochs, the validation loss {moved}"
+
+    def show_steps(self, arm: str, model: str) -> str:
+        """Show after how many epochs a model's trainings by patience ended, and how many steps each had."""
+        epochs, steps = self.find_stops(arm, model)["epochs"], self.of_arm("runs", arm).filter(model=model)["steps"]
+        return f"{epochs.min()} to {epochs.max()} epochs of {steps.sum() / epochs.sum():.0f} steps"
 
     def find_baseline(self, arm: str, seconds: float, figure: str) -> str | None:
         """Find the plain model with the smallest error at a horizon; None where none has the figure."""
