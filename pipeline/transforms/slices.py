@@ -97,5 +97,7 @@ def list_windows(first: Integers, size: Integers, most_rows: int) -> Iterator[tu
     frames = np.flatnonzero(rows)
     for window in cut_frames(frames + zero, rows[frames], most_rows, 0):
         runs = np.flatnonzero((first < window.end_frame) & (end > window.first_frame))
+        if len(runs) == 0:  # a gap between runs
+            continue
         before = np.maximum(window.first_frame - first[runs], 0)
         yield runs, before, np.minimum(size[runs], window.end_frame - first[runs]) - before

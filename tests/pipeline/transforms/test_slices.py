@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tracklake.pipeline.transforms.slices import Slice, cut_frames, list_windows
@@ -71,6 +71,7 @@ def test_a_file_with_ticks_of_other_times_is_not_read(tmp_path):
         pl.read_parquet(tmp_path / "b.parquet")
 
 
+@example([(0, 1), (0, 1), (2, 1), (2, 1)], 1)  # nothing in frame 1
 @given(st.lists(st.tuples(st.integers(-5, 40), st.integers(1, 12)), max_size=8), st.integers(1, 30))
 def test_windows_have_every_frame_of_every_run_once_in_order_of_time(runs, most_rows):
     first, size = np.array(runs, np.int64).reshape(-1, 2).T
