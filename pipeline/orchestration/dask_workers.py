@@ -69,6 +69,7 @@ class DaskWorkers:
         self._places = places
         self._admitted: set[str] = set()
         self._guard = threading.Lock()
+        self._is_closed = False
         self._missing_since: float | None = None
         self._count_slots(client.nthreads().values())
 
@@ -116,7 +117,7 @@ class DaskWorkers:
                 yield pending.pop(future.key), made
         finally:
             if pending:
-                with suppress(Exception):  # a client that is closed has cancelled them, and another error is on its way
+                with suppress(Exception), self._hold_client():  # one that is closed has cancelled them
                     self._client.cancel(futures, force=True)
 
     def _fetch(self, future: Any) -> Any:  # noqa: ANN401  (untyped in distributed; a record, or an exception)
@@ -131,7 +132,8 @@ class DaskWorkers:
                     raise
         if future.status == "cancelled":
             raise self._explain_loss()
-        return future.exception().with_traceback(future.traceback())
+        with self._hold_client():
+            return future.exception(ANSWER_S).with_traceback(future.traceback(ANSWER_S))
 
     def check_workers(self) -> None:
         """Refuse to go on without workers, or with one that has joined and cannot do the work.
@@ -139,9 +141,7 @@ class DaskWorkers:
         Raises:
             WorkersError: as above, or the scheduler is lost.
         """
-        with self._guard:
-            if self._client.status != "running":
-                raise self._explain_loss()
+        with self._hold_client():
             threads = self._ask(self._client.nthreads)
             workers = threads.keys()
             if workers:
@@ -156,6 +156,19 @@ class DaskWorkers:
                 )
             if self._address is not None and workers - self._admitted:
                 self._admitted |= self.refuse_unfit(workers - self._admitted)
+
+    def close(self) -> None:
+        """End batches that go on in other threads: a client that is closed while it is asked never answers."""
+        with self._guard:
+            self._is_closed = True
+
+    @contextmanager
+    def _hold_client(self) -> Iterator[None]:
+        """Keep the client open, for the length of a block."""
+        with self._guard:
+            if self._is_closed or self._client.status != "running":
+                raise self._explain_loss()
+            yield
 
     def _count_slots(self, threads: Collection[int]) -> None:
         """Let the next batches be as large as the cluster is now, which may grow."""
@@ -269,7 +282,10 @@ def open_workers(settings: Settings, places: Collection[Path]) -> Iterator[DaskW
             client.forward_logging("tracklake")  # those of an existing cluster have logs of their own
         else:
             workers.refuse_unfit(client.nthreads().keys(), is_first=True)
-        yield workers
+        try:
+            yield workers
+        finally:
+            workers.close()
 
 
 def _connect(address: str) -> Any:  # noqa: ANN401  (untyped in distributed)

@@ -211,6 +211,7 @@ def test_what_is_queued_is_cancelled_and_a_worker_that_joins_later_is_looked_at(
         while not (tmp_path / "1").exists():
             time.sleep(0.01)
     thread.join(timeout=10)
+    assert len(failed) == 1
     begun = len(list(tmp_path.glob("[0-9]")))
     time.sleep(1.0)
     assert len(list(tmp_path.glob("[0-9]"))) == begun < 8
@@ -222,6 +223,30 @@ def test_what_is_queued_is_cancelled_and_a_worker_that_joins_later_is_looked_at(
     assert f'pip install "tracklake=={version("tracklake")}" "polars=={polars.__version__}"' in failed[1]
     with pytest.raises(WorkersError, match="tracklake is missing"), open_workers(settings, [tmp_path]):
         raise AssertionError
+
+
+def test_the_client_is_not_closed_while_it_is_asked(start, tmp_path):
+    ended = []
+
+    def do(workers: DaskWorkers) -> None:
+        with pytest.raises(WorkersError, match="connection to the scheduler was lost"):
+            list(workers.do("toy", make_calls(toy_calls.wait, *((tmp_path, number) for number in range(8)))))
+        ended.append(workers)
+
+    with open_workers(Settings(runner="dask", dask_address=start()), [tmp_path]) as workers:
+        ask, is_asked = workers._client.nthreads, threading.Event()
+
+        def ask_slowly(**options: Any) -> Any:
+            is_asked.set()
+            time.sleep(0.5)
+            return ask(**options)
+
+        workers._client.nthreads = ask_slowly
+        thread = threading.Thread(target=do, args=(workers,))
+        thread.start()
+        is_asked.wait()
+    thread.join(timeout=20)
+    assert ended == [workers]
 
 
 def test_a_worker_sees_the_lake(start, tmp_path):
