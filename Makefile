@@ -1,5 +1,5 @@
 # make run     environment, generated sample, the whole pipeline to a report
-# make test    every test, property tests with fewer examples than in `make test-thorough`
+# make test    the tests, but for the long ones and most examples, which `make test-thorough` has
 # make test-lowest  the core's tests with the lowest versions that pyproject.toml admits
 # make lint    ruff, types, import rules
 # make bench   what is claimed about speed and memory

@@ -6,6 +6,10 @@ from lake_sources import EXCERPTS, SAME_BITS, SAMPLE
 
 os.environ |= SAME_BITS  # before anything imports NumPy
 
+from tracklake.pipeline.cli.memory import keep_freed_memory
+
+keep_freed_memory()  # as each command does, before anything imports Polars
+
 import gc
 import http.client
 import json
@@ -45,12 +49,14 @@ settings.register_profile("tracklake", max_examples=50, deadline=None, suppress_
 settings.load_profile("tracklake")
 
 
-QUICK_SHARE, LEAST_EXAMPLES = 0.4, 6
+QUICK_SHARE, LEAST_EXAMPLES = 0.25, 6
 """Share of the examples that a property test asks for which are drawn without --thorough, and the fewest drawn."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--thorough", action="store_true", help="draw all the examples that property tests ask for")
+    parser.addoption(
+        "--thorough", action="store_true", help="every test, and all the examples that property tests ask for"
+    )
 
 
 def reduce_examples(test: Callable[..., object]) -> None:
@@ -330,7 +336,10 @@ def choose_group(item: pytest.Item) -> str:
     used = set(getattr(item, "fixturenames", ()))
     if used & {"prefect_server", "sample", "lake"}:
         return "lake"
-    return "excerpts" if "excerpts_lake" in used else item.nodeid.partition("::")[0]
+    for shared, group in (("excerpts_lake", "excerpts"), ("object_store_server", "bucket")):
+        if shared in used:
+            return group
+    return item.nodeid.partition("::")[0]
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the markers
@@ -338,6 +347,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not config.getoption("--thorough"):
         for test in {item.obj for item in items if getattr(getattr(item, "obj", None), "is_hypothesis_test", False)}:
             reduce_examples(test)
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
     for item in items:
         item.add_marker(pytest.mark.xdist_group(choose_group(item)))
     # A server costs a tenth of a processor while it waits: the files that need it come last.

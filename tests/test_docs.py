@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from lake_sources import SAMPLE
 from simulated import simulate_once
 
 from tracklake.quality_reports.gates.markdown import write_gates
@@ -33,12 +32,12 @@ def newcomer(command, lake, sample, tmp_path):
 
 SHORTER = {
     "--seconds 60": "--seconds 1",
-    "--minutes 0.2 --seed 3": " ".join([*SAMPLE, "--format", "ngsim-text"]),
     "--examples 1000": "--examples 200",
 }
 """Options of the README's commands with shorter ones; the sample is that of the session, simulated already."""
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("plain_flows")
 def test_the_commands_of_the_readme_run_as_printed(newcomer):
     """One after the other, as a reader types them: later ones need what earlier ones made.

@@ -36,7 +36,9 @@ def workplace(lake, sample, tmp_path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("examples", [PAGE, CELLS], ids=["page", "notebook"])
+@pytest.mark.parametrize(
+    "examples", [pytest.param(PAGE, id="page"), pytest.param(CELLS, id="notebook", marks=pytest.mark.thorough)]
+)
 def test_the_examples_run(workplace, command, examples, monkeypatch):
     monkeypatch.chdir(workplace)
     monkeypatch.setattr(os, "environ", command.environment)

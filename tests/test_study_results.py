@@ -207,6 +207,7 @@ def test_losses_are_drawn_by_model_and_phase_and_prices_by_their_intervals():
     assert re.findall(r'<line [^>]*stroke="([^"]+)" stroke-width="2"', svg) == [ORANGE, BLUE]
 
 
+@pytest.mark.thorough
 def test_committed_pages_are_those_of_the_committed_tables():
     results = Results.read(DOCS)
     pages = render_pages(results)

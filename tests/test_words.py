@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -15,18 +15,18 @@ UNWANTED = re.compile(r"\b(nobody|told|odds|(?<!--)anew|whoever|in vain|passed o
 SILENCED = re.compile(r"# (?:noqa(?:: [A-Z0-9, ]+)?|type: ignore(?:\[[\w-]+\])?) *(.*)")
 
 
-def list_docstrings(source: str) -> Iterator[tuple[int, str]]:
+def list_docstrings(nodes: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
     """Line and text of the docstrings of modules, classes and functions."""
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             text = ast.get_docstring(node)
             if text is not None:
                 yield getattr(node, "lineno", 1), text
 
 
-def list_constant_texts(source: str) -> Iterator[tuple[int, str]]:
+def list_constant_texts(nodes: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
     """Line and text of the strings that document constants and attributes."""
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         if isinstance(node, ast.Module | ast.ClassDef):
             for before, after in zip(node.body, node.body[1:], strict=False):
                 match before, after:
@@ -36,14 +36,16 @@ def list_constant_texts(source: str) -> Iterator[tuple[int, str]]:
 
 def find_faults(source: str) -> list[str]:
     """What a reader could not understand by itself, with its line."""
+    nodes = list(ast.walk(ast.parse(source)))
+    docstrings = list(list_docstrings(nodes))
     short = [
         f"{line}: fewer than four words: {text.splitlines()[0]}"
-        for line, text in list_docstrings(source)
+        for line, text in docstrings
         if len(text.splitlines()[0].split()) < 4
     ]
     fragments = [
         f"{line}: a fragment: {text.splitlines()[0]}"
-        for line, text in (*list_constant_texts(source), *list_docstrings(source))
+        for line, text in (*list_constant_texts(nodes), *docstrings)
         if FRAGMENT.match(text)
     ]
     return short + fragments

@@ -126,27 +126,40 @@ ALONE = {
 }
 MOVED = tuple(replace(own, seeds=5, source=KRAUSS, label=f"{own.model}, of Krauss") for own in (LSTM, V_LSTM, CS_LSTM))
 CLEAN = generate("varied-idm", 0, "The same traffic without any defect.", "--defect", "late_start", "--dose", "0")
-DOSED = ("late_start", "frame_gap", "position_jump", "second_track", "acceleration_spike")
-"""Defects that are injected, each alone."""
+DOSED = ("late_start", "frame_gap", "position_jump", "second_track")
+"""Defects that are injected, each alone, and whose price is measured for two networks."""
+DOSED_ONCE = ("overlap", "early_end", "backward")
+"""Those whose price is measured for the one that learns fast."""
+CONTROL = "acceleration_spike"
+"""Defect that moves no position: its reconstructed tracks show what reconstruction does without one to repair."""
+UNSEEN = (
+    *("acceleration_spike", "frozen_slow_speed", "hard_braking", "sideways_speed", "size_change"),
+    *("wrong_headway", "wrong_leader", "lane_flicker"),
+)
+"""Defects that move no position and remove no entry, so that networks without neighbors learn the same; tested."""
 DOSE = 0.2
 """Share of the vehicles that get a defect."""
 REPAIRED = {"TRACKLAKE_RECONSTRUCT": "true", "TRACKLAKE_TRACKS_FROM": "reconstructed"}
 CLEANLY = (Learner("v-lstm", 5, 12_500), Learner("lstm", 5, 25_000))
 """Networks that are trained on traffic with and without defects: one with a density, and one that learns fast."""
+
+
+def damage(own: Learner, defect: str) -> tuple[Learner, ...]:
+    """Train on traffic with a defect, and on its reconstructed tracks; of the control on the latter alone."""
+    label = f"{own.model}, {defect} {DOSE:.0%}"
+    source = generate("varied-idm", 0, "", "--defect", defect, "--dose", str(DOSE))
+    repaired = replace(own, label=f"{label}, reconstructed", source=source, settings=REPAIRED)
+    return (repaired,) if defect == CONTROL else (replace(own, label=label, source=source), repaired)
+
+
 DAMAGED = tuple(
-    replace(
-        own,
-        label=f"{own.model}, {defect} {DOSE:.0%}{title}",
-        source=generate("varied-idm", 0, "", "--defect", defect, "--dose", str(DOSE)),
-        settings=settings,
-    )
-    for own in CLEANLY
-    for defect in DOSED
-    for title, settings in (("", {}), (", reconstructed", REPAIRED))
+    each
+    for own, more in zip(CLEANLY, ((), DOSED_ONCE), strict=True)
+    for defect in (*DOSED, *more, CONTROL)
+    for each in damage(own, defect)
 )
 RESTORED = tuple(own for own in DAMAGED if own.settings)
-CONTROLS = tuple(own for own in RESTORED if "acceleration_spike" in own.name)
-"""Reconstructed tracks of a defect that moves no position: what reconstruction does without one to repair."""
+CONTROLS = tuple(own for own in RESTORED if CONTROL in own.name)
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
 FOREST = Arm("forest", IDM, (), (), protocol="grid-2021", settings={"TRACKLAKE_RECONSTRUCT": "false"})
 FOREST_TEXT = (
@@ -335,9 +348,10 @@ PIECES = (
         6,
         "The price of defects",
         "One defect of a fifth of the vehicles in otherwise clean traffic; networks are trained on it, or on its "
-        "reconstructed tracks, and scored on the same traffic without defects. Reconstruction smooths what a network "
-        "learns from, and not what it is scored on. So reconstructed tracks are compared with those of a defect that "
-        "moves no position, `acceleration_spike`, too: networks read positions alone.",
+        "reconstructed tracks, and scored on the same traffic without defects. The generator's other defects "
+        f"({', '.join(f'`{each}`' for each in UNSEEN)}) move no position and remove no entry: these networks learn the "
+        "same with them as without. Reconstruction smooths what a network learns from, and not what it is scored on. "
+        f"So reconstructed tracks are compared with those of `{CONTROL}`, too, which leaves nothing to repair.",
         (
             replace(
                 GENERATED,

@@ -150,6 +150,7 @@ def is_fixed(file):
     return file.path.startswith((".files", "tensors"))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("plain_flows", "empty_charts")
 def test_every_command_gives_at_an_address_what_it_gives_in_a_folder(machine, bucket, tmp_path):
     folder = tmp_path / "lake"

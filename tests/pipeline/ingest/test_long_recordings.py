@@ -142,7 +142,7 @@ def test_the_corridor_has_what_slices_could_spoil(whole):
     assert whole[SPLIT_LEFT_OUT].height > 0
 
 
-@pytest.mark.parametrize("entries", [1, 2_001])
+@pytest.mark.parametrize("entries", [pytest.param(1, marks=pytest.mark.thorough), 2_001])
 def test_slices_have_the_tables_of_the_whole(corridor, undivided, whole, tmp_path, entries):
     root = make_lake(corridor, tmp_path / "lake", entries)
     made = read_tables(root)

@@ -12,8 +12,11 @@ from small_lake import Nursery, check_folder, check_lake, find_files, write_roun
 
 from tracklake.pipeline.lake import is_settled, load
 
-STRIDE = 14
-"""Steps of a session from one death to the next; 1 is thorough and takes half a minute."""
+
+@pytest.fixture
+def stride(request: pytest.FixtureRequest) -> int:
+    """Steps of a session from one death to the next; 1 takes half a minute."""
+    return 14 if request.config.getoption("--thorough") else 28
 
 
 @pytest.fixture
@@ -28,17 +31,17 @@ def nursery(root: Path) -> Iterator[Nursery]:
     made.close()
 
 
-def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nursery: Nursery):
+def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nursery: Nursery, stride: int):
     for number in range(3):
         write_round(root, number)
     step, number, deaths = 0, 3, 0
     while nursery.ask(f"die {number} {step}") == signal.SIGKILL:
         check_lake(root)
-        assert not is_settled(root, load(root)) or step < STRIDE
+        assert not is_settled(root, load(root)) or step < stride
         deaths += 1
         if deaths % 3 == 0:  # three deaths on top of each other, then one session that ends
             write_round(root, number + 1)
-        step, number = step + STRIDE, number + 2
+        step, number = step + stride, number + 2
     check_lake(root)
     check_folder(root, linked=True)
     assert is_settled(root, load(root))
@@ -47,11 +50,11 @@ def test_a_death_at_any_step_of_a_session_leaves_a_whole_lake(root: Path, nurser
     assert load(root).commits["validate/highd/01-upper"].info["number"] == number
 
 
-def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nursery: Nursery):
+def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nursery: Nursery, stride: int):
     """The same fingerprints again and again: what an earlier death left is used where whole, and made where not."""
     write_round(root, 0)
-    for step in range(0, 150, STRIDE):
-        nursery.ask(f"die {1 + step // STRIDE % 3} {step}")
+    for step in range(0, 150, stride):
+        nursery.ask(f"die {1 + step // stride % 3} {step}")
         check_lake(root)
     write_round(root, 2)
     check_lake(root)
@@ -59,6 +62,7 @@ def test_deaths_of_sessions_that_are_all_the_same_are_resumed(root: Path, nurser
     assert [Path(file.path).name for file in entry.files["tensors"]] == ["files.json", "y.bin", "x.bin"]
 
 
+@pytest.mark.thorough
 def test_deaths_at_random_moments(root: Path, nursery: Nursery):
     write_round(root, 0)
     began = time.perf_counter()

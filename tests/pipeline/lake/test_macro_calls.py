@@ -80,7 +80,16 @@ def counts(opened: LakeConnection) -> dict[str, dict[str, int]]:
 
 
 @pytest.mark.parametrize("name", CALLS)
-@pytest.mark.parametrize("alias", ["subsets", "entry", "asked", "tracks", "recording", "follower", "vehicle"])
+@pytest.mark.parametrize(
+    "alias",
+    [
+        *("subsets", "entry"),
+        *(
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in ("asked", "tracks", "recording", "follower", "vehicle")
+        ),
+    ],
+)
 def test_arguments_may_be_columns_whatever_their_table_is_called(opened: LakeConnection, counts, name: str, alias: str):
     """Never taken for a column of the macro's own tables, which would give every subset's rows for each."""
     for argument in (f'"{alias}".subset', "subset"):

@@ -92,7 +92,10 @@ def check_settled(root: Path) -> None:
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("work", [run_first, change, prune, rebuild, change_nothing])
-def test_a_death_at_any_step_is_noticed_and_mended(tmp_path: Path, work: Callable[[Path], None]):
+def test_a_death_at_any_step_is_noticed_and_mended(
+    tmp_path: Path, work: Callable[[Path], None], request: pytest.FixtureRequest
+):
+    stride = 1 if request.config.getoption("--thorough") else 3
     before, root = tmp_path / "before", tmp_path / "lake"
     if work is not run_first:
         for number in (2, 3, 4):  # so that there is something to delete, too
@@ -118,9 +121,9 @@ def test_a_death_at_any_step_is_noticed_and_mended(tmp_path: Path, work: Callabl
             settled.append(step)
         change_nothing(root)
         check_settled(root)
-        step += 1
+        step += stride
     check_settled(root)
-    assert done[0] == step
+    assert step - stride < done[0] <= step
     assert step >= (8 if work is change_nothing else 20)
     assert all(early <= 1 for early in settled), "after the first changes, nothing is settled until the end"
 

@@ -28,6 +28,7 @@ def wait_for(find, process, seconds: float = 90):
     raise AssertionError(process.communicate(timeout=5)[0] if process.poll() is not None else "too slow")
 
 
+@pytest.mark.thorough
 def test_a_scheduled_run_on_a_changed_folder(command, tmp_path):
     watched, root = tmp_path / "watched", tmp_path / "lake"
     watched.mkdir()

@@ -54,6 +54,7 @@ def read_all(root: Path) -> dict[str, pl.DataFrame]:
     return {table.name: tables[table.name].select(*table.dtypes) for table in TABLES}
 
 
+@pytest.mark.thorough
 def test_a_killed_run_leaves_whole_tables_and_the_next_run_does_the_rest(
     command, raw, undisturbed, prefect_home, tmp_path
 ):

@@ -54,7 +54,11 @@ def test_tables_of_slices_are_those_of_the_whole(lake, stage, values, dataset, s
 
 @pytest.mark.parametrize(
     ("tracks_from", "storage"),
-    [("recorded", "int16-decimetres"), ("reconstructed", "float32"), ("filtered", "float32")],
+    [
+        ("recorded", "int16-decimetres"),
+        pytest.param("reconstructed", "float32", marks=pytest.mark.thorough),
+        pytest.param("filtered", "float32", marks=pytest.mark.thorough),
+    ],
 )
 def test_tensors_of_slices_are_those_of_the_whole(lake, tmp_path, tracks_from, storage):
     def write(name, **values):

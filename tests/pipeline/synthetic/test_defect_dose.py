@@ -7,7 +7,9 @@ import numpy as np
 import polars as pl
 import pytest
 from lake_sources import SAMPLE
+from raw_texts import read_highd
 from simulated import simulate_once
+from study.pieces import UNSEEN
 from test_sample_defects import damage
 
 from tracklake.pipeline.synthetic import DOSED, write_sample
@@ -59,6 +61,32 @@ def test_samples_differ_by_the_dose_alone_and_say_what_was_reached(tmp_path):
     rows = pl.read_parquet(tmp_path / "clean" / "truth.parquet").filter(kind="rows", name="malformed")
     assert rows["entries"].sum() == 0
     assert "only frame_gap, of 0.2 of the vehicles" in (tmp_path / "dosed" / "README.md").read_text()
+
+
+def read_positions(out, **defect):
+    """What networks without neighbors learn from: positions by vehicle and frame."""
+    with simulate_once():
+        made = write_sample(out, formats=("highd",), minutes=float(SAMPLE[1]), seed=int(SAMPLE[3]), **defect)
+    found = {}
+    for number in ("01", "02", "03"):
+        files = [out / f"{number}_{kind}.csv" for kind in ("recordingMeta", "tracksMeta", "tracks")]
+        for subset in read_highd(files, number).subsets:
+            tracks = subset.tracks.select("vehicle_id", "frame", "x_m", "y_m")
+            found[subset.name] = tracks.sort("vehicle_id", "frame")
+    return made.dose, found
+
+
+@pytest.mark.thorough
+def test_networks_are_not_given_what_these_defects_change(tmp_path):
+    """The study says so of them, and trains on others."""
+    _, clean = read_positions(tmp_path / "clean", defect="frame_gap", dose=0.0)
+    same = set()
+    for name in DOSED:
+        reached, dosed = read_positions(tmp_path / name, defect=name, dose=1.0)
+        assert reached > 0.1, name
+        if all(dosed[subset].equals(tracks) for subset, tracks in clean.items()):
+            same.add(name)
+    assert same == set(UNSEEN)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from recorded import make_facts, make_vehicles
@@ -66,6 +66,7 @@ def read_by(tracks, at_once):
     at_once=st.integers(1, 900),
     has_lanes=st.booleans(),
 )
+@settings(max_examples=20)  # each reconstructs twice
 def test_shares_are_those_of_the_whole(tmp_path_factory, seed, vehicles_at_once, at_once, has_lanes):
     tracks = drive_platoons(seed)
     tracks = tracks if has_lanes else tracks.with_columns(lane=pl.lit(None, pl.Int16))
