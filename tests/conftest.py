@@ -54,9 +54,7 @@ QUICK_SHARE, LEAST_EXAMPLES = 0.25, 6
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--thorough", action="store_true", help="every test, and all the examples that property tests ask for"
-    )
+    parser.addoption("--thorough", action="store_true", help="every test, with all examples of property tests")
 
 
 def reduce_examples(test: Callable[..., object]) -> None:

@@ -78,7 +78,7 @@ def read_positions(out, **defect):
 
 @pytest.mark.thorough
 def test_networks_are_not_given_what_these_defects_change(tmp_path):
-    """The study says so of them, and trains on others."""
+    """The study says so of them, and trains on others: a wrong speed turns a vehicle and moves its front."""
     _, clean = read_positions(tmp_path / "clean", defect="frame_gap", dose=0.0)
     same = set()
     for name in DOSED:

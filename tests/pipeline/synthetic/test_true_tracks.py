@@ -64,7 +64,7 @@ def test_shortest_tracks(rows):
 
 @pytest.fixture(scope="module")
 def exact(sample, tmp_path_factory) -> Path:
-    """The session's sample without noise; its defects remain. Counts of what rules find are left out: they take long."""
+    """The session's sample without noise; its defects remain. What rules find is not counted."""
     del sample
     out = tmp_path_factory.mktemp("exact") / "raw"
     minutes, seed = float(SAMPLE[1]), int(SAMPLE[3])
