@@ -58,7 +58,7 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
     """
     titles = {
         "leakage": "RMSE beside constant velocity's at 5 s, csp-2018 minus time-blocks: leakage and other traffic",
-        "defects": "Defects of a fifth of the vehicles: RMSE at 5 s, minus that without; reconstructed against reconstructed",
+        "defects": "Defects of a fifth of the vehicles: RMSE at 5 s, minus that without (both reconstructed or not)",
     }
     panels = []
     for price, title in titles.items():

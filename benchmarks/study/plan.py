@@ -105,7 +105,7 @@ SPEEDS = {
     "attention-h4": 4_000,
 }
 """Samples (of attention: scenes) that a training takes in a second on one thread, measured on two idle cores."""
-OVERHEAD_S, LAKE_S = 7.0, 40.0
+OVERHEAD_S, LAKE_S = 7.0, 36.0
 """Seconds of a run besides its training (starts, scores), and of making a lake."""
 QUICK_MODELS = 4
 """Models of an arm of the quick study."""
