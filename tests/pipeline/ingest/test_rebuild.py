@@ -73,6 +73,7 @@ def test_every_command_refuses_it_with_the_command_that_rebuilds_it(command, mad
     assert (old / "manifest.json").read_bytes() == before
 
 
+@pytest.mark.catalog
 def test_it_is_rebuilt_by_that_command_under_its_readers(command, made, old, monkeypatch):
     lake_id = json.loads((old / "manifest.json").read_text())["lake_id"]
     standing = {*old.glob(".files/**/*.parquet"), *old.glob("trax/**/*.parquet")}

@@ -100,6 +100,7 @@ def test_tables_of_removed_files_stay_and_are_named_in_one_note(command, ingest,
     assert counted(root) == dict.fromkeys(("01", "02", "03", "04", "05"), ENTRIES)
 
 
+@pytest.mark.catalog
 def test_prune_removes_every_stages_tables_and_the_whole_lakes_are_made_again(command, ingest, copy, monkeypatch):
     raw, root = copy
     drop(raw, "03")
@@ -302,6 +303,7 @@ def test_a_mistyped_folder_prunes_nothing(command, ingest, tmp_path):
     assert (root / "manifest.json").read_bytes() == before
 
 
+@pytest.mark.catalog
 def test_remove_takes_recordings_by_name(command, ingest, copy, tmp_path):
     raw, root = copy
     before = (root / "manifest.json").read_bytes()

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import duckdb
 import pytest
+from plain_catalogs import list_live
 from small_lake import DEADLY, check_folder, find_files, make_status, put, put_round, write_round
 
-from tracklake.pipeline.lake import Manifest, Writer, catalog, is_settled, load, open_for_writing
+from tracklake.pipeline.lake import Writer, catalog, is_settled, load, open_for_writing
 from tracklake.schemas.files import list_unfinished
 
 ANOTHER = {"dataset": "highd", "subset": "02-upper"}
@@ -22,10 +23,6 @@ class Died(BaseException):
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A catalog that DuckDB need not make, and nothing synced: only the order of steps is looked at."""
-
-    def list_live(_root: Path, manifest: Manifest) -> bytes:
-        return "\n".join(sorted(manifest.live_paths())).encode()
-
     monkeypatch.setattr(catalog, "build_catalog", list_live)
     monkeypatch.setattr(os, "fsync", lambda _descriptor: None)
 

@@ -257,6 +257,7 @@ def test_a_worker_sees_the_lake(start, tmp_path):
         list(workers.do("toy", make_calls(toy_calls.add, (1, 2))))
 
 
+@pytest.mark.thorough
 def test_workers_elsewhere_need_the_address_of_a_lake_on_an_object_store_and_the_raw_files(
     start, raw, bucket, tmp_path
 ):

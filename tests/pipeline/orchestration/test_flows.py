@@ -285,6 +285,7 @@ def wait_for_tasks(root: Path, wanted: set[str]) -> set[str]:
     return seen
 
 
+@pytest.mark.thorough
 def test_tasks_and_the_report_are_seen_by_the_server_that_prefect_api_url_names(command, sample, tmp_path):
     raw = tmp_path / "raw"
     raw.mkdir()
