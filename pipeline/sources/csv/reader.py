@@ -166,6 +166,7 @@ def _is_sound(layout: Layout) -> pl.Expr:
     # Only the line parser strips blanks around a text. Texts with given choices have none: they are compared above.
     free = [name for name, dtype in layout.dtypes.items() if dtype == pl.String() and name not in layout.choices]
     sound += [~pl.col(name).ne_missing(pl.col(name).str.strip_chars()).any() for name in free]
+    sound += [~(pl.col(name) == "").any() for name in free]  # an empty field in quotes, which is empty like any other
     return pl.all_horizontal(sound)
 
 

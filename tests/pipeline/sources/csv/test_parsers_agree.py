@@ -86,8 +86,10 @@ def test_what_is_accepted_at_once_is_accepted_line_by_line(case, data):
 @given(data=st.just(",".join(ROW_RECORDING).encode()))
 @example(data=",".join([*ROW_RECORDING[:-1], ROW_RECORDING[-1] + " "]).encode())
 @example(data=",".join([*ROW_RECORDING[:-2], " ", ROW_RECORDING[-1]]).encode())
+@example(data=",".join([*ROW_RECORDING[:-2], '""', ROW_RECORDING[-1]]).encode())
+@example(data=",".join('""' if cell == "Tue" else cell for cell in ROW_RECORDING).encode())
 @settings(max_examples=1, deadline=None)
-def test_blanks_around_a_text_do_not_depend_on_the_parser(data):
+def test_blanks_and_quotes_around_a_text_do_not_depend_on_the_parser(data):
     check(data, CASES["recording"][0])
 
 
