@@ -6,8 +6,9 @@ from lake_sources import EXCERPTS, SAME_BITS, SAMPLE
 
 os.environ |= SAME_BITS  # before anything imports NumPy
 
-from tracklake.pipeline.cli.memory import keep_freed_memory
+from tracklake.pipeline.cli.memory import collect_seldom, keep_freed_memory
 
+collect_seldom()
 keep_freed_memory()  # as each command does, before anything imports Polars
 
 import gc

@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from tracklake.pipeline.cli.logs import choose_file, choose_verbose
-from tracklake.pipeline.cli.memory import keep_freed_memory
+from tracklake.pipeline.cli.memory import collect_seldom, keep_freed_memory
 from tracklake.pipeline.cli.streams import guard_streams
 
 COMMANDS = {
@@ -168,6 +168,7 @@ def _read_global_options(
 def main() -> None:
     """Entry point of the `tracklake` command."""
     keep_freed_memory()
+    collect_seldom()
     guard_streams()
     app()
 
