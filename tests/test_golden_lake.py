@@ -25,6 +25,7 @@ def test_the_lake_of_the_sample_is_as_before(sample, lake, run, tmp_path):
     check("sample", digest_lake(sample, lake.root, run, tmp_path))
 
 
+@pytest.mark.thorough
 def test_the_lake_of_the_real_excerpts_is_as_before(excerpts_lake, run, tmp_path):
     check("excerpts", digest_lake(EXCERPTS, excerpts_lake.root, run, tmp_path))
 

@@ -85,6 +85,7 @@ def tiny(command, tmp_path_factory, plain_flows):  # noqa: ARG001  (a fixture ca
     return workshop, docs, calls
 
 
+@pytest.mark.thorough
 def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     workshop, docs, _ = tiny
     seeds = read_table(docs, "seeds").filter(group="all", dataset="all")
@@ -123,6 +124,7 @@ def test_a_tiny_study_has_every_seed_and_the_digests_of_its_tensors(tiny):
     assert found["low"] <= found["difference"] <= found["high"]
 
 
+@pytest.mark.thorough
 def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tiny):
     workshop, docs, calls = tiny
     calls.clear()
@@ -137,6 +139,7 @@ def test_a_finished_study_trains_nothing_again_and_a_new_seed_alone_is_added(tin
     assert len(select_complete(jobs, 2)) == 6  # a seed that lacks a fold is left out
 
 
+@pytest.mark.thorough
 def test_a_run_with_other_defaults_than_now_is_made_again(tiny, tmp_path, monkeypatch):
     workshop, _, _ = tiny
     said = []
@@ -157,6 +160,7 @@ def test_a_run_with_other_defaults_than_now_is_made_again(tiny, tmp_path, monkey
     assert sum("--evidence" in words for words in said) == 4  # of the first seed alone
 
 
+@pytest.mark.thorough
 def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_path, monkeypatch):
     workshop, _, _ = tiny
     arm = replace(TINY, name="woods", plain=(), learners=(), folds=(0,), forest=("--as-published",), pairs=())
@@ -202,6 +206,7 @@ def test_forests_are_scored_once_and_their_page_marks_what_differs(tiny, tmp_pat
     assert read_table(docs, "lakes")["arm"].to_list() == ["woods"]
 
 
+@pytest.mark.thorough
 def test_pages_of_a_study_print_its_digests_and_call_nothing_better_without_an_interval(tiny, monkeypatch):
     _, docs, _ = tiny
     piece = replace(PIECES[0], name="tiny", arms=(TINY,))

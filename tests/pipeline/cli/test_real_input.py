@@ -28,6 +28,7 @@ def test_peachtree_becomes_a_lake_and_says_what_was_left_out(command, tmp_path):
     assert "peachtree-1600-south" in (tmp_path / "lake" / "reports" / "index.html").read_text()
 
 
+@pytest.mark.thorough
 def test_all_excerpts_at_once(command, excerpts_lake):
     said = excerpts_lake.said
     # 1,005 + 1,999 + 10,000 + 38 + 155,604 rows, and 5,000 of the portal's once more in another dialect, which are
