@@ -37,11 +37,11 @@ from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
+from tracklake.schemas.published_results import published_rows
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
 from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
-from tracklake.training.evaluation.published import published_rows
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster

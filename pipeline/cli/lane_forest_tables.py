@@ -6,8 +6,8 @@ from typing import Any
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.schemas.protocols import V2V
+from tracklake.schemas.published_results import CELL_ACCURACY, CELL_ACCURACY_S
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S
 from tracklake.training.lane_changes.examples import ALL
 from tracklake.training.lane_changes.forest import LaneForest
 from tracklake.training.lane_changes.scores import SIZES, CellScore, GridScores, LearningPoint

@@ -7,9 +7,9 @@ import pytest
 
 from tracklake.quality_reports.rules.registry import RULES
 from tracklake.schemas.protocols import MEANINGS
+from tracklake.schemas.published_results import PUBLISHED
 from tracklake.schemas.references import HAMALAINEN, REFERENCES, find_references, link_references
 from tracklake.schemas.references_markdown import write_references
-from tracklake.training.evaluation.published import PUBLISHED
 from tracklake.training.models import MODELS
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -7,7 +7,7 @@ import numpy as np
 
 from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.protocols import V2V
-from tracklake.training.evaluation.published import CELL_ACCURACY, CELL_ACCURACY_S, CHOI_2021, PUBLISHED
+from tracklake.schemas.published_results import CELL_ACCURACY, CELL_ACCURACY_S, CHOI_2021, PUBLISHED
 from tracklake.training.evaluation.scores import find_nll
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, number_cells
 from tracklake.training.lane_changes.examples import ALL, STRATA

@@ -4,7 +4,7 @@ import pytest
 
 from tracklake.schemas.evaluations import EVALUATIONS, FIGURES
 from tracklake.schemas.protocols import PROTOCOLS
-from tracklake.training.evaluation.published import (
+from tracklake.schemas.published_results import (
     CELL_ACCURACY,
     CELL_ACCURACY_S,
     CHOI_2021,
