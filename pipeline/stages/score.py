@@ -12,6 +12,7 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.documents import read_json
+from tracklake.schemas.tensor_index import read_index
 from tracklake.schemas.tensors import INDEX_FILE
 
 BASELINE = "constant-velocity"
@@ -56,7 +57,6 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
 
     `skip` is called with a message for each run that is damaged or of another version.
     """
-    from tracklake.training.data.checks import read_index
     from tracklake.training.runs.run_folder import StaleRunError, read_config
 
     commit = manifest.commits.get(TENSORS)

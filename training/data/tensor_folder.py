@@ -13,9 +13,10 @@ from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import PARTS, SEVERITIES
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.tensor_index import TensorError, read_index, read_protocol
 from tracklake.schemas.tensors import ARRAYS, LANE_CENTRES, NOMINAL_LANE_M, STEPS_M
 from tracklake.training.data.batches import Batch, SceneBatch
-from tracklake.training.data.checks import TensorError, map_arrays, read_index, read_protocol
+from tracklake.training.data.checks import map_arrays
 from tracklake.training.data.gathers import check_numbers, find_runs, gather_samples, gather_scenes
 
 if TYPE_CHECKING:

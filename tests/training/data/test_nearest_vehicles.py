@@ -11,7 +11,7 @@ from tensor_loop import BY_VEHICLE, IN_TIME, UNDIVIDED, F, H, block_of, loop_ove
 from tensor_tables import CLOCK, TINY, sample_everything, sizes_of, split_row, write
 
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.data.checks import TensorError
+from tracklake.schemas.tensor_index import TensorError
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder

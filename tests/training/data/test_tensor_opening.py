@@ -12,8 +12,7 @@ from tensor_tables import TINY, drive, sample_everything, split_row, write
 
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import FileAccessError
-from tracklake.schemas.tensors import ARRAYS, INDEX_FILE, INDEX_KEYS, SUBSET_KEYS
-from tracklake.training.data.checks import KINDS
+from tracklake.schemas.tensors import ARRAYS, INDEX_FILE
 from tracklake.training.data.tensor_folder import TensorError, TensorFolder
 
 
@@ -163,10 +162,6 @@ def test_samples_of_no_part_are_refused(tmp_path):
     set_value("sample_part", 0, 9)(tmp_path)
     with pytest.raises(TensorError, match=r"`sample_part`: expected 0 to 2, got 9 \(1 samples of no part\); run"):
         TensorFolder.open(tmp_path)
-
-
-def test_every_kind_that_is_declared_is_known():
-    assert {*INDEX_KEYS.values(), *SUBSET_KEYS.values()} == set(KINDS)
 
 
 def test_steps_that_do_not_fit_the_error_are_refused(tmp_path):
