@@ -10,7 +10,7 @@ from pathlib import Path
 import altair as alt
 
 from tracklake.schemas.chart_theme import BLUE, GREEN, ORANGE
-from tracklake.training.plots.charts import Drawing, Row, fix_scale
+from tracklake.schemas.drawings import Drawing, Row, fix_scale
 
 ERRORS_DEG = (0.5, 1.0, 2.0)
 """Heading errors that are drawn, in degrees."""

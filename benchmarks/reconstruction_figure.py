@@ -8,7 +8,7 @@ from reconstruction_data import Recording, apply_reconstruction
 
 from tracklake.pipeline.transforms.reconstruction.config import ReconstructionConfig
 from tracklake.schemas.chart_theme import BLUE, INK, ORANGE
-from tracklake.training.plots.charts import Drawing, Row
+from tracklake.schemas.drawings import Drawing, Row
 
 SERIES = {"recorded": (ORANGE, [2, 2]), "true": (INK, [7, 4]), "reconstructed": (BLUE, [1, 0])}
 """Colours and dashes by series."""

@@ -7,8 +7,8 @@ import polars as pl
 from study_onboard_scores import LEAST_VEHICLES
 
 from tracklake.schemas.chart_theme import BLUE, ORANGE
+from tracklake.schemas.drawings import Drawing
 from tracklake.training.onboard.scores import RESAMPLES
-from tracklake.training.plots.charts import Drawing
 
 NEAR_M = 100.0
 """Distance along the road, either way, within which vehicles are judged."""

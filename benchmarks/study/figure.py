@@ -6,7 +6,7 @@ import altair as alt
 import polars as pl
 
 from tracklake.schemas.chart_theme import AMBER, BLUE, GREEN, INK, ORANGE, PURPLE, SKY
-from tracklake.training.plots.charts import Drawing
+from tracklake.schemas.drawings import Drawing
 
 PALETTE = (INK, AMBER, BLUE, ORANGE, GREEN, PURPLE, SKY)
 DASHES: tuple[list[int], ...] = ([1, 0], [8, 4], [2, 3])

@@ -8,9 +8,9 @@ from typing import Any
 import altair as alt
 
 from tracklake.schemas.chart_theme import BLUE, GREEN, INK, MUTED, ORANGE, PAPER, PURPLE
+from tracklake.schemas.drawings import Drawing, Layers, fix_scale, name_rows
 from tracklake.schemas.errors import UsageError
 from tracklake.training.plots import picture_rows
-from tracklake.training.plots.charts import Drawing, Layers, fix_scale, name_rows
 from tracklake.training.plots.picture import Picture
 
 MODEL_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)

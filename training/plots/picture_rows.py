@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from tracklake.schemas.arrays import Floats
-from tracklake.training.plots.charts import Row
+from tracklake.schemas.drawings import Row
 from tracklake.training.plots.picture import Alternative, Forecast, Picture, Vehicle
 
 UNKNOWN_SIZE_M = (4.5, 1.8)

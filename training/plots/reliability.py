@@ -4,7 +4,7 @@ import altair as alt
 import polars as pl
 
 from tracklake.schemas.chart_theme import BLUE, MUTED
-from tracklake.training.plots.charts import Drawing, fix_scale, name_rows
+from tracklake.schemas.drawings import Drawing, fix_scale, name_rows
 
 SIZE = 220
 """Width and height of a panel, in pixels."""

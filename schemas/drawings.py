@@ -1,4 +1,4 @@
-"""Charts of training as files: SVG or PNG, the same bytes for the same chart, without anything to fetch."""
+"""Charts as files: SVG or PNG, the same bytes for the same chart, without anything to fetch."""
 
 import re
 from dataclasses import dataclass
