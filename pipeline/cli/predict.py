@@ -1,8 +1,9 @@
 """`tracklake predict`: samples drawn on the road with their truth and the models' predictions."""
 
-from enum import StrEnum
+import json as json_format
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,19 +11,22 @@ from tracklake.pipeline.cli.command import command, read_settings
 from tracklake.pipeline.cli.comparability import print_lane_centres
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, require_choice
+from tracklake.pipeline.cli.sample_choice import MOST_SEARCHED, Pick, find_sample, pick_samples
 from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.extras import require_extras
-from tracklake.schemas.files import write_output
+from tracklake.schemas.files import write_file, write_output
 from tracklake.schemas.origin import describe_synthetic
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.picture import Picture, forecast_samples, forecast_scene, take_picture
-from tracklake.training.plots.sample_choice import MOST_SEARCHED, find_sample, pick_samples
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
+
+if TYPE_CHECKING:
+    from tracklake.training.models.attention import SceneAttention
 
 FOLDER = "predictions"
 """Folder of the lake with the drawings."""
@@ -32,16 +36,6 @@ MOST_MODELS = 4
 """Most models in one drawing."""
 
 BASELINE = "constant-velocity"
-
-
-class Pick(StrEnum):
-    """Kinds of samples that can be picked."""
-
-    LANE_CHANGE = "lane-change"
-    LANE_KEEP = "lane-keep"
-    BRAKE = "brake"
-    WORST = "worst"
-    RANDOM = "random"
 
 
 NamesArgument = Annotated[
@@ -214,7 +208,7 @@ def _pick_samples(
     judge: Forecaster,
 ) -> list[int]:
     """Pick samples of a kind."""
-    found = pick_samples(folder, part, pick.value, count=count, seed=seed, judge=judge)
+    found = pick_samples(folder, part, pick, count=count, seed=seed, judge=judge)
     if pick is Pick.WORST:
         many = len(folder.samples_of(part))
         among = f"{MOST_SEARCHED:,} drawn of {many:,}" if many > MOST_SEARCHED else f"{many:,}"
@@ -270,11 +264,31 @@ def _draw_attention(
     folder: TensorFolder, forecasters: list[Forecaster], samples: list[int], target: Path
 ) -> list[Path]:
     """Write the attention maps of every model with attention, in a folder of its name."""
-    from tracklake.training.plots.attention import export_attention  # imports Altair
-
     found = []
     for own in forecasters:
         if own.reads == "scene":
             network: Any = own.predictor  # a network with attention
             found += export_attention(folder, network, samples, target / own.name)
     return found
+
+
+def export_attention(
+    folder: TensorFolder, network: "SceneAttention", samples: Sequence[int], out_dir: Path
+) -> list[Path]:
+    """Write a drawing and a JSON table per sample, and return their paths; files of the same names are replaced.
+
+    Raises:
+        IndexError: no sample has the number.
+    """
+    from tracklake.training.plots.attention import draw_attention, map_attention  # imports Altair
+
+    out_dir.mkdir(parents=True, exist_ok=True)
+    written = []
+    for shown in map_attention(folder, network, samples):
+        picture = shown.picture
+        name = f"{picture.subset}_{picture.own.vehicle_id}_{picture.time_s:.1f}s_attention"
+        drawing, table = out_dir / f"{name}.svg", out_dir / f"{name}.json"
+        write_file(drawing, draw_attention(shown).render(drawing.suffix))
+        write_file(table, json_format.dumps(shown.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
+        written += [drawing, table]
+    return written

@@ -1,10 +1,8 @@
 """Attention weights of samples, drawn per head: the road with the ego's weights, and the whole matrices."""
 
-import json
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import altair as alt
@@ -14,7 +12,6 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Floats
 from tracklake.schemas.chart_theme import INK, MUTED, PAPER
 from tracklake.schemas.drawings import Drawing, Layers, Row, fix_scale, name_rows
-from tracklake.schemas.files import write_file
 from tracklake.training.data.gathers import find_nearest, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models.inputs import NEAREST
@@ -98,26 +95,6 @@ class AttentionMap:
                 "decoder_vehicles": self.decoder.round(6).tolist(),
             },
         }
-
-
-def export_attention(
-    folder: TensorFolder, network: "SceneAttention", samples: npt.ArrayLike, out_dir: Path
-) -> list[Path]:
-    """Write a drawing and a JSON table per sample, and return their paths; files of the same names are replaced.
-
-    Raises:
-        IndexError: no sample has the number.
-    """
-    out_dir.mkdir(parents=True, exist_ok=True)
-    written = []
-    for shown in map_attention(folder, network, samples):
-        picture = shown.picture
-        name = f"{picture.subset}_{picture.own.vehicle_id}_{picture.time_s:.1f}s_attention"
-        drawing, table = out_dir / f"{name}.svg", out_dir / f"{name}.json"
-        write_file(drawing, draw_attention(shown).render(drawing.suffix))
-        write_file(table, json.dumps(shown.to_dict(), indent=1, allow_nan=False).encode() + b"\n")
-        written += [drawing, table]
-    return written
 
 
 def map_attention(

@@ -2,7 +2,6 @@
 
 import json
 import os
-from typing import get_args
 
 import pytest
 from drawn_moment import FAR, OWN, make_moment
@@ -129,9 +128,9 @@ def test_without_a_lake_there_is_nothing_to_draw(tmp_path, monkeypatch):
     assert "tracklake run" in done.stderr or "tracklake ingest" in done.stderr
 
 
-def test_kinds_to_pick_are_those_that_samples_are_picked_by():
-    from tracklake.pipeline.cli.predict import MOST_MODELS, SUFFIXES, Pick
-    from tracklake.training.plots import charts, picture_drawing, sample_choice
+def test_limits_of_the_options_are_those_of_drawings():
+    from tracklake.pipeline.cli.predict import MOST_MODELS, SUFFIXES
+    from tracklake.schemas import drawings
+    from tracklake.training.plots import picture_drawing
 
-    assert {pick.value for pick in Pick} == set(get_args(sample_choice.Pick))
-    assert (MOST_MODELS, SUFFIXES) == (picture_drawing.MOST_MODELS, charts.SUFFIXES)
+    assert (MOST_MODELS, SUFFIXES) == (picture_drawing.MOST_MODELS, drawings.SUFFIXES)

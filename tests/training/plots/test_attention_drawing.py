@@ -7,14 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, open_moment
-from tensor_tables import TINY
 
-from tracklake.training.models import find_model
 from tracklake.training.plots.attention import (
     choose_extent,
     describe_head,
     draw_attention,
-    export_attention,
     list_bands,
     list_boxes,
     list_weights,
@@ -128,30 +125,11 @@ def test_the_same_map_gives_the_same_bytes(shown):
     assert draw_attention(shown).render(".svg") == draw_attention(shown).render(".svg")
 
 
-def test_drawings_name_every_head_and_fetch_nothing(folder, shown, tmp_path):
+def test_drawings_name_every_head_and_fetch_nothing(shown):
     drawn = draw_attention(shown)
     svg = drawn.render(".svg").decode()
     assert not re.search(r"(href|src|@import|url\()[^>]*http", svg)
     for words in ("head 1", "head 2", "vehicle 1 of highd b", "encoder: vehicles", "decoder: vehicles", "2 (50%)"):
         assert words in svg
-    drawing, _ = export_attention(folder, KnownAttention(), [OWN_SAMPLE], tmp_path)
-    assert drawing.read_text() == svg
     assert drawn.render(".png").startswith(b"\x89PNG")
     assert len(drawn.to_vega_lite()["datasets"]["weights"]) == HEADS * (9 + 6 + 9)
-
-
-@pytest.mark.parametrize("markings", [(0.0, 4.0, 8.0), None])
-def test_a_network_is_exported(tmp_path, markings):
-    folder = open_moment(tmp_path / "moment", markings=markings)
-    network = find_model("attention-h2").build(TINY)
-    files = export_attention(folder, network, [FAR_SAMPLE, OWN_SAMPLE], tmp_path / "out")
-    assert [file.name for file in files] == [
-        f"b_{vehicle}_1.0s_attention{suffix}" for vehicle in (FAR, OWN) for suffix in (".svg", ".json")
-    ]
-    table = json.loads(files[3].read_text())
-    for part, rows in table["attention"].items():
-        np.testing.assert_allclose(np.sum(rows, axis=-1), 1, atol=1e-5, err_msg=part)
-        assert np.shape(rows)[:2] == (2, 3)
-    assert export_attention(folder, network, [], tmp_path / "out") == []
-    with pytest.raises(IndexError):
-        export_attention(folder, network, [99], tmp_path / "out")

@@ -7,12 +7,12 @@ import pytest
 from drawn_moment import FAR, FAR_SAMPLE, NEAR, OWN, OWN_SAMPLE, PLACES, SIZES_M, open_moment, sure
 from lane_tracks import open_tracks, track
 
+from tracklake.pipeline.cli.sample_choice import measure_last_distance
 from tracklake.training.data.observed import FutureInputError, ObservedScene
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.plots.picture import forecast_samples, forecast_scene, take_picture
 from tracklake.training.plots.picture_drawing import describe_marks, draw_picture
 from tracklake.training.plots.picture_rows import choose_view, list_errors
-from tracklake.training.plots.sample_choice import measure_last_distance
 from tracklake.training.runs.forecasters import Forecaster, UnknownRunError, open_forecaster
 
 

@@ -8,9 +8,9 @@ import pytest
 from drawn_moment import FAR_SAMPLE, OWN_SAMPLE, open_moment
 from tensor_tables import TINY, random_clock, sample_everything, split_row, write
 
+from tracklake.pipeline.cli.sample_choice import NoSampleError, find_sample, measure_last_distance, pick_samples
 from tracklake.schemas.errors import UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.plots.sample_choice import NoSampleError, find_sample, measure_last_distance, pick_samples
 from tracklake.training.runs.forecasters import open_forecaster
 
 
@@ -119,7 +119,7 @@ def test_the_worst_are_those_a_loop_finds(many, monkeypatch):
 
 
 def test_the_worst_is_searched_among_some_of_very_many(many, monkeypatch):
-    monkeypatch.setattr("tracklake.training.plots.sample_choice.MOST_SEARCHED", 2)
+    monkeypatch.setattr("tracklake.pipeline.cli.sample_choice.MOST_SEARCHED", 2)
     folder, _ = many
     judge = open_forecaster("constant-velocity", folder, folder.path, frozenset({"eval"}))
     assert len(pick_samples(folder, "eval", "worst", count=5, judge=judge)) == 2

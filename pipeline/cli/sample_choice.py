@@ -1,6 +1,6 @@
-"""The choice of samples: by vehicle and time, at random among those of a kind, or by a model's greatest error."""
+"""Samples that `tracklake predict` draws: by vehicle and time, at random by kind, or by a model's greatest error."""
 
-from typing import Literal
+from enum import StrEnum
 
 import numpy as np
 
@@ -10,10 +10,18 @@ from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.runs.forecasters import Forecaster
 
-Pick = Literal["random", "lane-change", "lane-keep", "brake", "worst"]
-
 MOST_SEARCHED = 20_000
 """Most samples searched for the worst; of more, so many are drawn at random."""
+
+
+class Pick(StrEnum):
+    """Kinds of samples that can be picked."""
+
+    LANE_CHANGE = "lane-change"
+    LANE_KEEP = "lane-keep"
+    BRAKE = "brake"
+    WORST = "worst"
+    RANDOM = "random"
 
 
 class NoSampleError(TracklakeError):
@@ -78,7 +86,7 @@ def pick_samples(
     kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
     found = samples[kinds[pick]] if pick in kinds else samples
     found = _prefer(found, folder.sample_future[found] == folder.protocol.horizon_ticks)
-    if pick == "lane-change":
+    if pick == Pick.LANE_CHANGE:
         row = folder.sample_row[found].astype(np.intp)
         found = _prefer(found, folder.lane[row + folder.sample_future[found]] != folder.lane[row])
     if len(found) == 0:
@@ -87,7 +95,7 @@ def pick_samples(
             f"`{folder.split}`; pick another kind (--pick) or part (--part)"
         )
     random = np.random.default_rng(seed)
-    if pick != "worst":
+    if pick != Pick.WORST:
         return random.permutation(found)[:count]
     if judge is None:
         raise UsageError("`worst` needs a model to judge by")
