@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from scored_runs import evaluate
 from tiny_network import write_tiny
 
 import tracklake
 from tracklake.schemas.errors import UsageError
 from tracklake.training.data.batches import Batch
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models import find_model
 from tracklake.training.runs.checkpoint import UnfinishedError
 from tracklake.training.runs.run_folder import StaleRunError

@@ -23,7 +23,7 @@ from tracklake.pipeline.cli.options import (
     QuietOption,
     require_choice,
 )
-from tracklake.pipeline.cli.score_tables import show_evaluations
+from tracklake.pipeline.cli.score_tables import describe_fit, show_evaluations
 from tracklake.pipeline.cli.smoothing_gain import describe_causality, measure_gain, open_histories, show_gain
 from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
@@ -40,8 +40,7 @@ from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 from tracklake.schemas.published_results import published_rows
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import Evaluation
-from tracklake.training.evaluation.evaluate import evaluate as evaluate_model
+from tracklake.training.evaluation.evaluate import Evaluation, measure_errors
 from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
@@ -209,7 +208,7 @@ def _show_scores(terminal: Terminal, found: Sequence[Evaluation], table: pl.Data
     """Print the scores, what was fitted on the fly, and which tracks the histories are of."""
     show_evaluations(terminal, found[0], table, [own.value for own in by])
     for fit in (own.fit for own in found if own.fit):
-        terminal.print_line(fit.describe(), style="dim")
+        terminal.print_line(describe_fit(fit), style="dim")
     terminal.print_line(describe_causality(found[0].protocol.tracks_from), style="dim")
 
 
@@ -238,12 +237,14 @@ def _evaluate_all(
 ) -> tuple[list[Forecaster], list[Evaluation]]:
     """Open and score runs and models; a run that does not fit the tensors is skipped, or refused with `strict`."""
     opened, found = [], []
-    score = partial(evaluate_model, nearest=nearest, with_latency=True, every_tick=every_tick)
+    protocol = tensors.protocol
+    seconds = [tick / protocol.rate_hz for tick in range(1, protocol.horizon_ticks + 1)] if every_tick else None
+    score = partial(measure_errors, nearest=nearest, seconds=seconds, with_latency=True)
     for name in names:
         observe = records[name].observe if name in records else None
         try:
             model = open_forecaster(name, tensors, models, frozenset({part}))
-            found.append(score(model, tensors, models, part, observe=observe))
+            found.append(score(model, tensors, part, observe=observe))
         except (StaleRunError, NotFiniteError, MissingExtraError) as error:
             if strict:
                 raise

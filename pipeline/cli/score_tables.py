@@ -9,6 +9,7 @@ from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.schemas.evaluations import EVERYTHING, FINDING_GROUPS
 from tracklake.schemas.protocols import Headline
 from tracklake.training.evaluation.evaluate import Evaluation
+from tracklake.training.models.fitting import Fit
 
 HEADINGS = {
     "rmse_m": "RMSE, m",
@@ -139,3 +140,19 @@ def _show_last(terminal: Terminal, rows: pl.DataFrame, figures: Sequence[str]) -
     if timed:
         text = f"a moment: the median of {last['latency_samples'][0]:g} samples predicted at once, on one thread"
         terminal.print_line(text, style="dim")
+
+
+def describe_fit(fit: Fit) -> str:
+    """Describe in one line which parameters of a model were fitted, on how many samples, and which were set."""
+    how = f"fitted on {fit.samples:,} samples of `train`" if fit.samples else "not fitted: `train` has no samples"
+    groups = {how: set(fit.parameters).difference(fit.given), "set, not fitted": set(fit.given)}
+    values = {
+        name: f"{name} = {value:g}" + (" (bound of the search)" if name in fit.at_bounds else "")
+        for name, value in fit.parameters.items()
+    }
+    shown = [
+        ", ".join(text for name, text in values.items() if name in names) + f", {how}"
+        for how, names in groups.items()
+        if names
+    ]
+    return f"{fit.model}: {'; '.join(shown)}"

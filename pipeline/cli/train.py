@@ -19,6 +19,7 @@ from tracklake.pipeline.cli.options import (
     QuietOption,
     read_pairs,
 )
+from tracklake.pipeline.cli.score_tables import describe_fit
 from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS as RUNS
@@ -166,7 +167,7 @@ def _show_training(terminal: Terminal, metrics: dict[str, Any], out: Path) -> No
     else:
         terminal.print_line("note: nothing was scored: the split has no samples in `eval`; add recordings", style="dim")
     if fit := metrics.get("fit"):
-        terminal.print_line(Fit(**fit).describe())
+        terminal.print_line(describe_fit(Fit(**fit)))
     else:
         terminal.print_line(
             f"{metrics['steps']:,} steps in {metrics['seconds']:,.1f} s: {metrics['samples_per_s']:,.0f} samples/s; "

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from scored_runs import evaluate
 from tensor_tables import TINY, sample_everything, split_row, write
 from tensor_tables import drive as drive_vehicles
 from tiny_network import RECIPE, Forgetful, make_tables, read_log, register, write_tiny
@@ -16,7 +17,6 @@ import tracklake.training.train
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models import MODELS, Phase, Recipe
 from tracklake.training.models.inputs import read_samples
 from tracklake.training.train import TrainConfig, train

@@ -3,11 +3,11 @@
 import polars as pl
 import pytest
 import torch
+from scored_runs import evaluate
 from tensor_tables import split_row
 from tiny_network import PARTS, register, write_tiny
 
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.train import DivergedError, TrainConfig, train
 

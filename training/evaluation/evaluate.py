@@ -3,8 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from tracklake.training.evaluation.scores import Tally, find_strata
 from tracklake.training.models.fitting import Fit
 from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import NotFiniteError, Prediction
-from tracklake.training.runs.forecasters import Forecaster, open_forecaster
+from tracklake.training.runs.forecasters import Forecaster
 
 LATENCY_MOMENTS = 20
 """Number of moments that the median time is taken of."""
@@ -97,37 +96,6 @@ class EmptyPartError(TracklakeError):
     """The part to evaluate has no samples."""
 
 
-def evaluate(
-    model: str | Forecaster,
-    tensors: str | Path | TensorFolder,
-    models: str | Path,
-    part: str = "eval",
-    *,
-    nearest: int = NEAREST,
-    with_latency: bool = False,
-    every_tick: bool = False,
-    observe: Observer | None = None,
-) -> Evaluation:
-    """Evaluate a trained run, or a model that is no network.
-
-    `model` is a run's folder in `models`, or a model that is no network, by name or opened; `tensors` their folder, or
-    the folder opened (and narrowed, see `TensorFolder.narrow`). `nearest` is the largest number of vehicles around the
-    ego in a scene. Scores are of the protocol's seconds, or of every tick of the horizon. `observe` is called with
-    every batch.
-
-    Raises:
-        TensorError: the tensors are missing or damaged.
-        TracklakeError: see `open_forecaster` and `measure_errors`.
-    """
-    folder = tensors if isinstance(tensors, TensorFolder) else TensorFolder.open(tensors)
-    if isinstance(model, str):
-        model = open_forecaster(model, folder, Path(models), frozenset({part}))
-    ticks = range(1, folder.protocol.horizon_ticks + 1)
-    seconds = [tick / folder.protocol.rate_hz for tick in ticks] if every_tick else None
-    found = measure_errors(model, folder, part, nearest=nearest, seconds=seconds, observe=observe)
-    return replace(found, latency=measure_latency(model, folder, part, nearest)) if with_latency else found
-
-
 def measure_errors(
     model: Forecaster,
     folder: TensorFolder,
@@ -135,11 +103,13 @@ def measure_errors(
     *,
     nearest: int = NEAREST,
     seconds: Sequence[float] | None = None,
+    with_latency: bool = False,
     observe: Observer | None = None,
 ) -> Evaluation:
     """Predict every sample of a part and sum up the errors, after `refuse_future`.
 
     `nearest` is the largest number of vehicles around the ego in a scene; `seconds` None stands for the protocol's.
+    `observe` is called with every batch.
 
     Raises:
         EmptyPartError: the part has no samples.
@@ -171,6 +141,7 @@ def measure_errors(
         vehicles=int(strata.vehicle[-1]) + 1,
         scores=tally.score(at, protocol.rate_hz),
         nearest=nearest if model.reads == "scene" else None,
+        latency=measure_latency(model, folder, part, nearest) if with_latency else {},
         vehicle_sums=_list_vehicle_sums(folder, samples, tally, at),
         run=model.config,
         fit=model.fit,

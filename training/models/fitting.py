@@ -58,21 +58,6 @@ class Fit:
     given: Sequence[str] = ()
     at_bounds: Sequence[str] = ()
 
-    def describe(self) -> str:
-        """Return a line for people."""
-        how = f"fitted on {self.samples:,} samples of `train`" if self.samples else "not fitted: `train` has no samples"
-        groups = {how: set(self.parameters).difference(self.given), "set, not fitted": set(self.given)}
-        values = {
-            name: f"{name} = {value:g}" + (" (bound of the search)" if name in self.at_bounds else "")
-            for name, value in self.parameters.items()
-        }
-        shown = [
-            ", ".join(text for name, text in values.items() if name in names) + f", {how}"
-            for how, names in groups.items()
-            if names
-        ]
-        return f"{self.model}: {'; '.join(shown)}"
-
     def to_dict(self) -> dict[str, Any]:
         """Convert to plain values for JSON."""
         return asdict(self)

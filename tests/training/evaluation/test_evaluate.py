@@ -11,6 +11,7 @@ from unittest import mock
 import numpy as np
 import polars as pl
 import pytest
+from scored_runs import evaluate
 from tensor_tables import CLOCK, TINY, drive, finding, sample_everything, split_row, write
 
 from tracklake.schemas.comparisons import VEHICLE_ERRORS
@@ -18,7 +19,7 @@ from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import EmptyPartError, evaluate, measure_errors
+from tracklake.training.evaluation.evaluate import EmptyPartError, measure_errors
 from tracklake.training.models.constant_velocity import ConstantVelocity
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster, UnknownRunError
@@ -291,7 +292,8 @@ def test_other_horizons_can_be_asked_for(tmp_path):
 
 
 def test_every_tick_of_the_horizon_can_be_asked_for(tmp_path):
-    result = evaluate("constant-velocity", two_samples(tmp_path / "tensors"), tmp_path, every_tick=True)
+    seconds = (0.5, 1.0, 1.5, 2.0)
+    result = evaluate("constant-velocity", two_samples(tmp_path / "tensors"), tmp_path, seconds=seconds)
     # After a second the first is 5 m off; otherwise both are where they are said to be, as long as they are known.
     expected = [(0.5, 2, 0.0), (1.0, 2, 2.5), (1.5, 1, 0.0), (2.0, 1, 0.0)]
     assert [(row.seconds, row.n, pytest.approx(row.mae_m, abs=1e-6)) for row in list_rows(result.horizons)] == expected
@@ -365,11 +367,10 @@ WITHOUT_TORCH = """
 import sys
 sys.modules["torch"] = None  # importing it now fails as if it were not installed
 from pathlib import Path
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.schemas.errors import MissingExtraError
 from tracklake.training.train import train
 tensors, models = map(Path, sys.argv[1:])
-print(evaluate("constant-velocity", tensors, models).samples)
+print(train("constant-velocity", tensors, models / "cv")["evaluation"]["samples"])
 try:
     train("lstm", tensors, models / "lstm")
 except MissingExtraError as error:

@@ -12,6 +12,7 @@ from tensor_tables import TINY, split_row
 from test_motion_models import draw_tracks, name_noise
 from tiny_network import write_tiny
 
+from tracklake.pipeline.cli.score_tables import describe_fit
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
@@ -120,7 +121,7 @@ def test_parameters_that_are_set_are_not_said_to_be_fitted():
     fit = Fit(
         "kalman-cv", 1200, {"measurement_lateral_m": 0.25, "acceleration_lateral_m2ps3": 2.0}, ["measurement_lateral_m"]
     )
-    assert fit.describe() == (
+    assert describe_fit(fit) == (
         "kalman-cv: acceleration_lateral_m2ps3 = 2, fitted on 1,200 samples of `train`; measurement_lateral_m = 0.25, "
         "set, not fitted"
     )
@@ -137,8 +138,8 @@ def test_a_value_at_the_bound_of_the_search_is_marked():
         "acceleration_longitudinal_m2ps3",
         "measurement_longitudinal_m",
     ]
-    assert "measurement_longitudinal_m = 0.001 (bound of the search)," in fit.describe()
-    assert "measurement_lateral_m = 0.2, set, not fitted" in fit.describe()
+    assert "measurement_longitudinal_m = 0.001 (bound of the search)," in describe_fit(fit)
+    assert "measurement_lateral_m = 0.2, set, not fitted" in describe_fit(fit)
     assert fit.to_dict()["at_bounds"] == fit.at_bounds
 
 
@@ -178,5 +179,5 @@ def test_only_the_training_part_is_fitted_on(tmp_path):
 def test_without_a_training_part_the_defaults_hold_and_that_is_said(tmp_path):
     folder = TensorFolder.open(write_tiny(tmp_path / "tensors", split_row("b", "eval"), subsets="b"))
     fit = open_forecaster("damped-velocity", folder, tmp_path, frozenset({"eval"})).fit
-    assert fit.describe() == "damped-velocity: decay_s = 1, not fitted: `train` has no samples"
+    assert describe_fit(fit) == "damped-velocity: decay_s = 1, not fitted: `train` has no samples"
     assert TINY.name == folder.protocol.name

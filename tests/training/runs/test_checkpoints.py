@@ -10,11 +10,11 @@ from dataclasses import replace
 import pytest
 import torch
 from file_damages import Code
+from scored_runs import evaluate
 from tensor_tables import TINY
 from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
 
 from tracklake.schemas.hashing import hash_chunks
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
     UnfinishedError,

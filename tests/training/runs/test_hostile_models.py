@@ -8,13 +8,13 @@ import shutil
 import pytest
 import torch
 from mutations import JUNK, mutate, nest
+from scored_runs import evaluate
 from tensor_tables import TINY
 from tiny_network import register, write_tiny
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.models import MAX_PARAMETER, MODELS
 from tracklake.training.runs.run_folder import StaleRunError, load_run
 from tracklake.training.train import TrainConfig, train

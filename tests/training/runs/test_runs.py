@@ -11,12 +11,12 @@ import polars as pl
 import pytest
 import torch
 from file_damages import DAMAGES
+from scored_runs import evaluate
 from tensor_tables import TINY, split_row
 from tiny_network import PARTS, Forgetful, register, write_tiny
 
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.evaluation.evaluate import evaluate
 from tracklake.training.runs.run_folder import RUN_VERSION, StaleRunError, digest_tensors, find_versions, load_run
 from tracklake.training.train import TrainConfig, train
 
