@@ -1,5 +1,6 @@
 """Settings of the allocators; imports nothing heavy, as it has to run before Polars is imported."""
 
+import atexit
 import ctypes
 import gc
 import os
@@ -18,12 +19,13 @@ _NEW_OBJECTS = 10_000
 
 
 def collect_seldom() -> None:
-    """Let Python look for cycles of objects less often.
+    """Let Python look for cycles of objects less often, and not when it exits.
 
     The modules that a command imports make a million objects, none of which is garbage: looking through them takes a
-    sixth of the processor time of a command on a small recording (`benchmarks/cli.py`).
+    third of the processor time of a command on a small recording (`benchmarks/start.py`).
     """
     gc.set_threshold(_NEW_OBJECTS)
+    atexit.register(gc.freeze)  # at the very end, as it is the first to be registered
 
 
 def keep_freed_memory() -> bool:
