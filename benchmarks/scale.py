@@ -10,6 +10,10 @@ one process and that all together held, looked at five times a second; MB are th
 replacements of the manifest's root.
 """
 
+from tracklake.pipeline.cli.memory import keep_freed_memory
+
+keep_freed_memory()  # as each command does, before anything imports Polars
+
 import argparse
 import os
 import resource
@@ -87,6 +91,7 @@ def measure_recordings(
     """Print the lines of one number of recordings."""
     raw = work / f"raw-{recordings}"
     write_highd(raw, recordings, SMALL_ROWS)
+    os.sync()
     for place, runner, number in product(("folder", "store"), runners, workers):
         name = f"{recordings}-{place}-{runner}-{number}"
         lake = str(work / name) if place == "folder" else make_bucket(store, name)
@@ -105,6 +110,7 @@ def measure_entries(work: Path, millions: int) -> None:
     with tempfile.TemporaryDirectory(dir=work) as folder:
         raw, lake = Path(folder) / "raw", Path(folder) / "lake"
         rows = write_highd(raw, max(1, millions * 1_000_000 // LONG_ROWS), LONG_ROWS)
+        os.sync()  # the files are on the disk before the commands start
         cost = run_commands(raw, str(lake), lake, {"TRACKLAKE_WORKERS": "2"})
         live_bytes = measure_lake(str(lake), {})
         print(
