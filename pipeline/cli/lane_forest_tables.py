@@ -5,12 +5,12 @@ from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import format_number, print_table
+from tracklake.schemas.lane_forest import ALL, CellScore, GridScores, LearningPoint
 from tracklake.schemas.protocols import V2V
 from tracklake.schemas.published_results import CELL_ACCURACY, CELL_ACCURACY_S
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.lane_changes.examples import ALL
 from tracklake.training.lane_changes.forest import LaneForest
-from tracklake.training.lane_changes.scores import SIZES, CellScore, GridScores, LearningPoint
+from tracklake.training.lane_changes.scores import SIZES
 from tracklake.training.onboard.as_published import PublishedScores
 
 CELL_ACCURACIES = {

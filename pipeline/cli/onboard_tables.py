@@ -5,9 +5,9 @@ from typing import Any
 
 from tracklake.pipeline.cli.console import Terminal
 from tracklake.pipeline.cli.tables import format_number, print_table
+from tracklake.schemas.lane_forest import ALL, STRATA
 from tracklake.schemas.protocols import V2V
 from tracklake.schemas.published_results import CHOI_2021
-from tracklake.training.lane_changes.examples import ALL, STRATA
 from tracklake.training.onboard.samples import Parts
 
 Row = dict[str, Any]

@@ -15,6 +15,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.lane_forest import ALL, LEFT_OUT, STRATA
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.schemas.validation import explain_faults
 from tracklake.training.data.batches import Arrays
@@ -31,18 +32,10 @@ START_S = 4.0
 sought within 4 s, too."""
 TOLERANCE_M = 0.1
 """Distance from the target lane's centre at which a vehicle has reached it, m."""
-STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
-"""Groups of samples. Accelerating: the recorded speed is at least what it was SPEED_CHANGE_S ago. Changing: the label
-is not keep."""
 MIRRORED: Bytes = np.array([KEEP, RIGHT, LEFT], dtype=np.uint8)
 """Maneuver of KEEP, LEFT and RIGHT on a road mirrored sideways."""
-ALL = "all"
-"""Name of the group of all samples."""
 SPEED_CHANGE_S = 1.0
 """Time between the two speeds that are compared, s."""
-LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
-"""Why a sample is left out: it has no lane now; its track ends before the horizon, or before T_d has passed; or its
-speed is unknown, now or SPEED_CHANGE_S ago. The first that applies counts."""
 READ_SAMPLES = 4096
 """Number of samples read at once; their scenes take about 20 MB."""
 

@@ -6,7 +6,6 @@ behind in the target's own lane or, if there is none, the nearest one behind in 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.lane_forest import Coefficient
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.cells import find_columns
 
@@ -158,26 +158,6 @@ def weigh_positions(ticks: int, rate_hz: int) -> Floats:
         weights[known, : len(solved) - 1, ticks - known :] = solved[1:]
     weights[:, 1] *= 2
     return weights
-
-
-@dataclass(frozen=True)
-class Coefficient:
-    """Pearson's coefficients of a feature with 1 where the class is keep, left or right, else 0 (point-biserial).
-
-    They are 0 where either does not vary. `reason` says why the forest does not read the feature; empty where it does.
-    """
-
-    feature: str
-    keep: float
-    left: float
-    right: float
-    chosen: bool
-    reason: str
-
-    @property
-    def strength(self) -> float:
-        """Largest of the three coefficients' absolute values."""
-        return max(abs(self.keep), abs(self.left), abs(self.right))
 
 
 def choose_features(

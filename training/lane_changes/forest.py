@@ -15,11 +15,11 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.documents import parse_json
 from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import write_file
+from tracklake.schemas.lane_forest import STRATA
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import (
-    STRATA,
     Examples,
     LaneForestSettings,
     draw_balanced,

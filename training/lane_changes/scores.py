@@ -14,12 +14,12 @@ import numpy as np
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.lane_forest import ALL, CellScore, GridScores, LearningPoint, ManeuverScore
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
-    ALL,
     LabelledSamples,
     LaneForestSettings,
     Targets,
@@ -43,59 +43,6 @@ SIZES = (250, 500, 1000, 2000, 4000)
 """Numbers of examples drawn, before augmentation."""
 MOST_SCORED = 20_000
 """Largest number of samples that each forest is scored on."""
-
-
-@dataclass(frozen=True)
-class CellScore:
-    """Scores of one model at one horizon, over all samples or one stratum: shares of n samples, None where n is 0.
-
-    The `column` is that of the model's own `place`, or the `forest`'s. `cell`, `row` and `lane` are samples in the
-    predicted cell, row and column; a true place outside the nine is never right, but in `cell_clipped`, where outer
-    columns and rows have no end. `one_against_rest` is the mean, over the nine cells, of the share of samples that are
-    rightly said to be in that cell or not: a wrong cell costs two ninths. `majority` is the most frequent true cell:
-    what a constant prediction reaches. `own_lane` and `outside` are true places in the own column, and outside the nine
-    cells.
-    """
-
-    model: str
-    column: str
-    seconds: float
-    stratum: str
-    n: int
-    cell: float | None
-    row: float | None
-    lane: float | None
-    cell_clipped: float | None
-    one_against_rest: float | None
-    majority: float | None
-    own_lane: float | None
-    outside: float | None
-
-
-@dataclass(frozen=True)
-class ManeuverScore:
-    """Scores of the forest's maneuvers, over all samples or one stratum. None: no such sample.
-
-    `accuracy` is the share of samples whose most probable maneuver is the label, `recall` the same by label, `balanced`
-    the mean of the recalls, `majority` the share of the most frequent label.
-    """
-
-    stratum: str
-    n: int
-    accuracy: float | None
-    recall: dict[str, float | None]
-    balanced: float | None
-    majority: float | None
-
-
-@dataclass(frozen=True)
-class GridScores:
-    """Scores of cells and maneuvers on one part, and the number of its samples that are not scored, by LEFT_OUT."""
-
-    cells: list[CellScore]
-    maneuvers: list[ManeuverScore]
-    left_out: int
-    left_out_by_reason: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -239,23 +186,6 @@ def _find_ticks(folder: TensorFolder, forest: LaneForest) -> tuple[int, ...]:
             f"{protocol.name}, {protocol.rate_hz} Hz, scored at {scored} s. Fit it again on these tensors"
         )
     return tuple(round(seconds * protocol.rate_hz) for seconds in forest.horizons_s)
-
-
-@dataclass(frozen=True)
-class LearningPoint:
-    """Scores on the evaluation part of a forest fitted on `drawn` examples, before augmentation.
-
-    `lane` is the share of `n` samples whose lane at the last horizon is right; see `ManeuverScore` for the others.
-    """
-
-    drawn: int
-    augmented: bool
-    seed: int
-    n: int
-    accuracy: float | None
-    balanced: float | None
-    lane: float
-    majority: float | None
 
 
 def learn_curve(

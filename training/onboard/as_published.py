@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
+from tracklake.schemas.lane_forest import CellScore, ManeuverScore
 from tracklake.schemas.protocols import V2V
 from tracklake.training.comparison.bootstrap import estimate_differences, estimate_shares
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -29,14 +30,7 @@ from tracklake.training.lane_changes.examples import (
     read_targets,
 )
 from tracklake.training.lane_changes.forest import decide_classes, fit_examples
-from tracklake.training.lane_changes.scores import (
-    COLUMNS,
-    CellScore,
-    ManeuverScore,
-    compare_with_rest,
-    score_cells,
-    score_maneuvers,
-)
+from tracklake.training.lane_changes.scores import COLUMNS, compare_with_rest, score_cells, score_maneuvers
 from tracklake.training.onboard.maneuvers import AT, fit_forest
 from tracklake.training.onboard.models import CTRV, predict_turns
 from tracklake.training.onboard.overhead import OverheadSamples, build_overhead, find_road_cells

@@ -12,10 +12,11 @@ import numpy as np
 from tracklake.schemas.arrays import Bytes, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.lane_forest import Coefficient
 from tracklake.schemas.protocols import V2V
 from tracklake.training.lane_changes.cells import Codes, find_columns, find_rows, measure_rows
 from tracklake.training.lane_changes.examples import KEEP, LEFT, RIGHT, draw_balanced
-from tracklake.training.lane_changes.features import Coefficient, choose_features, standardise_columns
+from tracklake.training.lane_changes.features import choose_features, standardise_columns
 from tracklake.training.onboard.models import predict_straight
 from tracklake.training.onboard.samples import FEATURE_NUMBER, FEATURES, Samples, augment_samples
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from tracklake.schemas.arrays import Flags, Floats, Integers, Singles
+from tracklake.schemas.lane_forest import ALL, STRATA, ManeuverScore
 from tracklake.schemas.protocols import V2V
 from tracklake.schemas.published_results import CELL_ACCURACY, CELL_ACCURACY_S, CHOI_2021, PUBLISHED
 from tracklake.training.evaluation.scores import find_nll
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, number_cells
-from tracklake.training.lane_changes.examples import ALL, STRATA
-from tracklake.training.lane_changes.scores import SIZES, ManeuverScore, score_maneuvers
+from tracklake.training.lane_changes.scores import SIZES, score_maneuvers
 from tracklake.training.models.prediction import Density
 from tracklake.training.onboard.maneuvers import AT, COLUMNS, ManeuverForest, find_cells, fit_forest
 from tracklake.training.onboard.models import Forecaster, predict_places

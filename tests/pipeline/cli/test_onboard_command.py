@@ -7,7 +7,7 @@ import pytest
 from drive_lake import write_drive
 
 from tracklake.pipeline.lake import open_for_writing
-from tracklake.training.lane_changes.examples import ALL, STRATA
+from tracklake.schemas.lane_forest import ALL, STRATA
 
 
 @pytest.fixture(scope="module")

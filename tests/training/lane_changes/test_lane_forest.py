@@ -15,11 +15,10 @@ from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.lane_forest import LEFT_OUT, STRATA
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.lane_changes.examples import (
-    LEFT_OUT,
-    STRATA,
     Examples,
     LaneForestSettings,
     draw_balanced,

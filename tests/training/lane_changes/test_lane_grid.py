@@ -12,10 +12,11 @@ from lane_tracks import CODES, SHORT, open_tracks, track
 from sklearn.ensemble import RandomForestClassifier
 
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.lane_forest import LEFT_OUT, STRATA
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.lane_changes.cells import find_columns, find_rows, measure_rows, number_cells
-from tracklake.training.lane_changes.examples import LEFT_OUT, STRATA, LaneForestSettings, label_samples
+from tracklake.training.lane_changes.examples import LaneForestSettings, label_samples
 from tracklake.training.lane_changes.forest import LaneForest, fit_lane_forest
 from tracklake.training.lane_changes.scores import evaluate_grid, learn_curve
 from tracklake.training.models.constant_velocity import ConstantVelocity

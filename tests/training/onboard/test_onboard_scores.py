@@ -8,7 +8,7 @@ from drive_tables import LANE_M, make_drive, make_traffic
 from scipy.stats import norm
 
 from tracklake.schemas.errors import TracklakeError
-from tracklake.training.lane_changes.examples import ALL, STRATA
+from tracklake.schemas.lane_forest import ALL, STRATA
 from tracklake.training.onboard.collisions import compare_overlaps, find_overlaps, score_warnings
 from tracklake.training.onboard.maneuvers import CORRELATED, NAMES, correlate_pairs, find_cells, fit_forest
 from tracklake.training.onboard.models import Forecaster, make_forecaster, predict_straight, predict_turns

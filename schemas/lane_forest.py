@@ -1,0 +1,102 @@
+"""Records of `lane_forest.json`: features of a forest that predicts lane changes, and scores of maneuvers and cells."""
+
+from dataclasses import dataclass
+
+STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
+"""Groups of samples. Accelerating: the recorded speed is at least what it was a second ago. Changing: the label is
+not keep."""
+ALL = "all"
+"""Name of the group of all samples."""
+LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
+"""Why a sample is left out: it has no lane now; its track ends before the horizon, or before T_d, the time that a
+maneuver takes, has passed; or its speed is unknown, now or a second ago. The first that applies counts."""
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """Pearson's coefficients of a feature with 1 where the class is keep, left or right, else 0 (point-biserial).
+
+    They are 0 where either does not vary. `reason` says why the forest does not read the feature; empty where it does.
+    """
+
+    feature: str
+    keep: float
+    left: float
+    right: float
+    chosen: bool
+    reason: str
+
+    @property
+    def strength(self) -> float:
+        """Largest of the three coefficients' absolute values."""
+        return max(abs(self.keep), abs(self.left), abs(self.right))
+
+
+@dataclass(frozen=True)
+class CellScore:
+    """Scores of one model at one horizon, over all samples or one stratum: shares of n samples, None where n is 0.
+
+    The `column` is that of the model's own `place`, or the `forest`'s. `cell`, `row` and `lane` are samples in the
+    predicted cell, row and column; a true place outside the nine is never right, but in `cell_clipped`, where outer
+    columns and rows have no end. `one_against_rest` is the mean, over the nine cells, of the share of samples that are
+    rightly said to be in that cell or not: a wrong cell costs two ninths. `majority` is the most frequent true cell:
+    what a constant prediction reaches. `own_lane` and `outside` are true places in the own column, and outside the nine
+    cells.
+    """
+
+    model: str
+    column: str
+    seconds: float
+    stratum: str
+    n: int
+    cell: float | None
+    row: float | None
+    lane: float | None
+    cell_clipped: float | None
+    one_against_rest: float | None
+    majority: float | None
+    own_lane: float | None
+    outside: float | None
+
+
+@dataclass(frozen=True)
+class ManeuverScore:
+    """Scores of the forest's maneuvers, over all samples or one stratum. None: no such sample.
+
+    `accuracy` is the share of samples whose most probable maneuver is the label, `recall` the same by label, `balanced`
+    the mean of the recalls, `majority` the share of the most frequent label.
+    """
+
+    stratum: str
+    n: int
+    accuracy: float | None
+    recall: dict[str, float | None]
+    balanced: float | None
+    majority: float | None
+
+
+@dataclass(frozen=True)
+class GridScores:
+    """Scores of cells and maneuvers on one part, and the number of its samples that are not scored, by LEFT_OUT."""
+
+    cells: list[CellScore]
+    maneuvers: list[ManeuverScore]
+    left_out: int
+    left_out_by_reason: dict[str, int]
+
+
+@dataclass(frozen=True)
+class LearningPoint:
+    """Scores on the evaluation part of a forest fitted on `drawn` examples, before augmentation.
+
+    `lane` is the share of `n` samples whose lane at the last horizon is right; see `ManeuverScore` for the others.
+    """
+
+    drawn: int
+    augmented: bool
+    seed: int
+    n: int
+    accuracy: float | None
+    balanced: float | None
+    lane: float
+    majority: float | None
