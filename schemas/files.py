@@ -2,10 +2,11 @@
 
 import os
 import re
+import shutil
 import sys
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -86,6 +87,30 @@ def _find_descriptor(target: Path) -> int | None:
             break
         target = target.parent / target.readlink()
     return None
+
+
+@contextmanager
+def replace_folder(target: Path) -> Iterator[Path]:
+    """Yield a new, hidden folder to write into, and put it in the target's place; on an error nothing changes.
+
+    A folder that was there is deleted. Missing parents are made.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    aside, old = name_unfinished(target), name_unfinished(target)
+    aside.mkdir()
+    try:
+        yield aside
+        if target.exists():
+            target.rename(old)  # a folder cannot be renamed over a full one
+        try:
+            aside.rename(target)
+        except BaseException:
+            if old.exists():
+                old.rename(target)
+            raise
+    finally:
+        for leftover in (aside, old):
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -1,11 +1,10 @@
 """Values that pydantic refuses, in the words of our messages."""
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar, Self
 
-from pydantic import ValidationError
+from pydantic import ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 
 from tracklake.schemas.errors import UsageError
 
@@ -29,18 +28,28 @@ def describe_fault(fault: Any) -> str:  # noqa: ANN401  (a TypedDict that pydant
     return re.sub("^Input should be ", "expected ", fault["msg"].removeprefix("Value error, "))
 
 
-@contextmanager
-def explain_faults(what: str = "") -> Iterator[None]:
-    """Turn what pydantic finds wrong with the settings of something into a message, which may begin with its name.
+STRICT = ConfigDict(strict=True, extra="forbid")
+"""Configuration of settings that are dataclasses: no value is converted, and no name is unknown."""
 
-    Raises:
-        UsageError: the block raised a ValidationError.
+
+@dataclass(frozen=True, config=STRICT)
+class CheckedSettings:
+    """Settings that raise UsageError, in the words of our messages, where a value is not as declared.
+
+    Subclasses are frozen dataclasses of pydantic with the configuration STRICT.
     """
-    try:
-        yield
-    except ValidationError as wrong:
-        faults = (
-            f"`{'.'.join(map(str, fault['loc']))}`: {describe_fault(fault)}, got {fault['input']!r}"
-            for fault in wrong.errors()
-        )
-        raise UsageError(f"{what}: {'; '.join(faults)}".removeprefix(": ")) from None
+
+    what: ClassVar[str] = ""
+    """Beginning of the message: what the settings are of."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _explain(cls, values: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401  (pydantic's own)
+        try:
+            return validate(values)
+        except ValidationError as wrong:
+            faults = (
+                f"`{'.'.join(map(str, fault['loc']))}`: {describe_fault(fault)}, got {fault['input']!r}"
+                for fault in wrong.errors()
+            )
+            raise UsageError(f"{cls.what}: {'; '.join(faults)}".removeprefix(": ")) from None

@@ -1,6 +1,5 @@
 """The generator of sample recordings: simulated traffic in the raw formats, with noise, known defects and the truth."""
 
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from tracklake.pipeline.synthetic.scenarios import (
 from tracklake.pipeline.synthetic.sumo import SumoError
 from tracklake.pipeline.synthetic.truth import TRUTH_SCHEMA
 from tracklake.schemas.errors import UsageError
-from tracklake.schemas.files import name_unfinished
+from tracklake.schemas.files import replace_folder
 
 ALL_FORMATS = FORMATS
 DEFAULT_MINUTES = 1.0
@@ -102,19 +101,10 @@ def write_sample(
     out = Path(out).absolute()
     _require_replaceable(out)
     began = time.perf_counter()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    aside, old = name_unfinished(out), name_unfinished(out)
-    aside.mkdir()
-    try:
+    with replace_folder(out) as aside:
         report = progress or (lambda _: None)
         rows, recordings, reached = build_sample(aside, formats, minutes, seed, models, traffic, dosed, report)
         _require_replaceable(out)
-        if out.exists():
-            out.rename(old)
-        aside.rename(out)
-    finally:
-        for leftover in (aside, old):
-            shutil.rmtree(leftover, ignore_errors=True)
     return SampleSummary(tuple(sorted(out.iterdir())), rows, recordings, time.perf_counter() - began, reached)
 
 

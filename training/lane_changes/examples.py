@@ -5,11 +5,11 @@ Labels use rows after the labelled one: they are for training and for scores, ne
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
+from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles, expand_ranges
@@ -17,7 +17,7 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.lane_forest import ALL, LEFT_OUT, STRATA
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.schemas.validation import explain_faults
+from tracklake.schemas.validation import STRICT, CheckedSettings
 from tracklake.training.data.batches import Arrays
 from tracklake.training.data.gathers import gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -44,8 +44,8 @@ Count = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-@checked_dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid"))
-class LaneForestSettings:
+@checked_dataclass(frozen=True, config=STRICT)
+class LaneForestSettings(CheckedSettings):
     """How examples are labelled, drawn and learned from; stored with the forest.
 
     Args:
@@ -71,12 +71,6 @@ class LaneForestSettings:
     leaf: Count = 20
     least_correlation: NotNegative = 0.05
     most_correlation: NotNegative = 0.95
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _explain(cls, values: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401  (pydantic's own)
-        with explain_faults():
-            return validate(values)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from tracklake.training.lane_changes.examples import (
     label_samples,
 )
 from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER, choose_features, describe_targets
+from tracklake.training.models.prediction import Prediction
 
 VERSION = 2
 """Version of the file; a change that older readers cannot read raises it."""
@@ -63,9 +64,11 @@ class LaneForest:
         """Settings it was fitted with."""
         return LaneForestSettings(**self.facts["settings"])
 
-    def predict(self, observed: ObservedScene[Any]) -> Singles:
-        """Predict B targets from what is observed of them: (B, 1 + T, 3), see `predict_proba`."""
-        return self.predict_proba(describe_targets(observed, self.rate_hz))
+    def predict(self, observed: ObservedScene[Any]) -> Prediction:
+        """Predict all probabilities of B targets as one array (B, 3 + 3 T), see `predict_proba`, and no positions."""
+        probability = self.predict_proba(describe_targets(observed, self.rate_hz))
+        none = np.zeros((len(probability), 0, 2), dtype=np.float32)
+        return Prediction(position_m=none, lateral=probability.reshape(len(probability), -1))
 
     def predict_proba(self, described: Singles) -> Singles:
         """Predict probabilities of keep, left and right (B, 1 + T, 3), of the maneuver and the lane at each horizon.

@@ -6,8 +6,7 @@ read only what `training.data.observed` holds.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.lane_forest import ALL, CellScore, GridScores, LearningPoint, ManeuverScore
-from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
@@ -31,7 +29,7 @@ from tracklake.training.lane_changes.examples import (
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
 from tracklake.training.models.constant_velocity import ConstantVelocity
-from tracklake.training.models.prediction import NotFiniteError, Prediction
+from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.run_folder import refuse_leak
 
@@ -43,18 +41,6 @@ SIZES = (250, 500, 1000, 2000, 4000)
 """Numbers of examples drawn, before augmentation."""
 MOST_SCORED = 20_000
 """Largest number of samples that each forest is scored on."""
-
-
-@dataclass(frozen=True)
-class _ForestPredictor:
-    """Forest with the interface of a model, for the guard: all probabilities in one array, and no places."""
-
-    forest: LaneForest
-
-    def predict(self, observed: ObservedScene[Any]) -> Prediction:
-        probability = self.forest.predict(observed)
-        none = np.zeros((len(probability), 0, 2), dtype=np.float32)
-        return Prediction(position_m=none, lateral=probability.reshape(len(probability), -1))
 
 
 def evaluate_grid(
@@ -83,7 +69,7 @@ def evaluate_grid(
     found = label_samples(folder, part, forest.settings)
     samples = found.draw(most, seed)
     if len(samples):
-        refuse_future(Forecaster("lane-forest", _ForestPredictor(forest), "scene"), folder, part)
+        refuse_future(Forecaster("lane-forest", forest, "scene"), folder, part)
     targets = read_targets(folder, samples.sample, ticks)
     straight = Forecaster("straight", ConstantVelocity(folder.protocol))
     straight_m = predict_places(straight, folder, samples.sample, ticks)

@@ -3,15 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, model_validator
+from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from tracklake.schemas.arrays import Flags, Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
-from tracklake.schemas.validation import explain_faults
+from tracklake.schemas.validation import STRICT, CheckedSettings
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import AugmentationName, Model, OptimizerName, Recipe, ScheduleName
 
@@ -28,8 +28,8 @@ Count = Annotated[int, Field(gt=0, le=MAX_NUMBER)]
 Amount = Annotated[float, Field(gt=0)]
 
 
-@checked_dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid"))
-class TrainConfig:
+@checked_dataclass(frozen=True, config=STRICT)
+class TrainConfig(CheckedSettings):
     """Settings of a training; those left out are the model's recipe (`training.models.Recipe`).
 
     At most one of `seconds`, `steps` and `epochs` is given. The recipe's phases share it in proportion to their epochs.
@@ -37,6 +37,7 @@ class TrainConfig:
     threads. On `cuda`, threads add up some sums in any order: there the seed does not decide the weights bit for bit.
     """
 
+    what = "training"
     seconds: Amount | None = None  # time budget of the loop with all its work; the learning rate follows the time
     steps: Count | None = None  # optimiser steps
     epochs: Count | None = None  # epochs of all phases together; none of the three = the recipe's epochs
@@ -60,12 +61,6 @@ class TrainConfig:
     device: str = "cpu"  # or `cuda`, with all tensors there
     log_steps: Count = 20  # between two rows of course.csv
     checkpoint_s: Amount = 60.0  # most between two checkpoints; one is also at the end of an epoch that took a while
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _explain(cls, values: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401  (pydantic's own)
-        with explain_faults("training"):
-            return validate(values)
 
     def __post_init__(self) -> None:
         """Raise UsageError where several budgets are given."""

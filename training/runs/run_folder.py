@@ -16,7 +16,7 @@ import numpy as np
 
 from tracklake.schemas.documents import read_json
 from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
-from tracklake.schemas.files import name_unfinished
+from tracklake.schemas.files import replace_folder
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.tensors import ARRAYS
@@ -91,10 +91,7 @@ def save_run(
 
     A run of that name is replaced. `config.json` (see `describe_run`) also records the versions of `find_versions`.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
-    aside = name_unfinished(out)
-    aside.mkdir()
-    try:
+    with replace_folder(out) as aside:
         if network is not None:
             import torch
 
@@ -104,14 +101,6 @@ def save_run(
         (aside / "metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False), encoding="utf-8")
         recorded = config | {"versions": find_versions()}
         (aside / "config.json").write_text(json.dumps(recorded, indent=1, allow_nan=False), encoding="utf-8")
-        old = aside.with_suffix(".old")
-        if out.exists():
-            out.rename(old)  # a folder cannot be renamed over a full one
-        aside.rename(out)
-        if old.exists():
-            shutil.rmtree(old)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def load_run(path: Path, protocol: Protocol) -> tuple[dict[str, Any], Predictor]:

@@ -345,7 +345,7 @@ def test_a_folder_is_learned_from(folder):
     assert fitted.facts["examples"] == 3 * drawn
     judged = label_samples(folder, "eval", replace(FEW, start_s=3.0))
     scene, _ = gather_nearest(folder, judged.sample, nearest=10)
-    decided = decide_classes(fitted.predict(scene))
+    decided = decide_classes(fitted.predict(scene).lateral.reshape(len(judged), 1 + 3, 3))
     examples = gather_examples(folder, judged)
     np.testing.assert_array_equal(decided, decide_classes(fitted.predict_proba(examples.feature)))
     assert (decided[:, 0] == examples.maneuver).mean() > (examples.maneuver == CODES["k"]).mean() + 0.1
