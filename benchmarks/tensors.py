@@ -230,7 +230,7 @@ def build(tables: str, out: str, storage: str) -> dict[str, Any]:
                     folder / "findings.parquet"),
                 protocol=CSP, storage=storage, **clock),
             )  # fmt: skip
-            yield {"dataset": "highd", "subset": folder.name, "frame_rate_hz": case["rate"],
+            yield {"dataset": "highd", "subset": folder.name, "origin": "synthetic", "frame_rate_hz": case["rate"],
                    "lane_markings_m": None}, [tensors]  # fmt: skip
 
     start, before = time.perf_counter(), time.process_time()
