@@ -32,10 +32,9 @@ import numpy as np
 from reference_loader import Reference
 from tensors import CASES, build, save
 
-from tracklake.training.data.observed import Observed, Truth
+from tracklake.training.data.gathers import read_samples
+from tracklake.training.data.observed import Observed, Reads, Truth
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import Reads
-from tracklake.training.models.inputs import read_samples
 
 Read = tuple[Any, Truth[Any]]
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError
+from tracklake.training.data.gathers import read_samples
+from tracklake.training.data.observed import Reads
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
-from tracklake.training.models import Reads
-from tracklake.training.models.inputs import read_samples
 from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, restore, save_checkpoint
 from tracklake.training.runs.config import Plan
 from tracklake.training.runs.forecasters import Forecaster

@@ -39,9 +39,9 @@ from tracklake.schemas.files import write_output
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 from tracklake.schemas.published_results import published_rows
 from tracklake.training.comparison.record import SampleRecord
+from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation, measure_errors
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError

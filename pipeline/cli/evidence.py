@@ -16,9 +16,9 @@ from tracklake.training.comparison.feasibility import measure_feasibility
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.comparison.traffic_states import measure_densities
 from tracklake.training.comparison.uncertainty import calibrate, find_radii, score_by_density
+from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.runs.forecasters import Forecaster
 
 Tables = dict[str, pl.DataFrame]

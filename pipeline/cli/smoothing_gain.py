@@ -20,10 +20,9 @@ from tracklake.pipeline.stages.stage import RECONSTRUCTION, StageError
 from tracklake.pipeline.transforms.resample import join_key, put_on_clock
 from tracklake.schemas.arrays import Floats, expand_ranges
 from tracklake.schemas.protocols import FILTERED_TRACKS, RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
-from tracklake.training.data.gathers import locate_rows
+from tracklake.training.data.gathers import locate_rows, read_samples, truth_of_ego
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.scores import find_strata, measure_samples
-from tracklake.training.models.inputs import read_samples, truth_of_ego
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.forecasters import BATCH_SIZE, Forecaster
 

@@ -16,9 +16,9 @@ from tiny_network import RECIPE, Forgetful, make_tables, read_log, register, wri
 import tracklake.training.train
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.protocols import CSP
+from tracklake.training.data.gathers import read_samples
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Phase, Recipe
-from tracklake.training.models.inputs import read_samples
 from tracklake.training.train import TrainConfig, train
 
 LSTM = {"hidden": 16, "anchoring": "both"}

@@ -18,10 +18,9 @@ from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.comparisons import ANY_RULE, FEASIBILITY, FEASIBILITY_RULES
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.comparison.bootstrap import estimate_shares
-from tracklake.training.data.gathers import locate_rows
+from tracklake.training.data.gathers import NEAREST, locate_rows, read_samples, truth_of_ego
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.scores import find_vehicles
-from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
 from tracklake.training.runs.forecasters import Forecaster
 
 BATCH_SIZE = 1024

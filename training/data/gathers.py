@@ -8,7 +8,11 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, expand_ranges
 from tracklake.training.data.batches import Array, Batch, SceneBatch
-from tracklake.training.data.observed import ObservedScene, Truth
+from tracklake.training.data.observed import Observed, ObservedScene, Reads, Truth, part_batch
+
+NEAREST = 10
+"""Most vehicles around the ego in a scene (Kim et al. 2020 train with the nearest ten)."""
+Inputs = tuple[Observed[Any] | ObservedScene[Any], Truth[Any]]
 
 
 class Folder(Protocol):
@@ -273,3 +277,21 @@ def _describe_lanes(folder: Folder, row: Array) -> tuple[Array, Array]:
     for lanes in described:
         lanes[..., 0] -= y_m * lanes[..., 2]
     return cast(described[0], "float32"), cast(described[1], "float32")
+
+
+def read_samples(folder: Folder, samples: npt.ArrayLike, reads: Reads, *, nearest: int = NEAREST) -> Inputs:
+    """Read samples by their numbers (B,) in any order, as arrays of the folder's kind and device.
+
+    Of a mapped folder they are 0 <= number < S (else IndexError), of a device's copy int64 tensors there. A scene has
+    V = 1 + nearest vehicles.
+    """
+    if reads == "grid":
+        return part_batch(gather_samples(folder, samples))
+    return gather_nearest(folder, samples, nearest=nearest)
+
+
+def truth_of_ego(truth: Truth[Any]) -> Truth[Any]:
+    """Return the truth of the samples themselves: of scenes, that of vehicle 0."""
+    if truth.future.ndim == 3:
+        return truth
+    return Truth(truth.future[:, 0], truth.future_mask[:, 0], truth.lateral, truth.longitudinal)

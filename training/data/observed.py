@@ -1,13 +1,15 @@
 """Samples as a model may see them, and the truth that it predicts, in separate types."""
 
 from dataclasses import dataclass, fields
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import Any, Generic, Literal, NoReturn, TypeVar
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.training.data.batches import Arrays, Batch
 
 ROWS, COLUMNS, ROW_M = 13, 3, 4.572
 """Rows of the grid along the road, 0 hindmost; its columns: left, own and right lane; and the length of a row, in m."""
+Reads = Literal["grid", "scene"]
+"""Input of a model: `Observed` (grid) or `ObservedScene` (scene)."""
 Array = TypeVar("Array")
 """NumPy arrays or torch tensors, of the same shapes, units and order."""
 

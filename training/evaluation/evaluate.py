@@ -17,12 +17,12 @@ from tracklake.schemas.evaluations import EVALUATIONS, EVERYTHING
 from tracklake.schemas.origin import DataOrigin, summarise_origins
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.split_recipes import TIME_BLOCKS
+from tracklake.training.data.gathers import NEAREST, read_samples
 from tracklake.training.data.observed import Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.guard import choose_moments, find_scene_samples, refuse_future
 from tracklake.training.evaluation.scores import Tally, find_strata
 from tracklake.training.models.fitting import Fit
-from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

@@ -27,9 +27,9 @@ from tracklake.schemas.arrays import Integers, expand_ranges
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, SEVERITIES
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS
+from tracklake.training.data.gathers import NEAREST, read_samples
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.inputs import NEAREST, read_samples
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

@@ -19,11 +19,10 @@ from tracklake.schemas.lane_forest import ALL, LEFT_OUT, STRATA
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.schemas.validation import STRICT, CheckedSettings
 from tracklake.training.data.batches import Arrays
-from tracklake.training.data.gathers import gather_nearest, locate_rows
+from tracklake.training.data.gathers import NEAREST, gather_nearest, locate_rows
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import find_columns
 from tracklake.training.lane_changes.features import describe_targets, mirror_targets, shift_targets
-from tracklake.training.models.inputs import NEAREST
 
 KEEP, LEFT, RIGHT = (LATERAL_MANEUVERS.index(name) for name in ("keep", "left", "right"))
 

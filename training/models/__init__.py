@@ -12,6 +12,7 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.text import suggest_name
+from tracklake.training.data.observed import Reads
 from tracklake.training.models.prediction import Prediction
 
 MAX_PARAMETER = 2048
@@ -27,8 +28,6 @@ ANCHORING, RESIDUAL = "anchoring", "residual"
 OptimizerName = Literal["adam", "adamw"]
 ScheduleName = Literal["constant", "cosine"]
 AugmentationName = Literal["none", "mirror", "shift", "both"]
-Reads = Literal["grid", "scene"]
-"""Input of a model: `training.data.observed.Observed` (grid) or `ObservedScene` (scene)."""
 
 
 class Predictor(Interface):

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from tracklake.schemas.arrays import Singles
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
+from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.models.constant_velocity import velocity_ticks
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.models.network import Network, check_choice, check_phase, find_anchored, to_numpy
 from tracklake.training.models.prediction import Prediction
 

@@ -8,7 +8,8 @@ from typing import Any, get_args
 
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.hashing import hash_chunks
-from tracklake.training.models import Model, Phase, Reads, Recipe
+from tracklake.training.data.observed import Reads
+from tracklake.training.models import Model, Phase, Recipe
 
 OWN_FILES: dict[str, tuple[str, str]] = {}
 """File and digest of each module that was imported for a model: an error raised in the file is not ours."""

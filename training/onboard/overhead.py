@@ -13,12 +13,11 @@ import numpy as np
 from tracklake.schemas.arrays import Floats, Integers, Singles
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import V2V
-from tracklake.training.data.gathers import gather_nearest
+from tracklake.training.data.gathers import NEAREST, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.cells import Codes, find_columns, find_rows, measure_rows
 from tracklake.training.lane_changes.examples import READ_SAMPLES, LabelledSamples, cut_numbers
 from tracklake.training.lane_changes.features import LEAST_SPEED_MPS, find_egos, fit_motion
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.onboard.maneuvers import AT
 from tracklake.training.onboard.models import predict_straight
 from tracklake.training.onboard.samples import FEATURE_NUMBER, Samples

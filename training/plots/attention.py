@@ -12,9 +12,8 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Floats
 from tracklake.schemas.chart_theme import INK, MUTED, PAPER
 from tracklake.schemas.drawings import Drawing, Layers, Row, fix_scale, name_rows
-from tracklake.training.data.gathers import find_nearest, gather_nearest
+from tracklake.training.data.gathers import NEAREST, find_nearest, gather_nearest
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.inputs import NEAREST
 from tracklake.training.plots.picture import Picture, take_picture
 from tracklake.training.plots.picture_rows import outline_vehicle
 

@@ -13,9 +13,15 @@ import numpy.typing as npt
 from tracklake.schemas.arrays import Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS, PARTS
 from tracklake.schemas.tensors import NOMINAL_LANE_M
-from tracklake.training.data.gathers import check_numbers, expand_groups, find_nearest, gather_nearest, locate_rows
+from tracklake.training.data.gathers import (
+    check_numbers,
+    expand_groups,
+    find_nearest,
+    gather_nearest,
+    locate_rows,
+    read_samples,
+)
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

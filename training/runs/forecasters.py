@@ -8,11 +8,11 @@ from typing import Any
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.text import find_similar
-from tracklake.training.data.observed import Truth
+from tracklake.training.data.gathers import NEAREST, read_samples, truth_of_ego
+from tracklake.training.data.observed import Reads, Truth
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models import MODELS, Predictor, Reads, find_model
+from tracklake.training.models import MODELS, Predictor, find_model
 from tracklake.training.models.fitting import Fit, fit_model
-from tracklake.training.models.inputs import NEAREST, read_samples, truth_of_ego
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
 

@@ -9,6 +9,7 @@ from tensor_tables import TINY, drive, random_clock, sample_everything, split_ro
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.tensors import ARRAYS, MOST_TICKS
+from tracklake.training.data.gathers import read_samples
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation import guard
@@ -21,7 +22,6 @@ from tracklake.training.evaluation.guard import (
     refuse_future,
 )
 from tracklake.training.models.constant_velocity import ConstantVelocity
-from tracklake.training.models.inputs import read_samples
 from tracklake.training.models.prediction import Density, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

@@ -9,9 +9,8 @@ import torch
 from tiny_network import read_log, register, write_tiny
 
 import tracklake.training.loop
-from tracklake.training.data.gathers import gather_nearest
+from tracklake.training.data.gathers import gather_nearest, read_samples
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
-from tracklake.training.models.inputs import read_samples
 from tracklake.training.train import TrainConfig, train
 
 
