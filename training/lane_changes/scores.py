@@ -197,16 +197,13 @@ def learn_curve(
     counts = counts[counts > 0]
     most = int(len(counts) * counts.min())
     sizes = sorted({min(size, most) for size in sizes})
-    # Samples that any of the draws needs are read once.
-    largest = {seed: draw_balanced(pool.stratum, sizes[-1], np.random.default_rng(seed)) for seed in seeds}
-    needed = np.unique(np.concatenate(list(largest.values())))
-    examples = gather_examples(folder, pool.select(needed))
     truth = gather_examples(folder, scored.draw(MOST_SCORED, seed=0))
     points: list[LearningPoint] = []
     for seed in seeds:
-        of_seed, stratum = np.searchsorted(needed, largest[seed]), pool.stratum[largest[seed]]
+        largest = pool.select(draw_balanced(pool.stratum, sizes[-1], np.random.default_rng(seed)))
+        examples = gather_examples(folder, largest)
         for size in sizes:
-            drawn = examples.select(of_seed[draw_balanced(stratum, size, np.random.default_rng(seed))])
+            drawn = examples.select(draw_balanced(largest.stratum, size, np.random.default_rng(seed)))
             if len(np.unique(drawn.maneuver)) < 2:  # no forest
                 continue
             for augmentation in dict.fromkeys([(), settings.augmentation]):

@@ -15,7 +15,7 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.models.constant_velocity import velocity_ticks
-from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
+from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_gaussian, to_prediction
 from tracklake.training.models.network import Network, check_choice, check_phase, find_anchored, to_numpy
 from tracklake.training.models.prediction import Prediction
 
@@ -207,13 +207,13 @@ class SceneAttention(Network):
     def predict_tensors(self, observed: ObservedScene[Tensor]) -> Prediction:
         """Return the ego's mean and density."""
         mean, sigma, rho = (part[:, 0] for part in self(observed))
-        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
+        return to_prediction((mean, sigma, rho))
 
     def predict_vehicles(self, observed: ObservedScene[Any]) -> Prediction:
         """Predict all vehicles that `limit` leaves of scenes of NumPy arrays, scene by scene."""
         present = torch.from_numpy(self.limit(observed).vehicle_mask)
         mean, sigma, rho = (part.cpu()[present] for part in self.infer(observed, self))
-        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
+        return to_prediction((mean, sigma, rho))
 
     def read_attention(self, observed: ObservedScene[Any]) -> Attention:
         """Return the attention weights for scenes of NumPy arrays."""

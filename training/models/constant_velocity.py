@@ -174,30 +174,20 @@ def _filter(protocol: Protocol, measurement_m: Floats, density: Floats) -> tuple
     """Run A filters with noise (A,), (A,): weights (A, F, H) of past positions in those ahead, and variances (A, F)."""
     tick_s, past = 1.0 / protocol.rate_hz, np.eye(protocol.history_ticks)
     ahead_s: Floats = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float64) * tick_s
+    move = np.array([[1.0, tick_s], [0.0, 1.0]])
+    added = density[:, None, None] * np.array([[tick_s**3 / 3, tick_s**2 / 2], [tick_s**2 / 2, tick_s]])
     noise = np.square(measurement_m)
     covariance = noise[:, None, None] * np.array([[1.0, 1.0 / tick_s], [1.0 / tick_s, 2.0 / tick_s**2]])
     position = np.tile(past[1], (len(noise), 1))  # (A, H): a weight for each past position
     velocity = np.tile((past[1] - past[0]) / tick_s, (len(noise), 1))
     for recorded in past[2:]:
-        covariance = _predicted(covariance, density, np.array(tick_s))
+        covariance = move @ covariance @ move.T + added
         column = covariance[:, :, 0]  # (A, 2) of position and velocity with the position
         gain = column / (column[:, :1] + noise[:, None])
         covariance = covariance - gain[:, :, None] * column[:, None, :]
         position = position + velocity * tick_s
         surprise = recorded - position
         position, velocity = position + gain[:, :1] * surprise, velocity + gain[:, 1:] * surprise
-    ahead = _predicted(covariance[:, None], density[:, None], ahead_s)  # (A, F, 2, 2)
-    weights = position[:, None] + velocity[:, None] * ahead_s[:, None]
-    return weights, ahead[..., 0, 0] + noise[:, None]
-
-
-def _predicted(covariance: Floats, density: Floats, time_s: Floats) -> Floats:
-    """Return covariances (..., 2, 2) after a time (...) of white-noise acceleration of a density (...)."""
-    shape = np.broadcast_shapes(density.shape, time_s.shape)
-    move, added = np.zeros((*shape, 2, 2)), np.zeros((*shape, 2, 2))
-    move[..., 0, 0] = move[..., 1, 1] = 1.0
-    move[..., 0, 1] = added[..., 1, 1] = time_s
-    added[..., 0, 0] = time_s**3 / 3
-    added[..., 0, 1] = added[..., 1, 0] = time_s**2 / 2
-    added *= density[..., None, None]
-    return move @ covariance @ np.swapaxes(move, -1, -2) + added
+    (place, shared), (_, speed) = np.moveaxis(covariance, 0, -1)[..., None]  # (A, 1) each
+    variance = place + 2 * shared * ahead_s + speed * ahead_s**2 + density[:, None] * ahead_s**3 / 3
+    return position[:, None] + velocity[:, None] * ahead_s[:, None], variance + noise[:, None]

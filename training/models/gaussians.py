@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from tracklake.training.models.network import to_numpy
-from tracklake.training.models.prediction import Density
+from tracklake.training.models.prediction import Density, Prediction
 
 Gaussian = tuple[Tensor, Tensor, Tensor]
 """Mean (..., F, 2) in m, sigma (..., F, 2) in m, and rho (..., F)."""
@@ -57,6 +57,11 @@ def to_density(mean: Tensor, sigma: Tensor, rho: Tensor, weight: Tensor | None =
     if weight is None:
         weight, mean, sigma, rho = mean.new_ones((len(mean), 1)), mean[:, None], sigma[:, None], rho[:, None]
     return Density(*(to_numpy(part) for part in (weight, mean, sigma, rho)))
+
+
+def to_prediction(gaussian: Gaussian) -> Prediction:
+    """Convert a density of one alternative (B, F) to a prediction: its means and itself."""
+    return Prediction(to_numpy(gaussian[0]), to_density(*gaussian))
 
 
 def keep_within(value: Tensor, low: float, high: float) -> Tensor:

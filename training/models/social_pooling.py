@@ -7,7 +7,7 @@ from torch.nn.functional import binary_cross_entropy, cross_entropy, leaky_relu,
 from tracklake.schemas.columns import LATERAL_MANEUVERS, LONGITUDINAL_MANEUVERS
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import COLUMNS, ROWS, Observed, Truth
-from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian
+from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_density, to_gaussian, to_prediction
 from tracklake.training.models.network import (
     Network,
     Straight,
@@ -57,8 +57,7 @@ class VanillaLstm(Network):
 
     def predict_tensors(self, observed: Observed[Tensor]) -> Prediction:
         """Return the means and their density, of one alternative."""
-        mean, sigma, rho = self(observed.history)
-        return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
+        return to_prediction(self(observed.history))
 
 
 class SocialPooling(Network):
@@ -204,8 +203,7 @@ class SocialPooling(Network):
         """Return the means of the most probable maneuver, the mixture of all, and their probabilities."""
         encoding = self.encode(observed)
         if not self.maneuvers:
-            mean, sigma, rho = self._to_gaussian(self.decode(encoding), observed.history)
-            return Prediction(to_numpy(mean), to_density(mean, sigma, rho))
+            return to_prediction(self._to_gaussian(self.decode(encoding), observed.history))
         lateral, longitudinal = (head(encoding).softmax(dim=1) for head in (self.op_lat, self.op_lon))
         weight = (lateral[:, :, None] * longitudinal[:, None, :]).flatten(start_dim=1)  # (B, 6)
         alternative = torch.arange(LATERAL * LONGITUDINAL, device=encoding.device)
