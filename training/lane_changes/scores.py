@@ -28,7 +28,7 @@ from tracklake.training.lane_changes.examples import (
 )
 from tracklake.training.lane_changes.features import FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.run_folder import refuse_leak

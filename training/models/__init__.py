@@ -183,12 +183,12 @@ _ATTENTION = {
 }
 
 _MODELS = (
-    Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", ".constant_velocity", "ConstantVelocity"),
+    Model("constant-velocity", "keeps the velocity of the last 0.2 s", "", ".motion", "ConstantVelocity"),
     Model(
         "damped-velocity",
         "constant velocity along the road, while the lateral velocity decays",
         "",
-        ".constant_velocity",
+        ".motion",
         "DampedVelocity",
         {"decay_s": 1.0},
         fitted=True,
@@ -197,7 +197,7 @@ _MODELS = (
         "kalman-cv",
         "Kalman filter over the history with constant velocity and white-noise acceleration",
         BAR_SHALOM,
-        ".constant_velocity",
+        ".motion",
         "KalmanConstantVelocity",
         {
             "measurement_longitudinal_m": 0.15,
@@ -207,7 +207,7 @@ _MODELS = (
         },
         fitted=True,
     ),
-    Model("ctrv", "constant turn rate and velocity", SCHUBERT, ".ctrv", "ConstantTurnRate"),
+    Model("ctrv", "constant turn rate and velocity", SCHUBERT, ".motion", "ConstantTurnRate"),
     Model(
         "lstm",
         "small LSTM encoder-decoder on the deviation from constant velocity",

@@ -14,8 +14,8 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.observed import ObservedScene, Truth
-from tracklake.training.models.constant_velocity import velocity_ticks
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_gaussian, to_prediction
+from tracklake.training.models.motion import velocity_ticks
 from tracklake.training.models.network import Network, check_choice, check_phase, find_anchored, to_numpy
 from tracklake.training.models.prediction import Prediction
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.motion import velocity_ticks
 from tracklake.training.models.network import PlaceNetwork, Straight
 
 SPEED_SCALE_MPS = 15.0

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
-from tracklake.training.models.constant_velocity import extrapolate, velocity_ticks
+from tracklake.training.models.motion import extrapolate, velocity_ticks
 from tracklake.training.models.prediction import Prediction
 
 Result = TypeVar("Result")

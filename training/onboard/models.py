@@ -75,7 +75,7 @@ def predict_turns(samples: Samples, ticks: int = V2V.horizon_ticks) -> Singles:
     The turn rate is the slope of `rel_heading_deg` over the history, by least squares: relative to the ego, so that on
     a bend which both drive, neither turns. The vehicle leaves the straight place by its arc less the arc's tangent.
 
-    Source: Schubert, Richter and Wanielik 2008, as `training.models.ctrv`.
+    Source: Schubert, Richter and Wanielik 2008, as `training.models.motion`.
     """
     heading = np.unwrap(np.radians(samples.feature[:, :, FEATURE_NUMBER["rel_heading_deg"]].astype(np.float64)), axis=1)
     time_s = np.arange(heading.shape[1]) / V2V.rate_hz

@@ -18,7 +18,7 @@ from tracklake.pipeline.cli.tables import format_number, print_table
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.comparisons import COMPARISON_TABLES, VEHICLE_ERRORS
 from tracklake.schemas.evaluations import EVALUATIONS
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 
 EVIDENCE = COMPARISON_TABLES[1:]

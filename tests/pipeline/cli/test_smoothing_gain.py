@@ -22,7 +22,7 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.runs.forecasters import Forecaster
 
 PAST = [(-4.0, -1.0), (-2.0, -0.5), (0.0, 0.0)]

@@ -10,7 +10,7 @@ from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.comparison import feasibility
 from tracklake.training.comparison.feasibility import measure_feasibility
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

@@ -20,7 +20,7 @@ from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import EmptyPartError, measure_errors
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Density, NotFiniteError, Prediction
 from tracklake.training.runs.forecasters import Forecaster, UnknownRunError
 

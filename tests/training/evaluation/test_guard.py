@@ -21,7 +21,7 @@ from tracklake.training.evaluation.guard import (
     find_scene_samples,
     refuse_future,
 )
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Density, Prediction
 from tracklake.training.runs.forecasters import Forecaster
 

@@ -19,7 +19,7 @@ from tracklake.training.lane_changes.cells import find_columns, find_rows, measu
 from tracklake.training.lane_changes.examples import LaneForestSettings, label_samples
 from tracklake.training.lane_changes.forest import LaneForest, fit_lane_forest
 from tracklake.training.lane_changes.scores import evaluate_grid, learn_curve
-from tracklake.training.models.constant_velocity import ConstantVelocity
+from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.forecasters import Forecaster
 from tracklake.training.runs.run_folder import StaleRunError

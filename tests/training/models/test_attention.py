@@ -16,7 +16,7 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.models.attention import MultiHeadAttention, describe_vehicles
-from tracklake.training.models.constant_velocity import velocity_ticks
+from tracklake.training.models.motion import velocity_ticks
 
 H, F = CSP.history_ticks, CSP.horizon_ticks
 TEN_HZ = replace(CSP, rate_hz=10)

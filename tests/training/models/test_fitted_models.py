@@ -16,8 +16,8 @@ from tracklake.pipeline.cli.score_tables import describe_fit
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
-from tracklake.training.models.constant_velocity import DampedVelocity, KalmanConstantVelocity, velocity_ticks
 from tracklake.training.models.fitting import Fit, fit_model, search, sum_moments
+from tracklake.training.models.motion import DampedVelocity, KalmanConstantVelocity, velocity_ticks
 from tracklake.training.runs.forecasters import open_forecaster
 from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import train

@@ -14,8 +14,7 @@ from scipy.stats import multivariate_normal
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
-from tracklake.training.models.constant_velocity import AXES
-from tracklake.training.models.ctrv import ConstantTurnRate
+from tracklake.training.models.motion import AXES, ConstantTurnRate
 
 PROTOCOLS = (CSP, TWO_SECONDS)
 UNTAUGHT = [name for name, model in MODELS.items() if not model.learns]
