@@ -15,11 +15,11 @@ from tiny_network import write_tiny
 
 import tracklake
 from tracklake.schemas.errors import UsageError
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.data.batches import Batch
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import find_model
 from tracklake.training.runs.checkpoint import UnfinishedError
-from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import TrainConfig, TrainingInterruptedError, train
 
 PAGE = (Path(__file__).parents[1] / "docs" / "own-models.md").read_text()

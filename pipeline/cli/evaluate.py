@@ -38,13 +38,13 @@ from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
 from tracklake.schemas.published_results import published_rows
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import Evaluation, measure_errors
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
-from tracklake.training.runs.run_folder import StaleRunError
 
 FOLDER = "evaluations"
 """Folder of the lake with one table of scores per protocol."""

@@ -20,10 +20,10 @@ from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.extras import require_extras
 from tracklake.schemas.files import write_file, write_output
 from tracklake.schemas.origin import describe_synthetic
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.plots.picture import Picture, forecast_samples, forecast_scene, take_picture
 from tracklake.training.runs.forecasters import Forecaster, open_forecaster
-from tracklake.training.runs.run_folder import StaleRunError
 
 if TYPE_CHECKING:
     from tracklake.training.models.attention import SceneAttention

@@ -12,6 +12,7 @@ from tracklake.pipeline.stages.readers import LakeReader
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.documents import read_json
+from tracklake.schemas.run_config import AGAIN, StaleRunError, read_config
 from tracklake.schemas.tensor_index import read_index
 from tracklake.schemas.tensors import INDEX_FILE
 
@@ -57,8 +58,6 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
 
     `skip` is called with a message for each run that is damaged or of another version.
     """
-    from tracklake.training.runs.run_folder import StaleRunError, read_config
-
     commit = manifest.commits.get(TENSORS)
     if commit is None or commit.info["path"] is None:
         return []
@@ -84,8 +83,6 @@ def _name_run(name: str, config: dict[str, Any]) -> str:
 
 def _read_score(path: Path) -> dict[str, Any] | None:
     """Return part and rows of a run's metrics.json; None where the part had no samples."""
-    from tracklake.training.runs.run_folder import AGAIN, StaleRunError
-
     try:
         evaluation = read_json(path)["evaluation"]
         if evaluation is None:

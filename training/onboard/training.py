@@ -11,6 +11,7 @@ import numpy as np
 from tracklake.schemas.arrays import Singles
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.protocols import V2V
+from tracklake.schemas.run_config import AGAIN, RUN_VERSION, StaleRunError, read_config
 from tracklake.training.models import Recipe, require_torch
 from tracklake.training.onboard.collisions import score_warnings
 from tracklake.training.onboard.models import (
@@ -24,7 +25,7 @@ from tracklake.training.onboard.models import (
 from tracklake.training.onboard.samples import Parts, Samples, augment_samples
 from tracklake.training.onboard.scores import score_model
 from tracklake.training.runs.config import TrainConfig, find_device
-from tracklake.training.runs.run_folder import AGAIN, RUN_VERSION, StaleRunError, load_weights, read_config, save_run
+from tracklake.training.runs.run_folder import load_weights, save_run
 
 if TYPE_CHECKING:
     import torch

@@ -7,6 +7,7 @@ from typing import Any
 
 from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.schemas.text import find_similar
 from tracklake.training.data.gathers import NEAREST, read_samples, truth_of_ego
 from tracklake.training.data.observed import Reads, Truth
@@ -14,7 +15,7 @@ from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, find_model
 from tracklake.training.models.fitting import Fit, fit_model
 from tracklake.training.models.prediction import Prediction
-from tracklake.training.runs.run_folder import StaleRunError, load_run, refuse_leak, refuse_unfinished
+from tracklake.training.runs.run_folder import load_run, refuse_leak, refuse_unfinished
 
 BATCH_SIZE = 256
 """Number of samples predicted at once; predictions do not depend on it. With 2,048, the largest network's values leave

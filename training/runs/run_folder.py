@@ -14,11 +14,11 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from tracklake.schemas.documents import read_json
-from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
+from tracklake.schemas.errors import UNREADABLE, UsageError
 from tracklake.schemas.files import replace_folder
 from tracklake.schemas.hashing import hash_chunks
 from tracklake.schemas.protocols import Protocol
+from tracklake.schemas.run_config import AGAIN, RUN_VERSION, StaleRunError, read_config
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import Predictor, Recipe, find_model
@@ -28,22 +28,12 @@ from tracklake.training.runs.checkpoint import RESTART, UnfinishedError, describ
 if TYPE_CHECKING:
     from torch import nn
 
-RUN_VERSION = 2
-"""Number of the run folder's layout; it grows when older runs cannot be read."""
-
-AGAIN = "train it again"
 TRAINED_BY = ("tracklake", "torch")
 """Distributions whose versions a run records."""
-KINDS = {"model": str, "parameters": dict, "protocol": dict, "train_subsets": list, "val_subsets": list, "blocks": list}
-"""Keys that a run's config must hold, and their types."""
 UNCHANGING = frozenset({"threads", "device", "log_steps", "checkpoint_s"})
 """Settings of a training that say how it is run and logged, not what is learned."""
 HASHED_BYTES = 1 << 22
 """Size of the pieces that are hashed, in bytes, so that Ctrl-C does not wait for a whole array."""
-
-
-class StaleRunError(TracklakeError):
-    """A run cannot be evaluated on these tensors: it was trained for others, is unfinished, or is damaged."""
 
 
 def describe_run(
@@ -141,27 +131,6 @@ def load_weights(network: "nn.Module", file: Path) -> None:
     except (*UNREADABLE, BadZipFile, EOFError, UnpicklingError, zlib.error) as wrong:
         reason = f"damaged, or not the weights of this model ({describe_damage(wrong)})"
         raise StaleRunError(f"{file}: {reason}; {AGAIN}") from None
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """Read a run's `config.json`; StaleRunError where it is of another version, or damaged."""
-    file = path / "config.json"
-    try:
-        config = read_json(file)
-    except ValueError as broken:
-        raise StaleRunError(f"{file}: not readable as JSON ({broken}); {AGAIN}") from None
-    version = config.get("version") if isinstance(config, dict) else f"a {type(config).__name__}"
-    if version != RUN_VERSION:
-        raise StaleRunError(f"{file}: expected version {RUN_VERSION}, got {version}; {AGAIN}")
-    config = {"val_subsets": [], **config}
-    lacking = sorted(name for name, kind in KINDS.items() if not isinstance(config.get(name), kind))
-    if not lacking and not {"name", "digest"} <= config["protocol"].keys():
-        lacking = ["the name and digest of a protocol"]
-    if not lacking and not all(isinstance(name, str) for name in config["train_subsets"] + config["val_subsets"]):
-        lacking = ["names of subsets"]
-    if lacking:
-        raise StaleRunError(f"{file}: expected {', '.join(lacking)} in it; {AGAIN}")
-    return config
 
 
 def refuse_unfinished(path: Path) -> None:

@@ -8,7 +8,7 @@ from tiny_network import write_tiny
 
 from tracklake.pipeline.lake.files import MODELS, TENSORS
 from tracklake.pipeline.stages.score import collect_scores
-from tracklake.training.runs.run_folder import RUN_VERSION
+from tracklake.schemas.run_config import RUN_VERSION
 
 ROW = {"seconds": 1.0, "rmse_m": 2.5, "rmse_longitudinal_m": 2.4, "n": 7}
 MANIFEST = SimpleNamespace(commits={TENSORS: SimpleNamespace(info={"path": "tensors"}, all_files=[])})

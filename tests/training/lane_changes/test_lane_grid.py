@@ -13,6 +13,7 @@ from sklearn.ensemble import RandomForestClassifier
 
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.lane_forest import LEFT_OUT, STRATA
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import FutureInputError
 from tracklake.training.lane_changes.cells import find_columns, find_rows, measure_rows, number_cells
@@ -22,7 +23,6 @@ from tracklake.training.lane_changes.scores import evaluate_grid, learn_curve
 from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import Prediction
 from tracklake.training.runs.forecasters import Forecaster
-from tracklake.training.runs.run_folder import StaleRunError
 
 LANES = np.array([[[-3.5, 3.0, 1], [0.5, 4.0, 1], [4.5, 4.0, 1]]], np.float32)
 """The own lane reaches from -1.5 to 2.5 m; so one lane's width to the left ends at -5.5 m, to the right at 6.5 m."""

@@ -14,12 +14,12 @@ from tiny_network import write_tiny
 
 from tracklake.pipeline.cli.score_tables import describe_fit
 from tracklake.schemas.protocols import CSP
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
 from tracklake.training.models.fitting import Fit, fit_model, search, sum_moments
 from tracklake.training.models.motion import DampedVelocity, KalmanConstantVelocity, velocity_ticks
 from tracklake.training.runs.forecasters import open_forecaster
-from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import train
 
 FITTED = [name for name, model in MODELS.items() if model.fitted]

@@ -9,13 +9,14 @@ import torch
 from drive_tables import make_drive, make_traffic
 
 from tracklake.schemas.errors import TracklakeError, UsageError
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.models.prediction import NotFiniteError
 from tracklake.training.onboard.models import CTRV, make_forecaster, predict_straight, predict_turns
 from tracklake.training.onboard.networks import RecursiveDecoder, StackedLstm
 from tracklake.training.onboard.samples import FEATURE_NUMBER, build_samples, split_samples
 from tracklake.training.onboard.training import describe_run, open_model, run_network, train_network
 from tracklake.training.runs.config import TrainConfig
-from tracklake.training.runs.run_folder import StaleRunError, save_run
+from tracklake.training.runs.run_folder import save_run
 
 ONE_EPOCH = TrainConfig(epochs=1, seed=3)
 

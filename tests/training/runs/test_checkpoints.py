@@ -15,6 +15,7 @@ from tensor_tables import TINY
 from tiny_network import PARTS, RECIPE, Forgetful, register, write_tiny
 
 from tracklake.schemas.hashing import hash_chunks
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.runs.checkpoint import (
     CHECKPOINT_FILE,
     UnfinishedError,
@@ -22,7 +23,6 @@ from tracklake.training.runs.checkpoint import (
     is_unfinished,
     unfinished_folder,
 )
-from tracklake.training.runs.run_folder import StaleRunError
 from tracklake.training.train import TrainConfig, TrainingInterruptedError, train
 
 # 4 steps an epoch; `mse` for 2 of 3 epochs. Other than one step after the other: dropout, Adam's moments, a cosine,

@@ -13,10 +13,11 @@ from tensor_tables import TINY
 from tiny_network import register, write_tiny
 
 from tracklake.schemas.errors import TracklakeError
+from tracklake.schemas.run_config import StaleRunError
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MAX_PARAMETER, MODELS
-from tracklake.training.runs.run_folder import StaleRunError, load_run
+from tracklake.training.runs.run_folder import load_run
 from tracklake.training.train import TrainConfig, train
 
 CONFIG = TrainConfig(epochs=3, patience=5, seed=4)

@@ -15,9 +15,10 @@ from scored_runs import evaluate
 from tensor_tables import TINY, split_row
 from tiny_network import PARTS, Forgetful, register, write_tiny
 
+from tracklake.schemas.run_config import RUN_VERSION, StaleRunError
 from tracklake.schemas.tensors import ARRAYS
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.runs.run_folder import RUN_VERSION, StaleRunError, digest_tensors, find_versions, load_run
+from tracklake.training.runs.run_folder import digest_tensors, find_versions, load_run
 from tracklake.training.train import TrainConfig, train
 
 CONFIG = TrainConfig(epochs=1)
