@@ -17,10 +17,9 @@ from tracklake.training.data.gathers import read_samples
 from tracklake.training.data.observed import Reads
 from tracklake.training.data.tensor_folder import DeviceFolder, TensorFolder
 from tracklake.training.evaluation.guard import refuse_future
-from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, restore, save_checkpoint
+from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, Row, TrainingState, open_log, restore, save_checkpoint
 from tracklake.training.runs.config import Plan
 from tracklake.training.runs.forecasters import Forecaster
-from tracklake.training.runs.progress import Row, TrainingState, open_log
 
 if TYPE_CHECKING:
     import torch

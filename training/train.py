@@ -11,10 +11,9 @@ from tracklake.training.loop import DivergedError, Progress, fit_network
 from tracklake.training.models import Model, find_model, require_torch
 from tracklake.training.models.fitting import fit_model
 from tracklake.training.models.prediction import NotFiniteError
-from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, claim_folder, read_checkpoint
+from tracklake.training.runs.checkpoint import CHECKPOINT_FILE, COLUMNS, claim_folder, read_checkpoint
 from tracklake.training.runs.config import TrainConfig, make_plan
 from tracklake.training.runs.forecasters import Forecaster
-from tracklake.training.runs.progress import COLUMNS
 from tracklake.training.runs.run_folder import describe_run, refuse_other_run, refuse_replacement, save_run
 
 __all__ = ["DivergedError", "TrainConfig", "TrainingInterruptedError", "train"]

@@ -15,10 +15,10 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
 from tracklake.schemas.lane_forest import ALL, CellScore, GridScores, LearningPoint, ManeuverScore
 from tracklake.training.data.tensor_folder import TensorFolder
+from tracklake.training.evaluation.evaluate import require_samples
 from tracklake.training.evaluation.guard import refuse_future
 from tracklake.training.lane_changes.cells import OUTSIDE, Codes, find_columns, find_rows, measure_rows, number_cells
 from tracklake.training.lane_changes.examples import (
-    LabelledSamples,
     LaneForestSettings,
     Targets,
     draw_balanced,
@@ -191,8 +191,14 @@ def learn_curve(
         TracklakeError: one of the parts has no samples, or none whose maneuver is known; or see `fit_examples`.
     """
     settings = settings or LaneForestSettings()
+    for part in ("train", "eval"):
+        require_samples(folder, part)
     pool, scored = (label_samples(folder, part, settings) for part in ("train", "eval"))
-    _refuse_empty(folder, {"train": pool, "eval": scored}, settings)
+    if empty := [part for part, labelled in (("train", pool), ("eval", scored)) if not len(labelled)]:
+        raise TracklakeError(
+            f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
+            f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
+        )
     counts = pool.count_strata()
     counts = counts[counts > 0]
     most = int(len(counts) * counts.min())
@@ -215,20 +221,3 @@ def learn_curve(
                 facts = (len(drawn), bool(augmentation), seed, own.n)
                 points.append(LearningPoint(*facts, own.accuracy, own.balanced, lane, own.majority))
     return points
-
-
-def _refuse_empty(folder: TensorFolder, pools: dict[str, LabelledSamples], settings: LaneForestSettings) -> None:
-    """Refuse parts without samples, or without samples whose maneuver is known."""
-    empty = [part for part, pool in pools.items() if not len(pool)]
-    without = [part for part in empty if not len(folder.samples_of(part))]
-    if without:
-        raise TracklakeError(
-            f"{folder.path}: a learning curve is fitted on `train` and scored on `eval`, and the split "
-            f"`{folder.split}` has no samples in {' and '.join(f'`{part}`' for part in without)}; with a single "
-            "recording everything trains: add recordings and run `tracklake split`"
-        )
-    if empty:
-        raise TracklakeError(
-            f"{folder.path}: no sample of {' and '.join(empty)} has a lane and a track that goes on for the horizon "
-            f"and {settings.start_s:g} s, so that its maneuver is known; it needs longer recordings"
-        )

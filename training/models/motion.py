@@ -224,7 +224,8 @@ class ConstantTurnRate:
         history = observed.history.astype(np.float64)
         chord, duration_s = history[:, -1] - history[:, -1 - self.ticks], self.ticks / self.rate_hz
         turn = self._yaw_rate(history)[:, None]  # (B, 1) rad/s, positive to the right
-        length = self.ahead_s * _sinc(turn * self.ahead_s / 2) / (duration_s * _sinc(turn * duration_s / 2))  # (B, F)
+        half = turn / (2 * np.pi)  # np.sinc(a) is sin(pi a) / (pi a)
+        length = self.ahead_s * np.sinc(half * self.ahead_s) / (duration_s * np.sinc(half * duration_s))  # (B, F)
         angle = turn * (self.ahead_s + duration_s) / 2
         cos, sin = length * np.cos(angle), length * np.sin(angle)
         along, across = chord[:, :1], chord[:, 1:]
@@ -242,8 +243,3 @@ class ConstantTurnRate:
         duration_s = ticks / self.rate_hz
         slowest = np.minimum(np.hypot(*last.T), np.hypot(*before.T)) / duration_s
         return np.where(slowest < LEAST_SPEED_MPS, 0.0, np.arctan2(cross, dot) / duration_s)
-
-
-def _sinc(angle: np.ndarray) -> np.ndarray:
-    """Return sin(a) / a, which is 1 at 0."""
-    return np.sinc(angle / np.pi)

@@ -143,7 +143,7 @@ class SocialPooling(Network):
         return pooled.flatten(start_dim=1)
 
     def _pool_sparsely(self, states: Tensor, sample: Tensor, cell: Tensor, samples: int) -> Tensor:
-        """Compute `_pool_densely` from occupied cells only, a quarter of all or fewer: 15 % less time per step.
+        """Compute `_pool_densely` from occupied cells only: 11 % less time per step with 2.5 neighbors, 5 % with 9.
 
         A neighbor in row r enters the outputs r - 2, r - 1 and r of the first convolution; those below 0 and above 10
         do not exist and are dropped.

@@ -277,7 +277,7 @@ def test_the_learning_curve(busy):
 def test_no_curve_without_an_evaluation_part(tmp_path):
     folder = open_tracks(tmp_path / "t", {"a": track(1, [2.0] * 20)})
     with pytest.raises(
-        TracklakeError, match=r"split `mine` has no samples in `eval`; with a single recording everything"
+        TracklakeError, match=r"split `mine` has no samples in `eval` \(samples: train .*; add recordings, or"
     ):
         learn_curve(folder, settings=SMALL)
     brief = {"a": track(1, [2.0] * 20), "b": track(1, [2.0] * 5)}
