@@ -1,6 +1,7 @@
 """Records of `lane_forest.json`: features of a forest that predicts lane changes, and scores of maneuvers and cells."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 STRATA = ("accelerating, keeping", "accelerating, changing", "decelerating, keeping", "decelerating, changing")
 """Groups of samples. Accelerating: the recorded speed is at least what it was a second ago. Changing: the label is
@@ -10,6 +11,44 @@ ALL = "all"
 LEFT_OUT = ("no lane", "future unknown", "maneuver unknown", "speed unknown")
 """Why a sample is left out: it has no lane now; its track ends before the horizon, or before T_d, the time that a
 maneuver takes, has passed; or its speed is unknown, now or a second ago. The first that applies counts."""
+SAME, NEGATED = "same", "negated"
+
+
+class Feature(NamedTuple):
+    """One number that describes a target: lateral values are positive to the right.
+
+    `mirrored` is the value on the mirrored road: SAME, NEGATED, or the name of another feature.
+    """
+
+    name: str
+    meaning: str
+    mirrored: str = SAME
+
+
+FEATURES = (
+    Feature("speed_mps", "along the road"),
+    Feature("accel_mps2", "along the road"),
+    Feature("lateral_speed_mps", "across the road", NEGATED),
+    Feature("lateral_accel_mps2", "across the road", NEGATED),
+    Feature("heading_rad", "of the velocity, from the direction of travel", NEGATED),
+    Feature("yaw_rate_radps", "change of the heading; stands in for the steering", NEGATED),
+    Feature("moved_m", "across the road since the history's beginning", NEGATED),
+    Feature("offset_m", "from the centre of its lane", NEGATED),
+    Feature("left_marking_m", "from the vehicle's centre to the lane's left edge", "right_marking_m"),
+    Feature("right_marking_m", "from the vehicle's centre to the lane's right edge", "left_marking_m"),
+    Feature("left_lane", "1 where there is a lane to the left", "right_lane"),
+    Feature("right_lane", "1 where there is a lane to the right", "left_lane"),
+    Feature("ego", "1 where there is a vehicle behind; where there is none, all that follows is 0"),
+    Feature("ego_column", "lane of the vehicle behind: -1 left, 0 own, 1 right", NEGATED),
+    Feature("gap_m", "distance from the ego's front to the target's front"),
+    Feature("side_m", "distance of the target to the right of the ego", NEGATED),
+    Feature("relative_speed_mps", "the target's speed minus the ego's; the following likewise"),
+    Feature("relative_accel_mps2", "along the road"),
+    Feature("relative_lateral_speed_mps", "across the road", NEGATED),
+    Feature("relative_heading_rad", "of the velocities", NEGATED),
+    Feature("relative_yaw_rate_radps", "of the headings' changes", NEGATED),
+)
+"""All candidates; a fit chooses which of them its forest reads."""
 
 
 @dataclass(frozen=True)

@@ -184,7 +184,7 @@ def write_evidence(terminal: Terminal, folder: Path, tables: Tables) -> None:
         write_output(folder / f"{name}.csv", table.write_csv().encode())
     if not tables.get("calibration", pl.DataFrame()).is_empty():
         require_extras("the reliability plot", "report")
-        from tracklake.training.plots.reliability import draw_reliability  # Altair takes a second to import
+        from tracklake.quality_reports.plots.reliability import draw_reliability  # Altair takes a second to import
 
         write_output(folder / "reliability.svg", draw_reliability(tables["calibration"]).render(".svg"))
     terminal.print_line(f"evidence {folder}: {', '.join(sorted(own.name for own in folder.iterdir()))}", style="dim")

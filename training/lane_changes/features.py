@@ -6,14 +6,14 @@ behind in the target's own lane or, if there is none, the nearest one behind in 
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.lane_forest import Coefficient
+from tracklake.schemas.lane_forest import FEATURES, NEGATED, SAME, Coefficient
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.cells import find_columns
 
@@ -23,45 +23,6 @@ LEAST_SPEED_MPS = 1.0
 """Lowest speed used for headings and yaw rates, m/s: at standstill they would be noise."""
 LEAST_KNOWN = 2
 """Smallest number of known positions of an ego."""
-SAME, NEGATED = "same", "negated"
-
-
-class Feature(NamedTuple):
-    """One number that describes a target: lateral values are positive to the right.
-
-    `mirrored` is the value on the mirrored road: SAME, NEGATED, or the name of another feature.
-    """
-
-    name: str
-    meaning: str
-    mirrored: str = SAME
-
-
-FEATURES = (
-    Feature("speed_mps", "along the road"),
-    Feature("accel_mps2", "along the road"),
-    Feature("lateral_speed_mps", "across the road", NEGATED),
-    Feature("lateral_accel_mps2", "across the road", NEGATED),
-    Feature("heading_rad", "of the velocity, from the direction of travel", NEGATED),
-    Feature("yaw_rate_radps", "change of the heading; stands in for the steering", NEGATED),
-    Feature("moved_m", "across the road since the history's beginning", NEGATED),
-    Feature("offset_m", "from the centre of its lane", NEGATED),
-    Feature("left_marking_m", "from the vehicle's centre to the lane's left edge", "right_marking_m"),
-    Feature("right_marking_m", "from the vehicle's centre to the lane's right edge", "left_marking_m"),
-    Feature("left_lane", "1 where there is a lane to the left", "right_lane"),
-    Feature("right_lane", "1 where there is a lane to the right", "left_lane"),
-    Feature("ego", "1 where there is a vehicle behind; where there is none, all that follows is 0"),
-    Feature("ego_column", "lane of the vehicle behind: -1 left, 0 own, 1 right", NEGATED),
-    Feature("gap_m", "distance from the ego's front to the target's front"),
-    Feature("side_m", "distance of the target to the right of the ego", NEGATED),
-    Feature("relative_speed_mps", "the target's speed minus the ego's; the following likewise"),
-    Feature("relative_accel_mps2", "along the road"),
-    Feature("relative_lateral_speed_mps", "across the road", NEGATED),
-    Feature("relative_heading_rad", "of the velocities", NEGATED),
-    Feature("relative_yaw_rate_radps", "of the headings' changes", NEGATED),
-)
-"""All candidates; a fit chooses which of them its forest reads."""
-
 FEATURE_NAMES = tuple(feature.name for feature in FEATURES)
 FEATURE_NUMBER = {name: number for number, name in enumerate(FEATURE_NAMES)}
 """Position of each feature in FEATURES."""

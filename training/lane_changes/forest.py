@@ -73,7 +73,7 @@ class LaneForest:
     def predict_proba(self, described: Singles) -> Singles:
         """Predict probabilities of keep, left and right (B, 1 + T, 3), of the maneuver and the lane at each horizon.
 
-        `described` is (B, candidates) in the order of `features.FEATURES`. The probabilities hold for the mix of the
+        `described` is (B, candidates) in the order of FEATURES. The probabilities hold for the mix of the
         examples; on the road, where lane changes are far less frequent, those of changes are lower.
         """
         probability = np.zeros((len(described), 1 + len(self.horizons_s), len(LATERAL_MANEUVERS)), dtype=np.float32)
