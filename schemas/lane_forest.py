@@ -49,6 +49,9 @@ FEATURES = (
     Feature("relative_yaw_rate_radps", "of the headings' changes", NEGATED),
 )
 """All candidates; a fit chooses which of them its forest reads."""
+FEATURE_NAMES = tuple(feature.name for feature in FEATURES)
+FEATURE_NUMBER = {name: number for number, name in enumerate(FEATURE_NAMES)}
+"""Position of each feature in FEATURES."""
 
 
 @dataclass(frozen=True)

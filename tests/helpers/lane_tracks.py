@@ -5,12 +5,11 @@ import polars as pl
 from tensor_tables import CLOCK, split_row, write
 
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.lane_forest import FEATURES
+from tracklake.schemas.lane_forest import FEATURE_NUMBER, FEATURES
 from tracklake.schemas.protocols import Protocol
 from tracklake.schemas.samples import NEIGHBORS, SAMPLES
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.lane_changes.examples import Examples
-from tracklake.training.lane_changes.features import FEATURE_NUMBER
 
 SHORT = Protocol(
     name="short", rate_hz=2, history_s=1.0, horizon_s=2.0, min_future_s=0.5, scored_s=(0.5, 1.0, 2.0), split="mine"

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tracklake.schemas.arrays import Bytes, expand_ranges
+from tracklake.schemas.arrays import expand_ranges
 from tracklake.training.data.batches import Array, Batch, SceneBatch
 from tracklake.training.data.observed import Observed, ObservedScene, Reads, Truth, part_batch
 
@@ -176,6 +176,8 @@ def gather_scenes(folder: Folder, scenes: npt.ArrayLike, *, absolute: bool = Fal
     origin, subset = locate_rows(folder, row), folder.run_subset[run]
     lane, marked = folder.lane[row], folder.marked_lanes
     centre_m, width_m = marked[subset, np.clip(lane, 0, marked.shape[1] - 1)].T
+    codes = (folder.sample_lateral, folder.sample_longitudinal)
+    lateral, longitudinal = (np.where(sample >= 0, own[sample], np.int8(-1)).astype(np.int8) for own in codes)
     return SceneBatch(
         scene=scene,
         vehicle_scene=vehicle_scene,
@@ -185,8 +187,8 @@ def gather_scenes(folder: Folder, scenes: npt.ArrayLike, *, absolute: bool = Fal
         history_mask=history_mask,
         future=future,
         future_mask=future_mask,
-        lateral=_read_maneuvers(folder.sample_lateral, sample),
-        longitudinal=_read_maneuvers(folder.sample_longitudinal, sample),
+        lateral=lateral,
+        longitudinal=longitudinal,
         origin=origin,
         speed_mps=folder.speed_mps[row],
         lane=lane,
@@ -196,13 +198,6 @@ def gather_scenes(folder: Folder, scenes: npt.ArrayLike, *, absolute: bool = Fal
         has_right=(lane > 0) & (lane < folder.last_lane[subset]),
         absolute=absolute,
     )
-
-
-def _read_maneuvers(values: Bytes, sample: npt.NDArray[np.int32]) -> npt.NDArray[np.int8]:
-    """Return (V,) the maneuvers of vehicles that are samples, -1 for the others."""
-    found = np.full(len(sample), -1, dtype=np.int8)
-    found[sample >= 0] = values[sample[sample >= 0]]
-    return found
 
 
 def gather_nearest(folder: Folder, samples: npt.ArrayLike, *, nearest: int) -> tuple[ObservedScene[Any], Truth[Any]]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
-from tracklake.schemas.lane_forest import FEATURES, NEGATED, SAME, Coefficient
+from tracklake.schemas.lane_forest import FEATURE_NAMES, FEATURE_NUMBER, FEATURES, NEGATED, SAME, Coefficient
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.cells import find_columns
 
@@ -23,9 +23,6 @@ LEAST_SPEED_MPS = 1.0
 """Lowest speed used for headings and yaw rates, m/s: at standstill they would be noise."""
 LEAST_KNOWN = 2
 """Smallest number of known positions of an ego."""
-FEATURE_NAMES = tuple(feature.name for feature in FEATURES)
-FEATURE_NUMBER = {name: number for number, name in enumerate(FEATURE_NAMES)}
-"""Position of each feature in FEATURES."""
 
 
 def describe_targets(observed: ObservedScene[Any], rate_hz: int) -> Singles:

@@ -15,7 +15,7 @@ from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.documents import parse_json
 from tracklake.schemas.errors import UNREADABLE, TracklakeError, UsageError
 from tracklake.schemas.files import write_file
-from tracklake.schemas.lane_forest import STRATA
+from tracklake.schemas.lane_forest import FEATURE_NAMES, FEATURE_NUMBER, STRATA
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.data.tensor_folder import TensorFolder
@@ -26,7 +26,7 @@ from tracklake.training.lane_changes.examples import (
     gather_examples,
     label_samples,
 )
-from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER, choose_features, describe_targets
+from tracklake.training.lane_changes.features import choose_features, describe_targets
 from tracklake.training.models.prediction import Prediction
 
 VERSION = 2

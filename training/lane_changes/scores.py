@@ -13,7 +13,7 @@ import numpy as np
 from tracklake.schemas.arrays import Bytes, Flags, Floats, Integers, Singles
 from tracklake.schemas.columns import LATERAL_MANEUVERS
 from tracklake.schemas.errors import TracklakeError
-from tracklake.schemas.lane_forest import ALL, CellScore, GridScores, LearningPoint, ManeuverScore
+from tracklake.schemas.lane_forest import ALL, FEATURE_NUMBER, CellScore, GridScores, LearningPoint, ManeuverScore
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.evaluate import require_samples
 from tracklake.training.evaluation.guard import refuse_future
@@ -26,7 +26,6 @@ from tracklake.training.lane_changes.examples import (
     label_samples,
     read_targets,
 )
-from tracklake.training.lane_changes.features import FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import LaneForest, decide_classes, fit_examples
 from tracklake.training.models.motion import ConstantVelocity
 from tracklake.training.models.prediction import NotFiniteError

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from tracklake.schemas.lane_forest import LEFT_OUT, STRATA
+from tracklake.schemas.lane_forest import FEATURE_NAMES, LEFT_OUT, STRATA
 from tracklake.schemas.protocols import CSP
 from tracklake.training.data.tensor_folder import TensorFolder
-from tracklake.training.lane_changes.features import FEATURE_NAMES
 from tracklake.training.lane_changes.forest import LaneForest
 from tracklake.training.models import MODELS
 from tracklake.training.runs.run_folder import describe_run, save_run

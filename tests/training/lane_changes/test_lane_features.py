@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lane_tracks import CODES
 
+from tracklake.schemas.lane_forest import FEATURE_NAMES, FEATURE_NUMBER, FEATURES
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.data.observed import ObservedScene
 from tracklake.training.lane_changes.features import (
-    FEATURE_NAMES,
-    FEATURE_NUMBER,
-    FEATURES,
     choose_features,
     describe_targets,
     find_egos,

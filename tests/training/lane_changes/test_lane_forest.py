@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from tracklake.pipeline.cli.app import app
 from tracklake.schemas.errors import TracklakeError
-from tracklake.schemas.lane_forest import FEATURES, LEFT_OUT, STRATA
+from tracklake.schemas.lane_forest import FEATURE_NAMES, FEATURE_NUMBER, FEATURES, LEFT_OUT, STRATA
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import gather_nearest
 from tracklake.training.lane_changes.examples import (
@@ -25,7 +25,6 @@ from tracklake.training.lane_changes.examples import (
     gather_examples,
     label_samples,
 )
-from tracklake.training.lane_changes.features import FEATURE_NAMES, FEATURE_NUMBER
 from tracklake.training.lane_changes.forest import (
     VERSION,
     ForestError,
