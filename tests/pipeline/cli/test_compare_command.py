@@ -53,6 +53,7 @@ def test_a_copy_is_said_to_be_equal(command, lake, copied):
     assert (done.code, compared["equal"]) == (0, True)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("plain_flows", "empty_charts")
 def test_another_threshold_changes_its_findings_only(command, pair, tmp_path):
     copied = shutil.copytree(pair, tmp_path / "copy")

@@ -72,6 +72,7 @@ def test_the_sample_stays_out_of_a_lake_of_other_recordings(command, tmp_path, m
     assert count(tmp_path / "lake") == 20
 
 
+@pytest.mark.thorough
 def test_what_was_made_with_other_settings_is_refused_or_skipped(command, lake, tmp_path):
     copy = tmp_path / "lake"
     shutil.copytree(lake.root, copy)

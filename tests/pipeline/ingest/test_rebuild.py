@@ -110,6 +110,7 @@ def test_it_is_rebuilt_by_that_command_under_its_readers(command, made, old, mon
     assert not (old / "trax").exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("prefect_server")
 def test_a_rebuild_killed_in_the_middle_goes_on(command, made, old):
     write_highd(old.parent / "raw", "03")

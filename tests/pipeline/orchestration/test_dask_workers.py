@@ -194,6 +194,7 @@ def test_a_job_is_done_again_where_its_worker_was_killed_and_one_that_kills_all_
     assert read(root) == read(tmp_path / "threads")
 
 
+@pytest.mark.thorough
 def test_what_is_queued_is_cancelled_and_a_worker_that_joins_later_is_looked_at(start, unlike, tmp_path):
     address = start()
     calls = make_calls(toy_calls.wait, *((tmp_path, number) for number in range(8)))
