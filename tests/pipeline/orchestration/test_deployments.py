@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from prefect.client.orchestration import get_client
@@ -60,17 +60,27 @@ def test_a_scheduled_run_on_a_changed_folder(command, tmp_path):
             assert described.keys() == Settings.model_fields.keys() - {"lake"}
             assert all("description" in each for each in described.values())
 
+            def find_runs():
+                own = DeploymentFilter(id=DeploymentFilterId(any_=[scheduled.id]))
+                return client.read_flow_runs(deployment_filter=own, sort=FlowRunSort.EXPECTED_START_TIME_DESC)
+
             def run_next() -> tuple[str, str]:
-                """What Prefect's scheduler does every minute: have the next run of the schedule done."""
-                wanted = {"start_time": f"{datetime.now(UTC):%FT%TZ}", "min_runs": 1, "max_runs": 1}
+                """What Prefect's scheduler does every minute: have the next run of the schedule done.
+
+                The schedule has one run every two seconds: asked again for the time of a run that has ended, the server
+                makes no other.
+                """
+                earlier = find_runs()
+                after = [each.expected_start_time + timedelta(seconds=1) for each in earlier[:1]]
+                start = max([datetime.now(UTC), *after])
+                wanted = {"start_time": f"{start:%FT%T.%fZ}", "min_runs": 1, "max_runs": 1}
                 client.request("POST", "/deployments/{id}/schedule", path_params={"id": scheduled.id}, json=wanted)
 
-                def find_run():
-                    own = DeploymentFilter(id=DeploymentFilterId(any_=[scheduled.id]))
-                    runs = client.read_flow_runs(deployment_filter=own, sort=FlowRunSort.EXPECTED_START_TIME_DESC)
-                    return runs if runs and all(run.state.is_final() for run in runs) else None
+                def find_new():
+                    runs = find_runs()
+                    return len(runs) > len(earlier) and all(run.state.is_final() for run in runs) and runs
 
-                latest = wait_for(find_run, process)[0]
+                latest = wait_for(find_new, process)[0]
                 assert latest.auto_scheduled
                 return latest.name, latest.state.name
 
