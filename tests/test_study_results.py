@@ -7,7 +7,9 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from study.defects import DEFECTS
 from study.figure import draw_curves, draw_prices
+from study.jobs import Lake
 from study.page import (
     lay_out_by_density,
     lay_out_differences,
@@ -20,8 +22,8 @@ from study.page import (
 )
 from study.pieces import PIECES
 from study.plan import Arm, Learner, Source
-from study.results import Results, UnprovenError, is_price, judge
-from study.tables import NOTHING, TABLES
+from study.results import BRAKE, Results, UnprovenError, judge
+from study.tables import NOTHING, TABLES, pool_errors, read_dose, select_unseen
 from verdicts import check_verdicts
 
 from tracklake.schemas.chart_theme import BLUE, ORANGE
@@ -59,73 +61,127 @@ def test_errors_of_two_splits_are_subtracted_with_both_their_intervals():
     assert found == pytest.approx({"difference": 2.0, "low": 1.5, "high": 2.5})
 
 
-def test_the_price_of_leakage_is_what_constant_velocity_does_not_share():
-    """Better than it by 1.0 m under the leaking split, by 0.6 m under the other: 0.4 m too little is shown."""
+def test_the_price_of_leakage_is_of_the_same_samples_and_other_vehicles_stand_apart():
+    """2 m more of other vehicles; 0.4 m less than a fair network has on the same samples, or 0.4 m more or less."""
+    unpaired, paired = next(piece.arms for piece in PIECES if piece.name == "leakage")
+    shared = {"dataset": "all", "figure": "rmse_m", "seconds": 5.0}
     rows = [
-        {"arm": arm, "model": model, "against": against, "dataset": "all", "figure": "rmse_m", "seconds": 5.0}
-        | {"difference": value, "low": value - half, "high": value + half}
-        for arm, differences in (("csp-2018", (4.0, 5.0, -1.0)), ("generated", (2.0, 2.6, -0.6)))
-        for model, against, value, half in (
-            ("lstm", NOTHING, differences[0], 1.0),
-            ("constant-velocity", NOTHING, differences[1], 1.0),
-            ("lstm", "constant-velocity", differences[2], 0.3 if arm == "csp-2018" else 0.1),
-        )
+        shared
+        | {"arm": arm, "model": model, "against": NOTHING, "difference": value, "low": value - 1, "high": value + 1}
+        for arm, value in ((unpaired.name, 4.0), ("generated", 2.0))
+        for model in ("constant-velocity", "lstm", "v-lstm")
     ]
-    # A half of the samples brakes under the leaking split, a quarter under the other, and errors are as large in both.
-    blank = dict.fromkeys(TABLES["seeds"]) | {"dataset": "all", "seconds": 5.0}
+    rows += [
+        shared
+        | {"arm": paired.name, "model": model, "against": fair, "difference": -0.4, "low": -0.4 - half}
+        | {"high": -0.4 + half}
+        for (model, fair), half in zip(paired.pairs[:2], (0.3, 0.5), strict=True)
+    ]
+    assert [model for model, _ in paired.pairs[:2]] == ["lstm", "v-lstm"]
+    blank = dict.fromkeys(TABLES["seeds"]) | {"dataset": "all", "group": "all", "seconds": 5.0}
     seeds = [
-        blank | {"arm": arm, "model": model, "seed": seed, "group": group, "n": n, "rmse_m": rmse}
-        for arm, braking in (("csp-2018", 200), ("generated", 100))
-        for model, seed, brake, normal in (("constant-velocity", None, 8.0, 2.0), ("lstm", 0, 6.0, 1.0))
-        for group, n, rmse in (
-            ("all", 400, 9.9),
-            ("longitudinal=brake", braking, brake),
-            ("longitudinal=normal", 400 - braking, normal),
-        )
+        blank | {"arm": arm, "model": model, "n": 400, "rmse_m": 9.9}
+        for arm in (unpaired.name, paired.name)
+        for model in ("constant-velocity", "lstm", "v-lstm")
     ]
     results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds, schema=TABLES["seeds"])})
-    half = math.sqrt(0.3**2 + 0.1**2)
-    price = results.price_leakage("lstm")
-    assert price == pytest.approx({"difference": -0.4, "low": -0.4 - half, "high": -0.4 + half})
-    assert results.find_braking("csp-2018") == 0.5
-    assert results.weigh_braking("generated", "lstm", 0.5) == pytest.approx(math.sqrt((36 + 1) / 2))
-    assert results.price_at_share("lstm", "generated") == results.price_at_share("lstm", "csp-2018") == 0.0
-    (arm,) = next(piece.arms for piece in PIECES if piece.name == "leakage")
-    *_, own = lay_out_leakage(results, arm).splitlines()
-    assert own.startswith("| `lstm` | +2.00 (+0.59 to +3.41) | -0.40 (-0.72 to -0.08) | +0.00 | +0.00 |")
-    assert own.endswith("| shows 0.40 m too little; with equal braking +0.00 or +0.00 m |")
-    seeds[-1]["rmse_m"] = 3.0  # lstm, which does not brake, under the fair split: 1.0 before
-    results = Results({"comparisons": pl.DataFrame(rows), "seeds": pl.DataFrame(seeds, schema=TABLES["seeds"])})
-    # Of a quarter that brakes: lstm has sqrt(36 / 4 + 3 / 4) and sqrt(36 / 4 + 27 / 4), the other model is unchanged.
-    assert results.price_at_share("lstm", "generated") == pytest.approx(math.sqrt(9.75) - math.sqrt(15.75))
+    other = "+2.00 (+0.59 to +3.41)"
+    assert lay_out_leakage(results, unpaired).splitlines()[2:] == [
+        f"| `constant-velocity` | {other} | - | - |",
+        f"| `lstm` | {other} | -0.40 (-0.70 to -0.10) | shows 0.40 m less |",
+        f"| `v-lstm` | {other} | -0.40 (-0.90 to +0.10) | no price shown |",
+    ]
+    drawn = {price["what"]: (price["price"], price["low"], price["high"]) for price in results.list_prices()}
+    assert drawn == {"lstm": ("leakage", -0.7, pytest.approx(-0.1)), "v-lstm": ("leakage", -0.9, pytest.approx(0.1))}
 
 
-def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_and_in_words():
-    """0.4 m more with a defect of 20 % of the vehicles: 0.02 m per per cent."""
-    (arm,) = next(piece.arms for piece in PIECES if piece.name == "defects")
-    by_name = {own.name: own for own in arm.learners}
-    clean, damaged = by_name["v-lstm"], by_name["v-lstm, late_start 20%"]
-    mended, control = (by_name[f"v-lstm, {name} 20%, reconstructed"] for name in ("late_start", "acceleration_spike"))
-    assert (damaged.name, clean.name) in arm.pairs
-    assert (mended.name, control.name) in arm.pairs
-    assert all(own.partition(",")[0] == other.partition(",")[0] for own, other in arm.pairs), "of one network"
+def test_braking_is_a_share_of_the_samples():
+    blank = dict.fromkeys(TABLES["seeds"]) | {"dataset": "all", "seconds": 5.0, "model": "constant-velocity"}
+    rows = [blank | {"arm": "csp-2018", "group": group, "n": n} for group, n in (("all", 400), (BRAKE, 100))]
+    assert Results({"seeds": pl.DataFrame(rows, schema=TABLES["seeds"])}).find_braking("csp-2018") == 0.25
+
+
+def test_errors_of_vehicles_that_a_network_was_trained_on_are_left_out_and_the_others_pooled():
+    """Vehicles 7 to 9 of one subset are evaluated under both splits; 3 and 4 m along, 4 and 3 across: 5 m in all."""
+    schema = {"subset": pl.String, "vehicle_id": pl.Int32, "seed": pl.Int64, "n": pl.Int64}
+    schema |= dict.fromkeys(("squared_longitudinal_m2", "squared_lateral_m2", "nll_nats"), pl.Float64)
     rows = [
-        {"arm": arm.name, "model": own.name, "against": other.name, "dataset": "all", "figure": figure, "seconds": 5.0}
+        ("a", 6, 0, 5, 5e4, 5e4, 9.0),
+        ("a", 7, 0, 1, 9.0, 16.0, 1.0),
+        ("a", 9, 0, 3, 3 * 16.0, 3 * 9.0, 6.0),
+        ("a", 10, 0, 5, 5e4, 5e4, 9.0),
+        ("b", 8, 0, 5, 5e4, 5e4, 9.0),
+    ]
+    errors = pl.DataFrame(rows, schema=schema, orient="row").with_columns(dataset=pl.lit("highd"), seconds=5.0)
+    block = {"dataset": "highd", "block": 0}
+    whole, cut = (
+        Lake(Arm("home", Source("Others."), (), ()), None, Path(), index={"blocks": blocks})
+        for blocks in (
+            [block | {"subset": name, "part": "eval", "first_vehicle_id": 1, "last_vehicle_id": 9} for name in "ab"],
+            [
+                block | {"subset": "a", "part": "eval", "first_vehicle_id": 7, "last_vehicle_id": 20},
+                block | {"subset": "b", "part": "train", "first_vehicle_id": 7, "last_vehicle_id": 20},
+            ],
+        )
+    )
+    unseen = select_unseen(errors, [whole, cut])
+    assert unseen.rows() == errors.filter(pl.col("subset") == "a", pl.col("vehicle_id").is_in([7, 9])).rows()
+    by_dataset = pool_errors(Arm("own", Source("Own."), (), ()), {"lstm": unseen}).rows_by_key("dataset", named=True)
+    assert by_dataset.keys() == {"highd", "all"}
+    for (pooled,) in by_dataset.values():
+        assert (pooled["arm"], pooled["model"], pooled["seed"], pooled["group"]) == ("own", "lstm", 0, "all")
+        assert (pooled["n"], pooled["rmse_m"], pooled["nll_nats"]) == (4, pytest.approx(5.0), pytest.approx(7 / 4))
+        assert pooled["rmse_longitudinal_m"] == pytest.approx(math.sqrt((9 + 3 * 16) / 4))
+        assert pooled["rmse_lateral_m"] == pytest.approx(math.sqrt((16 + 3 * 9) / 4))
+        assert pooled["mae_m"] is None
+
+
+def test_the_price_of_a_defect_is_per_per_cent_of_the_vehicles_that_have_it_and_in_words():
+    """0.4 m more with a defect of 20 % of the vehicles: 0.02 m per per cent; of 10 % that could have it: 0.04 m."""
+    plain, mended, _ = DEFECTS.arms
+    damaged, other, control = (f"v-lstm, {name} 20%" for name in ("late_start", "frame_gap", "acceleration_spike"))
+    assert (damaged, "v-lstm") in plain.pairs
+    of_control = (f"{damaged}, reconstructed", f"{control}, reconstructed")
+    assert of_control in mended.pairs
+    pairs = [pair for arm in DEFECTS.arms for pair in arm.pairs]
+    assert all(own.partition(",")[0] == other.partition(",")[0] for own, other in pairs), "of one network"
+    measured = [
+        (plain, damaged, "v-lstm", 0.4, 0.2),
+        (plain, other, "v-lstm", 0.4, 0.1),
+        (plain, of_control[1], "v-lstm", 9.0, 0.2),
+        (mended, *of_control, 0.05, 0.2),
+    ]
+    rows = [
+        {"arm": arm.name, "model": own, "against": other, "dataset": "all", "figure": figure, "seconds": 5.0}
         | {"difference": value, "low": value - 0.1, "high": value + 0.1}
-        for own, other, value in ((damaged, clean, 0.4), (mended, clean, 9.0), (mended, control, 0.05))
+        for arm, own, other, value, _ in measured
         for figure in ("rmse_m", "nll_nats")
     ]
-    seeds = pl.DataFrame({"arm": [arm.name], "seconds": [5.0]})
-    results = Results({"comparisons": pl.DataFrame(rows), "seeds": seeds})
-    *_, first, second = lay_out_prices(results, arm).splitlines()
+    runs = pl.DataFrame([{"arm": arm.name, "model": own, "lake": f"of {own}"} for arm, own, *_ in measured])
+    lakes = pl.DataFrame([{"arm": arm.name, "lake": f"of {own}", "dose": dose} for arm, own, *_, dose in measured])
+    seeds = pl.DataFrame({"arm": [plain.name, mended.name], "seconds": [5.0, 5.0]})
+    results = Results({"comparisons": pl.DataFrame(rows), "seeds": seeds, "runs": runs, "lakes": lakes})
+    first, second, third = lay_out_prices(results, plain).splitlines()[2:]
+    says = "worse +0.40 (+0.30 to +0.50)"
     per_cent = "+0.0200 (+0.0150 to +0.0250)"
-    assert first.endswith(f"| `v-lstm` | worse +0.40 (+0.30 to +0.50) | {per_cent} | {per_cent} | costs 0.40 m |")
+    assert first == f"| `{damaged}` | `v-lstm` | 20.0 | {says} | {per_cent} | {per_cent} | costs 0.40 m |"
+    per_cent = "+0.0400 (+0.0300 to +0.0500)"
+    assert second == f"| `{other}` | `v-lstm` | 10.0 | {says} | {per_cent} | {per_cent} | costs 0.40 m |"
+    assert third.endswith("| worse +9.00 (+8.90 to +9.10) | - | - | costs 9.00 m, by reconstruction alone |")
     # Reconstructed tracks are compared with reconstructed ones, which are smooth as they are.
-    per_cent = "+0.0025 (-0.0025 to +0.0075)"
-    assert second.endswith(f"| `{control.name}` | +0.05 (-0.05 to +0.15) | {per_cent} | {per_cent} | no cost shown |")
-    assert [price["what"] for price in results.list_prices()] == [damaged.name, mended.name]
-    assert is_price(control.name, clean.name)
-    assert not is_price(mended.name, clean.name)
+    own = lay_out_prices(results, mended).splitlines()[2]
+    assert own.startswith(f"| `{of_control[0]}` | `{of_control[1]}` | 20.0 | +0.05 (-0.05 to +0.15) |")
+    assert own.endswith("| no cost shown |")
+    drawn = [price["what"] for price in results.list_prices()]
+    assert drawn == [damaged, "v-lstm, frame_gap 10%", of_control[0]]
+
+
+def test_the_dose_is_the_share_of_the_vehicles_that_have_the_defect(tmp_path):
+    """Three of five vehicles of one subset, none of five of the other."""
+    rows = [("dose", 3), ("dose", 0), *[("first_frame", None)] * 10, ("defect", None)]
+    pl.DataFrame(rows, schema={"kind": pl.String, "vehicles": pl.Int64}, orient="row").write_parquet(tmp_path / "truth")
+    assert read_dose(tmp_path / "truth") == pytest.approx(0.3)
+    assert read_dose(tmp_path / "none") is None
 
 
 def test_what_is_planned_and_lacks_seeds_is_named_and_how_long_networks_were_trained():
@@ -216,43 +272,6 @@ def test_committed_pages_are_those_of_the_committed_tables():
         check_verdicts(page)
 
 
-def price_leaks_by_hand(comparisons):
-    """Subtract differences to constant velocity at 5 s under both splits; returns prices and bounds as printed."""
-    rows = comparisons.filter(against="constant-velocity", seconds=5.0, figure="rmse_m", dataset="all").to_dicts()
-    by_arm = {(row["arm"], row["model"]): row for row in rows}
-    said = set()
-    for arm, model in by_arm:
-        if arm == "csp-2018" and ("generated", model) in by_arm:
-            leaks, fair = by_arm[arm, model], by_arm["generated", model]
-            price = leaks["difference"] - fair["difference"]
-            half = math.hypot(leaks["high"] - leaks["difference"], fair["high"] - fair["difference"])
-            said |= {f"{value:+.2f}" for value in (price, price - half, price + half)}
-    return said
-
-
-def brake_alike_by_hand(seeds):
-    """Prices of leakage at 5 s if as many samples braked under both splits, as printed."""
-    rows = seeds.filter(pl.col("arm").is_in(["csp-2018", "generated"]), seconds=5.0, dataset="all").to_dicts()
-    found = {(row["arm"], row["model"], row["group"], row["seed"]): row for row in rows}
-    said = set()
-    for share_of in ("csp-2018", "generated"):
-        counts = [found[share_of, "constant-velocity", group, None]["n"] for group in ("longitudinal=brake", "all")]
-        share = counts[0] / counts[1]
-        errors = {}
-        for arm, model, group, seed in found:
-            if group == "longitudinal=brake":
-                brake = found[arm, model, group, seed]["rmse_m"]
-                other = found[arm, model, "longitudinal=normal", seed]["rmse_m"]
-                error = math.sqrt(share * brake**2 + (1 - share) * other**2)
-                errors.setdefault((arm, model), []).append(error)
-        mean = {key: sum(own) / len(own) for key, own in errors.items()}
-        for arm, model in mean:
-            if arm == "csp-2018":
-                gains = [mean[each, model] - mean[each, "constant-velocity"] for each in (arm, "generated")]
-                said.add(f"{gains[0] - gains[1]:+.2f}")
-    return said
-
-
 def pool_shares_by_hand(tables):
     """Shares of predictions that break a rule, of positions in regions, and of right maneuvers, in per cent."""
     sums = {}
@@ -281,7 +300,6 @@ def test_every_number_of_the_discussion_is_in_the_tables():
     differences = tables["comparisons"].select("difference", "low", "high")
     known = {f"{value:.2f}" for row in means.drop(key).rows() for value in row if value is not None}
     known |= {f"{value:+.2f}" for row in differences.rows() for value in row if value is not None}
-    known |= price_leaks_by_hand(tables["comparisons"]) | brake_alike_by_hand(tables["seeds"])
     known |= pool_shares_by_hand(tables)
     said = re.findall(r"(?<![\w.])[+-]?\d+\.\d+", (DOCS / "results-discussion.md").read_text())
     assert set(said) <= known

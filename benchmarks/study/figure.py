@@ -57,8 +57,8 @@ def draw_prices(rows: Sequence[Mapping[str, object]]) -> Drawing:
         rows: those of `Results.list_prices`.
     """
     titles = {
-        "leakage": "RMSE beside constant velocity's at 5 s, csp-2018 minus time-blocks: leakage and other traffic",
-        "defects": "Defects of a fifth of the vehicles: RMSE at 5 s, minus that without (both reconstructed or not)",
+        "leakage": "Leakage: RMSE at 5 s, trained under csp-2018 minus trained under time-blocks, on the same samples",
+        "defects": "Defects and the share of the vehicles that have them: RMSE at 5 s, minus that without",
     }
     panels = []
     for price, title in titles.items():

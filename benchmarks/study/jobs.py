@@ -34,6 +34,7 @@ from tracklake.training.models import find_model
 from tracklake.training.runs.run_folder import digest_tensors
 
 ROOT = Path(__file__).resolve().parents[2]
+TRUTH = "truth.parquet"
 NOTES, SCORES, VEHICLES = "jobs.csv", "scores.csv", "vehicles.parquet"
 """Files of the study's folder: what was run, and of each run its scores and its errors by vehicle."""
 EVIDENCE = ("--calibration", "--feasibility")
@@ -69,6 +70,11 @@ class Lake:
         """Settings of the lake."""
         left_out = {} if self.fold is None else {"TRACKLAKE_SPLIT_EVAL_BLOCK": str(self.fold)}
         return {**self.arm.settings, **left_out}
+
+    @property
+    def truth(self) -> Path:
+        """File of the truth of a generated sample."""
+        return self.root.parents[1] / "sources" / make_digest(self.arm.source.sample) / TRUTH
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -124,9 +130,16 @@ class Job:
 
     @property
     def evidence(self) -> Path | None:
-        """Folder of its calibration and feasibility; None: of networks, the first seed's alone are looked at."""
+        """Folder of its calibration and feasibility; None: of networks, the first seed's alone are looked at.
+
+        They are of all vehicles, so that an arm of some has none.
+        """
         asked = make_digest(EVIDENCE)[:4]
-        return None if self.seed else self.lake.root.parents[1] / "evidence" / f"{self.identity}-{asked}"
+        return (
+            None
+            if self.seed or self.lake.arm.is_unseen
+            else self.lake.root.parents[1] / "evidence" / f"{self.identity}-{asked}"
+        )
 
     @property
     def is_current(self) -> bool:
@@ -230,8 +243,7 @@ class Workshop:
         """Find the lakes that a model is trained in, one per fold; none: those that it is scored on."""
         if own.source is None and not own.settings:
             return []
-        settings = {**arm.settings, **own.settings}
-        homes = self.find_lakes(replace(arm, source=own.source or arm.source, settings=settings))
+        homes = self.find_lakes(replace(arm, source=own.source or arm.source, settings=arm.settle(own)))
         return [replace(lake, variant=own.name) for lake in homes]
 
     def list_lakes(self, arm: Arm) -> dict[Path, Lake]:
@@ -263,7 +275,7 @@ class Workshop:
         """Return the raw file or the generated sample of a source; None where it could not be made."""
         if not source.file:
             out = self.work / "sources" / make_digest(source.sample)
-            made = (out / "truth.parquet").exists() or self.run("sample", "--out", out, *source.sample)
+            made = (out / TRUTH).exists() or self.run("sample", "--out", out, *source.sample)
             return out if made else None
         raw = self.data / source.file
         if not source.lane_ft:

@@ -1,6 +1,5 @@
 """docs/results.md, its figures and docs/results-discussion.md, made of the committed tables and nothing else."""
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -8,9 +7,9 @@ import polars as pl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from study.figure import draw_curves, draw_errors, draw_prices
-from study.pieces import AXES, DOSE, PIECES
+from study.pieces import AXES, PIECES
 from study.plan import Arm
-from study.results import BRAKE, FEW, Results, grid, is_price, judge
+from study.results import BRAKE, FEW, SAME_SAMPLES, Results, grid, is_of_tracks, judge
 from study.tables import FIGURES, LEARNED, NOTHING, RADIUS_LEVEL
 from tracklake.schemas.comparisons import ALL_DENSITIES, ANY_RULE
 from tracklake.schemas.evaluations import EVERYTHING
@@ -50,9 +49,15 @@ def render_pages(results: Results) -> dict[str, str]:
         "missing": [piece for piece in PIECES if not any(arm.name in has for arm in piece.arms)],
         "has": has,
         "figures": FIGURES,
-        "prices": results.list_prices(),
         "anchored": [own.name for own in AXES],
-        **{"BRAKE": BRAKE, "CONSTANT": CONSTANT, "OURS": OURS, "PUBLISHED": PUBLISHED, "DIFFERENCE": DIFFERENCE},
+        **{
+            "SAME_SAMPLES": SAME_SAMPLES,
+            "BRAKE": BRAKE,
+            "CONSTANT": CONSTANT,
+            "OURS": OURS,
+            "PUBLISHED": PUBLISHED,
+            "DIFFERENCE": DIFFERENCE,
+        },
         **{own.__name__: partial(own, results) for own in TABLES_OF_ARM},
     }
     return {name: templates.get_template(f"{name}.j2").render(given) for name in PAGES}
@@ -116,7 +121,10 @@ def choose_headline(results: Results, arm: Arm) -> str:
 
 
 def lay_out_maneuvers(results: Results, arm: Arm) -> str:
-    """Lay out RMSE at the last horizon by true maneuver; along the road where nothing is known across it."""
+    """Lay out RMSE at the last horizon by true maneuver; along the road where nothing is known across it.
+
+    It is empty where there are no errors by maneuver.
+    """
     last = results.list_seconds(arm.name)[-1]
     rows = results.of_arm("seeds", arm.name).filter(seconds=last, dataset=arm.dataset)
     figure = choose_headline(results, arm)
@@ -126,6 +134,8 @@ def lay_out_maneuvers(results: Results, arm: Arm) -> str:
         for model in results.list_models(arm.name)
     ]
     shown = [number for number in range(1, 1 + len(groups)) if any(row[number] != "-" for row in body)]
+    if not shown:
+        return ""
     heads = ["model", *groups]
     return grid([heads[0], *(heads[n] for n in shown)], ([row[0], *(row[n] for n in shown)] for row in body))
 
@@ -215,44 +225,39 @@ def lay_out_prices(results: Results, arm: Arm) -> str:
     body = []
     for own, against in arm.pairs:
         error, nll = (results.compare(arm.name, own, against, at, figure) for figure in ("rmse_m", "nll_nats"))
-        if is_price(own, against) and error is not None:
-            says = judge(error["low"], error["high"])
+        if error is not None:
+            dose, of_tracks = 100 * results.find_dose(arm.name, own), is_of_tracks(own, against)
             costs = {"worse": f"costs {error['difference']:.2f} m", "better": f"gains {-error['difference']:.2f} m"}
-            parts = [_format_difference(each, per=100 * DOSE, digits=4, is_judged=False) for each in (error, nll)]
-            row = (_format_difference(error), *parts, costs.get(says, "no cost shown"))
-            body.append([f"`{own}`", f"`{against}`", *row])
-    heads = ("trained on", "against", f"RMSE at {at:g} s, m", "m per %", "nats per %", "in words")
+            says = costs.get(judge(error["low"], error["high"]), "no cost shown")
+            parts = [
+                "-" if of_tracks else _format_difference(each, per=dose, digits=4, is_judged=False)
+                for each in (error, nll)
+            ]
+            row = (f"{dose:.1f}", _format_difference(error), *parts)
+            body.append([f"`{own}`", f"`{against}`", *row, f"{says}{', by reconstruction alone' if of_tracks else ''}"])
+    heads = ("trained on", "against", "vehicles, %", f"RMSE at {at:g} s, m", "m per %", "nats per %", "in words")
     return grid(heads, body) if body else ""
 
 
 def lay_out_leakage(results: Results, arm: Arm, fair: str = "generated") -> str:
-    """Lay out errors of a leaking split minus those of another arm; both are of other vehicles, and drawn apart.
-
-    The price is what is left of it beside constant velocity, which learns nothing; the columns after it are the price
-    if the share of braking vehicles were equal: that of either arm.
-    """
+    """Lay out errors of a leaking split minus those of another arm, of other vehicles, and the price of leakage."""
     seconds = results.list_seconds(arm.name)
     body = []
     for own in results.list_models(arm.name):
-        learns = own in results.list_networks(arm.name)
-        price = results.price_leakage(own, fair, arm.name) if learns else None
-        equal = [results.price_at_share(own, of, fair, arm.name) if learns else None for of in (fair, arm.name)]
+        price = results.price_leakage(own)
         found = (*(results.subtract(arm.name, fair, own, at) for at in seconds), price)
-        shown = ["-" if each is None else f"{each:+.2f}" for each in equal]
-        words = _say_leakage(price, shown)
-        body.append([f"`{own}`", *(_format_difference(each, is_judged=False) for each in found), *shown, words])
-    heads = [f"price at {seconds[-1]:g} s", f"braking as in `{fair}`", f"as in `{arm.name}`", "in words"]
+        body.append([f"`{own}`", *(_format_difference(each, is_judged=False) for each in found), _say_leakage(price)])
+    heads = [f"same samples, {seconds[-1]:g} s", "in words"]
     return grid(["model", *(f"{at:g} s" for at in seconds), *heads], body)
 
 
-def _say_leakage(price: dict[str, float] | None, equal: Sequence[str]) -> str:
-    """Say what a split that leaks does to the error that is shown of a model, and what other traffic has done of it."""
+def _say_leakage(price: dict[str, float] | None) -> str:
+    """Say what a split that leaks does to the error that is shown of a model."""
     if price is None:
         return "-"
     metres = abs(price["difference"])
-    shown = {"better": f"shows {metres:.2f} m too little", "worse": f"shows {metres:.2f} m too much"}
-    says = shown.get(judge(price["low"], price["high"]))
-    return f"{says}; with equal braking {' or '.join(equal)} m" if says else "no price shown"
+    shown = {"better": f"shows {metres:.2f} m less", "worse": f"shows {metres:.2f} m more"}
+    return shown.get(judge(price["low"], price["high"]), "no price shown")
 
 
 def lay_out_stops(results: Results, arm: Arm) -> str:

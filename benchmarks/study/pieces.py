@@ -2,56 +2,11 @@
 
 from dataclasses import replace
 
-from study.plan import Arm, Learner, Piece, Source
+from study.defects import DEFECTS
+from study.plan import Arm, Learner, Piece
+from study.traffic import BLOCKS, I_80, IDM, KRAUSS, PARTS, PLAIN, US_101
 
-PLAIN = ("constant-velocity", "damped-velocity", "kalman-cv")
 PLAIN_PAIRS = (("damped-velocity", "constant-velocity"), ("kalman-cv", "constant-velocity"))
-BLOCKS = {
-    "TRACKLAKE_SPLIT": "time-blocks",
-    "TRACKLAKE_SPLITS": '["time-blocks"]',
-    "TRACKLAKE_RECONSTRUCT": "false",
-}
-
-US_101 = Source(
-    "US-101, 2005-06-15 07:50, an excerpt of NGSIM (U.S. Department of Transportation 2016): 290 of 2,169 vehicles, so "
-    "that no vehicle's neighbors are known. It has no lanes; samples were given lanes of 12 ft from `Local_X`.",
-    file="ngsim/us101_0750_290_vehicles.csv.gz",
-    lane_ft=12.0,
-    lacks_vehicles=True,
-)
-I_80 = Source(
-    "I-80, 2005-04-13 16:00, extracted again from NGSIM's video by Coifman and Li (2017), A critical evaluation of the "
-    "Next Generation Simulation (NGSIM) vehicle trajectory dataset, Transportation Research Part B 105: 2,283 vehicles "
-    "with lanes and neighbors, but without lateral positions and sizes: every vehicle is 4.27 m long and 1.83 m wide. "
-    "Only errors along the road mean anything.",
-    file="i80_coifman_li_2017/trajectories-i80-1600-1615.csv.gz",
-)
-
-
-def generate(traffic: str, seed: int, title: str, *more: str) -> Source:
-    """Declare generated traffic: three minutes of eight free and congested carriageways and one of NGSIM's kind."""
-    options = (
-        "--traffic",
-        traffic,
-        "--format",
-        "highd",
-        "--format",
-        "ngsim-text",
-        "--minutes",
-        "3",
-        "--seed",
-        f"{seed}",
-    )
-    return Source(title, sample=(*options, *more))
-
-
-IDM = generate(
-    "varied-idm", 0, "Generated traffic: 200 drivers a carriageway, who follow IDM ([sample.md](sample.md))."
-)
-KRAUSS = generate("varied-krauss", 1, "Generated traffic: 200 drivers a carriageway follow Krauss's model.")
-PARTS = {**BLOCKS, "TRACKLAKE_SPLIT_BLOCK_S": "50", "TRACKLAKE_VALIDATION_PART": "true"}
-"""Settings of generated traffic: blocks of 50 s with 8 s between them, some of them for validation."""
-
 V_LSTM, LSTM = Learner("v-lstm", 8, 25_000), Learner("lstm", 8, 25_000)
 STACKED, DECODER = Learner("stacked-lstm", 5, 20_000), Learner("lstm-encoder-decoder", 5, 5_000)
 CS_LSTM, CS_LSTM_M = Learner("cs-lstm", 5, 20_000), Learner("cs-lstm-m", 5, 20_000)
@@ -89,13 +44,6 @@ def pair_with(own: Learner, others: tuple[Learner, ...]) -> tuple[tuple[str, str
     return tuple((other.name, own.name) for other in others)
 
 
-def pair_by_model(firsts: tuple[Learner, ...], others: tuple[Learner, ...]) -> tuple[tuple[str, str], ...]:
-    """Pair each of the others with the one of the same model."""
-    return tuple(
-        pair for own in firsts for pair in pair_with(own, tuple(o for o in others if o.model == own.model and o != own))
-    )
-
-
 OURS = (V_LSTM, STACKED, ATTENTION, CS_LSTM, CS_LSTM_M, DECODER)
 PUBLISHED = tuple(map(publish, OURS))
 EGO_ONLY = ablate(ATTENTION, "ego-only loss", "ego_only=true")
@@ -125,44 +73,12 @@ ALONE = {
     for dataset, title in (("ngsim", "NGSIM-like"), ("highd", "highD-like"))
 }
 MOVED = tuple(replace(own, seeds=5, source=KRAUSS, label=f"{own.model}, of Krauss") for own in (LSTM, V_LSTM, CS_LSTM))
-CLEAN = generate("varied-idm", 0, "The same traffic without any defect.", "--defect", "late_start", "--dose", "0")
-DOSED = ("late_start", "frame_gap", "position_jump", "second_track")
-"""Defects that are injected, each alone, and whose price is measured for two networks."""
-DOSED_ONCE = ("overlap", "early_end", "frozen_slow_speed")
-"""Those whose price is measured for the one that learns fast, and without reconstruction."""
-CONTROL = "acceleration_spike"
-"""Defect that moves no position: its reconstructed tracks show what reconstruction does without one to repair."""
-UNSEEN = ("acceleration_spike", "hard_braking", "wrong_headway", "wrong_leader", "lane_flicker")
-"""Defects that move no position and remove no entry, so that networks without neighbors learn the same; tested."""
-DOSE = 0.2
-"""Share of the vehicles that get a defect."""
-REPAIRED = {"TRACKLAKE_RECONSTRUCT": "true", "TRACKLAKE_TRACKS_FROM": "reconstructed"}
-CLEANLY = (Learner("v-lstm", 5, 12_500), Learner("lstm", 5, 25_000))
-"""Networks that are trained on traffic with and without defects: one with a density, and one that learns fast."""
-
-
-def damage(own: Learner, defect: str, *, repaired: bool = False) -> Learner:
-    """Train on traffic with a defect, or on its reconstructed tracks."""
-    return replace(
-        own,
-        label=f"{own.model}, {defect} {DOSE:.0%}{', reconstructed' if repaired else ''}",
-        source=generate("varied-idm", 0, "", "--defect", defect, "--dose", str(DOSE)),
-        settings=REPAIRED if repaired else {},
-    )
-
-
-DAMAGED = tuple(
-    each
-    for own, more in zip(CLEANLY, ((), DOSED_ONCE), strict=True)
-    for each in (
-        *(damage(own, defect, repaired=repaired) for defect in DOSED for repaired in (False, True)),
-        *(damage(own, defect) for defect in more),
-        damage(own, CONTROL, repaired=True),
-    )
-)
-RESTORED = tuple(own for own in DAMAGED if own.settings)
-CONTROLS = tuple(own for own in RESTORED if CONTROL in own.name)
 LEAKING = tuple(replace(own, seeds=5) for own in (LSTM, V_LSTM, ATTENTION, CS_LSTM))
+CSP_2018 = {"TRACKLAKE_SPLIT": "csp-2018", "TRACKLAKE_SPLITS": '["csp-2018"]'}
+THIRD_BLOCK = {"TRACKLAKE_SPLIT_BLOCK_S": "50", "TRACKLAKE_SPLIT_EVAL_BLOCK": "2"}
+"""Settings of `time-blocks` that leave out the third block, in which most samples of `csp-2018` are evaluated."""
+LENT = tuple(replace(own, settings={**CSP_2018, **dict.fromkeys(THIRD_BLOCK, "")}) for own in LEAKING)
+FAIR = tuple(replace(own, label=f"{own.model}, time-blocks") for own in LEAKING)
 FOREST = Arm("forest", IDM, (), (), protocol="grid-2021", settings={"TRACKLAKE_RECONSTRUCT": "false"})
 FOREST_TEXT = (
     "The forest of Choi et al. (2021), by information gain, votes on the maneuver from twelve features, and the "
@@ -331,43 +247,28 @@ PIECES = (
         "The price of leakage",
         "The split of convolutional social pooling's code (`csp-2018`) cuts every recording by the vehicles' numbers: "
         "vehicles that drive side by side are in different parts. Errors under it are compared with those on the same "
-        "recordings parted by blocks of time. Other vehicles are scored: differences are not paired. Constant velocity "
-        "learns nothing, so its difference is what the other vehicles make. What is left is no pure price of leakage: "
-        "vehicles that brake are another share of what is scored, constant velocity errs most there, and where it errs "
-        "more there is more to gain; and `csp-2018` trains on more samples. The last columns make the shares equal.",
+        "recordings parted by blocks of time; other vehicles are scored there. The price of leakage is measured on the "
+        "same samples: those of vehicles that `csp-2018` evaluates, in a block of time that `time-blocks` leaves out. "
+        "Networks that were trained under `csp-2018` have seen vehicles around these at the same time, those that were "
+        "trained under `time-blocks` nothing of that time. The former so have more samples to draw from, too, and more "
+        "that are like those that are scored: a price is of all that, though both were given equally many.",
         (
-            replace(
-                GENERATED,
-                name="csp-2018",
-                learners=LEAKING,
-                settings={**BLOCKS, "TRACKLAKE_SPLIT": "csp-2018", "TRACKLAKE_SPLITS": '["csp-2018"]'},
-                pairs=(),
+            Arm("csp-2018", IDM, PLAIN, LEAKING, settings={**BLOCKS, **CSP_2018}),
+            Arm(
+                "csp-2018, same samples",
+                replace(
+                    IDM,
+                    title="Vehicles that no network was trained on. Those without a suffix are of `csp-2018`.",
+                ),
+                PLAIN,
+                (*LENT, *FAIR),
+                settings={**BLOCKS, **THIRD_BLOCK},
+                pairs=tuple((own.name, fair.name) for own, fair in zip(LENT, FAIR, strict=True)),
+                is_unseen=True,
             ),
         ),
     ),
-    Piece(
-        "defects",
-        6,
-        "The price of defects",
-        "One defect of a fifth of the vehicles in otherwise clean traffic; networks are trained on it, or on its "
-        "reconstructed tracks, and scored on the same traffic without defects. Of the generator's other defects, five "
-        f"({', '.join(f'`{each}`' for each in UNSEEN)}) move no position and remove no entry: these networks learn the "
-        "same with them as without. NGSIM's formats cannot record `sideways_speed` and `size_change`, which were not "
-        "measured; nor was `backward`, as recordings in which a fifth of the vehicles move backward are excluded from "
-        "the samples (`max_backward_share`). A wrong speed turns a highD vehicle, and so moves its front. "
-        "Reconstruction smooths what a network learns from, and not what it is scored on; defects that one network "
-        "alone learned from were not reconstructed. "
-        f"So reconstructed tracks are compared with those of `{CONTROL}`, too, which leaves nothing to repair.",
-        (
-            replace(
-                GENERATED,
-                name="defects",
-                source=CLEAN,
-                learners=(*CLEANLY, *DAMAGED),
-                pairs=(*pair_by_model(CLEANLY, DAMAGED), *pair_by_model(CONTROLS, RESTORED)),
-            ),
-        ),
-    ),
+    DEFECTS,
     Piece(
         "forest",
         3,

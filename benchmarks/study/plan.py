@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 from tracklake.schemas.evaluations import EVERYTHING
 
@@ -24,6 +25,11 @@ class Source:
     lane_ft: float = 0.0
     lacks_vehicles: bool = False
 
+    @property
+    def recordings(self) -> tuple[object, ...]:
+        """What decides its recordings."""
+        return (self.file, self.sample, self.lane_ft)
+
 
 @dataclass(frozen=True)
 class Learner:
@@ -37,7 +43,7 @@ class Learner:
         options: more options of `tracklake train`.
         label: name of its runs; empty = the model's name.
         source: recordings that it is trained on, where they are others than it is scored on.
-        settings: settings of the lake that it is trained in, besides the arm's.
+        settings: settings of the lake that it is trained in, besides the arm's; an empty one takes the arm's away.
         at_home: whether it is scored where it is trained, and not on the arm's lake.
         tested: more options of `tracklake evaluate`.
     """
@@ -70,6 +76,8 @@ class Arm:
         pairs: models that are compared with each other, besides with the baselines.
         dataset: the part of the data that tables show, where some of the models are scored on it alone.
         forest: options of `tracklake lane-forest`, where the arm is one of forests that predict lane changes.
+        is_unseen: whether only vehicles are scored that are in no training part, by their numbers, of any lake that a
+            model was trained in.
     """
 
     name: str
@@ -82,6 +90,11 @@ class Arm:
     pairs: tuple[tuple[str, str], ...] = ()
     dataset: str = EVERYTHING
     forest: tuple[str, ...] = ()
+    is_unseen: bool = False
+
+    def settle(self, own: Learner) -> dict[str, str]:
+        """Return the settings of the lake that a model is trained in."""
+        return {name: value for name, value in {**self.settings, **own.settings}.items() if value}
 
 
 @dataclass(frozen=True)
@@ -96,17 +109,21 @@ class Piece:
 
 
 SPEEDS = {
-    "lstm": 10_500,
-    "v-lstm": 4_000,
-    "stacked-lstm": 3_600,
-    "lstm-encoder-decoder": 320,
-    "cs-lstm": 1_900,
-    "cs-lstm-m": 1_850,
-    "attention-h4": 4_000,
+    "lstm": 16_000,
+    "v-lstm": 5_000,
+    "stacked-lstm": 7_000,
+    "lstm-encoder-decoder": 420,
+    "cs-lstm": 3_000,
+    "cs-lstm-m": 2_400,
+    "attention-h4": 5_900,
 }
-"""Samples (of attention: scenes) that a training takes in a second on one thread, measured on two idle cores."""
-OVERHEAD_S, LAKE_S = 7.0, 36.0
-"""Seconds of a run besides its training (starts, scores), and of making a lake."""
+"""Samples (of attention: scenes) that a training takes in a second on one thread, beside another, on two idle cores."""
+START_S, SCORE_S = 3.6, 6.0
+"""Seconds of a training besides its steps, and of scoring a run, on one of two cores."""
+LAKE_S, MINUTE_S = 20.0, 20.0
+"""Seconds of one of two cores for making a lake with its sample, and for each minute of traffic in it."""
+MINUTES = 3.0
+"""Minutes of traffic of a source, where its sample does not state them."""
 QUICK_MODELS = 4
 """Models of an arm of the quick study."""
 QUICK_FOREST = {"--examples": "200", "--epochs": "1"}
@@ -116,8 +133,14 @@ FOREST_S = 45.0
 
 
 def estimate_run(learner: Learner) -> float:
-    """Estimate the seconds of one training and its scores, on one of two idle cores."""
-    return OVERHEAD_S + learner.samples * learner.epochs / SPEEDS[learner.model]
+    """Estimate the seconds of one training, on one of two idle cores."""
+    return START_S + learner.samples * learner.epochs / SPEEDS[learner.model]
+
+
+def estimate_lake(source: Source) -> float:
+    """Estimate the seconds of making a lake, which has both cores for half of them."""
+    stated = [float(value) for option, value in pairwise(source.sample) if option == "--minutes"]
+    return LAKE_S + MINUTE_S * (stated or [MINUTES])[-1]
 
 
 def estimate_decoder(options: Sequence[str]) -> float:
@@ -140,18 +163,20 @@ def estimate_pieces(pieces: Iterable[Piece]) -> dict[str, tuple[int, float]]:
 
 
 def list_work(arm: Arm) -> Iterator[tuple[tuple[object, ...], float]]:
-    """List lakes, plain models and trainings of an arm by what decides them, with the seconds that each takes."""
+    """List lakes, plain models, trainings and scores of an arm by what decides them, with the seconds of each."""
     for fold in arm.folds or (None,):
-        lake = repr((arm.source, arm.protocol, arm.settings, fold))
-        yield (lake,), LAKE_S
-        yield from (((lake, model), OVERHEAD_S / 4) for model in arm.plain)
+        lake = repr((arm.source.recordings, arm.protocol, arm.settings, fold))
+        yield (lake,), estimate_lake(arm.source)
+        yield from (((lake, model), SCORE_S / 3) for model in arm.plain)
         if arm.forest:
             yield (lake, repr(arm.forest)), FOREST_S + estimate_decoder(arm.forest)
         for own in arm.learners:
-            home = repr((own.source or arm.source, arm.protocol, {**arm.settings, **own.settings}, fold))
-            yield (home,), LAKE_S
+            home = repr(((own.source or arm.source).recordings, arm.protocol, arm.settle(own), fold))
+            yield (home,), estimate_lake(own.source or arm.source)
             how = (own.model, own.samples, own.epochs, own.options)
-            yield from (((home, how, seed), estimate_run(own)) for seed in range(own.seeds))
+            for seed in range(own.seeds):
+                yield (home, how, seed), estimate_run(own)
+                yield (home, how, seed, home if own.at_home else lake, own.tested), SCORE_S
 
 
 def shorten(source: Source) -> Source:

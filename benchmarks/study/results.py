@@ -1,14 +1,14 @@
 """Figures of the committed tables as the pages print them; differences are called better or worse by interval alone."""
 
-import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 
-from study.pieces import CONTROLS, PIECES, RESTORED
+from study.defects import DEFECTS, TRACKS
+from study.pieces import PIECES
 from study.plan import Arm
 from study.tables import NOTHING, TABLES, read_table
 from tracklake.schemas.errors import TracklakeError
@@ -16,8 +16,10 @@ from tracklake.schemas.evaluations import EVERYTHING
 from tracklake.training.onboard.as_published import DIFFERENCE
 
 UNITS = {"nll_nats": " nats"}
-BRAKE, NORMAL = "longitudinal=brake", "longitudinal=normal"
-"""Groups of samples by their true longitudinal maneuver."""
+BRAKE = "longitudinal=brake"
+"""Group of samples whose vehicles brake."""
+SAME_SAMPLES = "csp-2018, same samples"
+"""Arm in which the price of leakage is measured."""
 FEW = 30
 """Figures over fewer samples are not shown."""
 
@@ -155,28 +157,19 @@ class Results:
         made = self.of_arm("comparisons", arm).select("model", "against").unique().rows()
         return [pair for pair in own.pairs if pair in made and pair[0] not in own.plain]
 
-    def list_priced(self) -> list[tuple[str, str]]:
-        """List the pairs that price a defect."""
-        return [pair for pair in self.list_pairs("defects") if is_price(*pair)]
+    def find_dose(self, arm: str, model: str) -> float:
+        """Find which share of the vehicles that a network was trained on has the injected defect."""
+        lakes = self.of_arm("runs", arm).filter(model=model)["lake"].unique()
+        return float(self.of_arm("lakes", arm).filter(pl.col("lake").is_in(lakes.implode()))["dose"][0])
 
-    def subtract(
-        self, arm: str, other: str, model: str, seconds: float, against: str = NOTHING
-    ) -> dict[str, float] | None:
-        """Subtract a model's RMSE in another arm, of other vehicles: squares of both intervals' halves add up.
-
-        With `against`, it is the difference to that model which is subtracted.
-        """
-        found = [self.compare(name, model, against, seconds, "rmse_m") for name in (arm, other)]
+    def subtract(self, arm: str, other: str, model: str, seconds: float) -> dict[str, float] | None:
+        """Subtract a model's RMSE in another arm, of other vehicles: squares of both intervals' halves add up."""
+        found = [self.compare(name, model, NOTHING, seconds, "rmse_m") for name in (arm, other)]
         if found[0] is None or found[1] is None or None in (found[0]["low"], found[1]["low"]):
             return None
         difference = found[0]["difference"] - found[1]["difference"]
         half = sum((own["high"] - own["difference"]) ** 2 for own in found if own) ** 0.5
         return {"difference": difference, "low": difference - half, "high": difference + half}
-
-    def price_leakage(self, model: str, fair: str = "generated", leaking: str = "csp-2018") -> dict[str, float] | None:
-        """Price a split that leaks: what it adds, at the last horizon, to a model's difference to constant velocity."""
-        seconds = self.list_seconds(leaking)
-        return self.subtract(leaking, fair, model, seconds[-1], "constant-velocity") if seconds else None
 
     def find_braking(self, arm: str) -> float | None:
         """Find the share of an arm's samples, at its last horizon, whose vehicles brake; None where it is unknown."""
@@ -184,35 +177,24 @@ class Results:
         brake = self.select(arm, "constant-velocity", self.list_seconds(arm)[-1], group=BRAKE)
         return brake["n"][0] / rows["n"][0] if rows.height and brake.height else None
 
-    def weigh_braking(self, arm: str, model: str, share: float) -> float | None:
-        """Return a model's RMSE at the last horizon, if that share of the samples braked; in the mean over seeds."""
-        at = self.list_seconds(arm)[-1]
-        brake, other = (self.select(arm, model, at, group=name).sort("seed")["rmse_m"] for name in (BRAKE, NORMAL))
-        if len(brake) != len(other) or brake.is_empty():
+    def price_leakage(self, model: str) -> dict[str, float] | None:
+        """Price a split that leaks: what it takes off a network's error on the same samples at the last horizon."""
+        pairs = dict(self.list_pairs(SAME_SAMPLES))
+        if model not in pairs:
             return None
-        return float(np.sqrt(share * brake.to_numpy() ** 2 + (1 - share) * other.to_numpy() ** 2).mean())
-
-    def price_at_share(
-        self, model: str, share_of: str, fair: str = "generated", leaking: str = "csp-2018"
-    ) -> float | None:
-        """Price a split that leaks if the same share of samples braked under both splits: that of one of the arms."""
-        share = self.find_braking(share_of)
-        if share is None:
-            return None
-        found = [self.weigh_braking(arm, own, share) for arm in (leaking, fair) for own in (model, "constant-velocity")]
-        own, plain, own_fair, plain_fair = (math.nan if value is None else value for value in found)
-        price = own - plain - (own_fair - plain_fair)
-        return None if math.isnan(price) else price
+        at = self.list_seconds(SAME_SAMPLES)[-1]
+        return self.compare(SAME_SAMPLES, model, pairs[model], at, "rmse_m")
 
     def list_prices(self) -> list[dict[str, object]]:
         """List the prices of leakage by model, and of defects by training, that were measured with an interval."""
         found: list[tuple[str, str, dict[str, float] | None]] = []
-        if self.list_seconds("csp-2018"):
-            found += (("leakage", model, self.price_leakage(model)) for model in self.list_networks("csp-2018"))
-        for at in self.list_seconds("defects")[-1:]:
-            controls = [learner.name for learner in CONTROLS]  # far off: the table has what reconstruction alone costs
-            pairs = [pair for pair in self.list_priced() if pair[0] not in controls]
-            found += (("defects", own, self.compare("defects", own, clean, at, "rmse_m")) for own, clean in pairs)
+        found += [("leakage", model, self.price_leakage(model)) for model, _ in self.list_pairs(SAME_SAMPLES)]
+        for arm in (own.name for own in DEFECTS.arms if self.list_seconds(own.name)):
+            at = self.list_seconds(arm)[-1]
+            for model, clean in self.list_pairs(arm):
+                if not is_of_tracks(model, clean):  # far off: the table has what reconstruction alone costs
+                    what = re.sub(r"\d+%", f"{self.find_dose(arm, model):.0%}", model)
+                    found.append(("defects", what, self.compare(arm, model, clean, at, "rmse_m")))
         keys = ("difference", "low", "high")
         return [
             {"price": price, "what": what, **{key: own[key] for key in keys}}
@@ -241,13 +223,9 @@ class Results:
         return f"{judge(found['low'], found['high'])} ({found['difference']:+.2f}{unit}, 95 % interval {bounds}{unit})"
 
 
-def is_price(own: str, other: str) -> bool:
-    """Return whether a comparison prices a defect, or reconstruction alone.
-
-    Reconstructed tracks with a defect are compared with reconstructed ones without.
-    """
-    restored, controls = ([learner.name for learner in group] for group in (RESTORED, CONTROLS))
-    return own in controls or (own in restored) == (other in controls)
+def is_of_tracks(own: str, other: str) -> bool:
+    """Return whether two networks learned from different kinds of tracks, one of them from reconstructed ones."""
+    return own.endswith(TRACKS) != other.endswith(TRACKS)
 
 
 def find_dataset(arm: str) -> str:

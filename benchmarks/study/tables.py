@@ -45,6 +45,7 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
     "lakes": {
         **dict.fromkeys(("arm", "lake", "protocol", "protocol_digest", "split", "split_digest", "tensors"), TEXT),
         **dict.fromkeys(("train", "val", "eval"), WHOLE),
+        "dose": NUMBER,
     },
 }
 EVIDENCE_TABLES = {table.name: table for table in (CALIBRATION, DENSITY_ERRORS, CONFORMAL_RADII, FEASIBILITY)}
@@ -53,7 +54,7 @@ TABLES |= {
     for name, table in EVIDENCE_TABLES.items()
 }
 """Columns of docs/results-NAME.csv. `seeds` has one row per arm, model, seed, part of the data and horizon; the seed is
-null where nothing was drawn."""
+null where nothing was drawn. `dose` is the share of the vehicles that have the injected defect."""
 
 LEARNED = {"train": "maneuver, training part", "eval": "maneuver, scored part"}
 """Figures of a forest's learning curve by part; the number of examples stands in the column `grid`."""
@@ -89,8 +90,11 @@ def update_tables(docs: Path, arm: Arm, jobs: Sequence[Job]) -> None:
         return
     lakes = {(lake.root, lake.name): lake for job in done for lake in (job.lake, job.trained_in)}.values()
     errors = read_errors(done)
+    if arm.is_unseen:
+        homes = {job.home.root: job.home for job in done if job.home}.values()
+        errors = {model: select_unseen(own, homes) for model, own in errors.items()}
     found = {
-        "seeds": pool_scores(done),
+        "seeds": pool_errors(arm, errors) if arm.is_unseen else pool_scores(done),
         "comparisons": pl.DataFrame(list(compare_models(arm, errors)), schema=TABLES["comparisons"]),
         "runs": pl.DataFrame([describe_run(job) for job in done if job.learner], schema=TABLES["runs"]),
         "curves": pl.concat([pl.DataFrame(schema=TABLES["curves"]), *(read_curve(job) for job in done if job.learner)]),
@@ -183,6 +187,36 @@ def read_errors(jobs: Iterable[Job]) -> dict[str, pl.DataFrame]:
     return {model: pl.concat(own) for model, own in errors.items()}
 
 
+def select_unseen(errors: pl.DataFrame, homes: Iterable[Lake]) -> pl.DataFrame:
+    """Select the errors of vehicles whose numbers are in the evaluation part of all these lakes."""
+    for home in homes:
+        blocks = pl.DataFrame((home.index or {})["blocks"], infer_schema_length=None).filter(part="eval")
+        within = pl.col("vehicle_id").is_between("first_vehicle_id", "last_vehicle_id")
+        numbers = blocks.select("dataset", "subset", "first_vehicle_id", "last_vehicle_id")
+        errors = errors.join(numbers, on=["dataset", "subset"]).filter(within).select(errors.columns)
+    return errors
+
+
+def pool_errors(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    """Pool errors by vehicle into the table of seeds; figures that they do not have are null."""
+    along, across = ("squared_longitudinal_m2", "squared_lateral_m2")
+    mean = {name: pl.col(name).sum() / pl.col("n").sum() for name in (along, across)}
+    has_density = pl.col("nll_nats").is_not_null().all()
+    figures = {
+        "rmse_m": (mean[along] + mean[across]).sqrt(),
+        "rmse_longitudinal_m": mean[along].sqrt(),
+        "rmse_lateral_m": mean[across].sqrt(),
+        "nll_nats": pl.when(has_density).then(pl.col("nll_nats").sum() / pl.col("n").sum()),
+    }
+    rows = [pl.DataFrame(schema=TABLES["seeds"])]
+    for model, own in errors.items():
+        named = {"arm": arm.name, "model": model, "group": EVERYTHING}
+        for part in (own, own.with_columns(dataset=pl.lit(EVERYTHING))):
+            pooled = part.group_by("seed", "dataset", "seconds", maintain_order=True).agg(pl.col("n").sum(), **figures)
+            rows.append(pooled.with_columns(pl.lit(value).alias(name) for name, value in named.items()))
+    return pl.concat(rows, how="diagonal_relaxed").select(*TABLES["seeds"]).cast(TABLES["seeds"])
+
+
 def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dict[str, Any]]:
     """Compare models with nothing, networks with plain models, and the arm's pairs, on the part that the arm shows."""
     learned = [own.name for own in arm.learners]
@@ -245,4 +279,12 @@ def describe_lake(lake: Lake) -> dict[str, Any]:
         **{"arm": lake.arm.name, "lake": lake.name, "tensors": lake.digest, "split": index["split"]},
         **{"protocol": protocol["name"], "protocol_digest": protocol["digest"], "split_digest": recipe.get("digest")},
         **index["samples_by_part"],
+        "dose": read_dose(lake.truth),
     }
+
+
+def read_dose(truth: Path) -> float | None:
+    """Read from a sample's truth which share of its vehicles has the defect that was asked for; None where none was."""
+    rows = pl.read_parquet(truth, columns=["kind", "vehicles"]) if truth.exists() else pl.DataFrame({"kind": []})
+    doses = rows.filter(kind="dose")
+    return doses["vehicles"].sum() / rows.filter(kind="first_frame").height if doses.height else None

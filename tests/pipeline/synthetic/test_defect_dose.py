@@ -9,7 +9,7 @@ import pytest
 from lake_sources import SAMPLE
 from raw_texts import read_highd
 from simulated import simulate_once
-from study.pieces import UNSEEN
+from study.defects import UNSEEN
 from test_sample_defects import damage
 
 from tracklake.pipeline.synthetic import DOSED, write_sample
