@@ -203,7 +203,7 @@ def make_quick(piece: Piece) -> Piece:
                 if own.name not in left_out
             ),
             source=shorten(arm.source),
-            settings={**arm.settings, "TRACKLAKE_SPLIT_BLOCK_S": "10" if arm.source.sample else "60"},
+            settings={**arm.settings, "TRACKLAKE_SPLIT_BLOCK_S": "12" if arm.source.sample else "60"},
             forest=tuple(
                 QUICK_FOREST.get(before, word) for before, word in zip(("", *arm.forest), arm.forest, strict=False)
             ),

@@ -225,7 +225,7 @@ def compare_models(arm: Arm, errors: Mapping[str, pl.DataFrame]) -> Iterator[dic
             continue
         others = errors[model].with_columns(SUMS * 0.0) if against == NOTHING else errors[against]
         own, other = (select_part(each, arm.dataset) for each in (errors[model], others))
-        if set(own["dataset"]) == set(other["dataset"]):
+        if own.height and set(own["dataset"]) == set(other["dataset"]):
             named = {"arm": arm.name, "model": model, "against": against, "dataset": arm.dataset}
             for figure in FIGURES:
                 sums = COMPARED_FIGURES[figure]
