@@ -4,6 +4,7 @@ import gzip
 import json
 import re
 import shutil
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,10 +13,10 @@ import numpy as np
 import polars as pl
 import pytest
 from study.__main__ import main, run_arms
-from study.jobs import SCORES, Job, Lake, Workshop
+from study.jobs import SCORES, Job, Lake, Workshop, resolve_settings
 from study.page import render_pages
 from study.pieces import PIECES
-from study.plan import Arm, Learner, Source, estimate_pieces, make_quick
+from study.plan import EVAL_BLOCK, Arm, Learner, Source, estimate_pieces, make_quick
 from study.results import Results
 from study.tables import NOTHING, TABLES, pool_scores, read_table, select_complete
 from verdicts import check_verdicts
@@ -233,6 +234,38 @@ def test_the_identity_of_a_run_is_its_settings_and_its_tensors():
     ]
     assert len({own.identity for own in (job, *others)}) == 6
     assert replace(job, learner=replace(TINY.learners[0], seeds=8)).identity == job.identity
+
+
+def test_a_model_without_the_setting_of_folds_is_trained_once_for_all_of_them():
+    settings = {"TRACKLAKE_SPLIT": "time-blocks", "TRACKLAKE_SPLIT_BLOCK_S": "50"}
+    taken = {"TRACKLAKE_SPLIT": "csp-2018", "TRACKLAKE_SPLIT_BLOCK_S": "", EVAL_BLOCK: ""}
+    arm = replace(TINY, settings=settings)
+    own = replace(TINY.learners[0], source=OTHERS, settings=taken)
+    home = arm.find_home(own)
+    assert (home.source, home.settings, home.folds) == (OTHERS, {"TRACKLAKE_SPLIT": "csp-2018"}, ())
+    home = arm.find_home(TINY.learners[0])
+    assert (home.source, home.settings, home.folds) == (TINY.source, settings, TINY.folds)
+
+
+def test_jobs_that_share_a_run_train_it_once(tmp_path):
+    own = Learner("lstm", 1, 200, epochs=1)
+    home = Lake(TINY, None, tmp_path / "lakes" / "home", "digest", {"blocks": [], "protocol": {}})
+    lakes = [Lake(TINY, fold, tmp_path / "lakes" / f"{fold}", "digest", home.index) for fold in (0, 1)]
+    calls = []
+
+    def call(words, environment):  # noqa: ARG001  (as `call_command`)
+        calls.append(words[0])
+        if words[0] == "train":
+            time.sleep(0.2)  # the other job asks meanwhile
+            folder = home.root / "models" / words[words.index("--name") + 1]
+            folder.mkdir(parents=True)
+            (folder / "config.json").write_text(json.dumps(resolve_settings(own)))
+        return 0
+
+    workshop = Workshop(tmp_path, tmp_path, at_once=2, call=call)
+    workshop.work_on([Job(lake, "lstm", own, 0, home) for lake in lakes])
+    assert sorted(calls) == ["evaluate", "evaluate", "train"]
+    assert not workshop.failed
 
 
 def test_errors_of_folds_are_pooled_by_their_samples(tmp_path):

@@ -21,7 +21,7 @@ from typing import Any
 
 import polars as pl
 
-from study.plan import Arm, Learner, Source, estimate_run
+from study.plan import EVAL_BLOCK, Arm, Learner, Source, estimate_run
 from tracklake.pipeline.cli.lane_forest import FOLDER as FOREST_FOLDER
 from tracklake.pipeline.cli.lane_forest import SCORES as FOREST_SCORES
 from tracklake.pipeline.cli.train import read_model_settings
@@ -68,7 +68,7 @@ class Lake:
     @property
     def environment(self) -> dict[str, str]:
         """Settings of the lake."""
-        left_out = {} if self.fold is None else {"TRACKLAKE_SPLIT_EVAL_BLOCK": str(self.fold)}
+        left_out = {} if self.fold is None else {EVAL_BLOCK: str(self.fold)}
         return {**self.arm.settings, **left_out}
 
     @property
@@ -206,6 +206,7 @@ class Workshop:
     def __init__(self, work: Path, data: Path, *, at_once: int = 2, call: Call = call_command) -> None:
         self.work, self.data, self.at_once, self.call, self.lock = work, data, at_once, call, Lock()
         self.failed: list[str] = []
+        self.runs: dict[Path, Lock] = {}
         said = [
             subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
             for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
@@ -240,11 +241,10 @@ class Workshop:
         return [read_lake(replace(lake, root=self.work / "lakes" / digest)) for lake, digest in named]
 
     def find_homes(self, arm: Arm, own: Learner) -> list[Lake]:
-        """Find the lakes that a model is trained in, one per fold; none: those that it is scored on."""
+        """Find the lakes that a model is trained in, one per fold or one for all; none: those that it is scored on."""
         if own.source is None and not own.settings:
             return []
-        homes = self.find_lakes(replace(arm, source=own.source or arm.source, settings=arm.settle(own)))
-        return [replace(lake, variant=own.name) for lake in homes]
+        return [replace(lake, variant=own.name) for lake in self.find_lakes(arm.find_home(own))]
 
     def list_lakes(self, arm: Arm) -> dict[Path, Lake]:
         """List all lakes of an arm by their folders."""
@@ -258,7 +258,7 @@ class Workshop:
         for own in arm.learners:
             homes = {home.fold: home for home in self.find_homes(arm, own)}
             for lake in lakes:
-                home = homes.get(lake.fold)
+                home = homes.get(lake.fold, homes.get(None))
                 if home is None or home.index is not None:
                     where = (home, None) if home and own.at_home else (lake, home)
                     yield from (Job(where[0], own.name, own, seed, where[1]) for seed in range(own.seeds))
@@ -335,9 +335,14 @@ class Workshop:
         return file if file.exists() else None
 
     def train(self, job: Job, own: Learner) -> bool:
-        """Train a run if there is none yet; returns whether there is one."""
-        if job.is_current:
-            return True
+        """Train a run if there is none yet; returns whether there is one. Of jobs that share a run, the others wait."""
+        with self.lock:
+            being_trained = self.runs.setdefault(job.run_folder, Lock())
+        with being_trained:
+            return job.is_current or self.train_alone(job, own)
+
+    def train_alone(self, job: Job, own: Learner) -> bool:
+        """Train a run, or go on with it."""
         begun = (job.run_folder.with_name(f".{job.run}.unfinished") / "checkpoint.pt").exists()
         how = ("--seed", job.seed, "--samples-per-epoch", own.samples, "--epochs", own.epochs, *own.options)
         words = ("train", own.model, *job.trained_in.options, "--name", job.run, *how, "--threads", 1)

@@ -6,6 +6,9 @@ from itertools import pairwise
 
 from tracklake.schemas.evaluations import EVERYTHING
 
+EVAL_BLOCK = "TRACKLAKE_SPLIT_EVAL_BLOCK"
+"""Setting of the block that a fold leaves out; a model that takes it away is trained once for all folds."""
+
 
 @dataclass(frozen=True)
 class Source:
@@ -92,9 +95,11 @@ class Arm:
     forest: tuple[str, ...] = ()
     is_unseen: bool = False
 
-    def settle(self, own: Learner) -> dict[str, str]:
-        """Return the settings of the lake that a model is trained in."""
-        return {name: value for name, value in {**self.settings, **own.settings}.items() if value}
+    def find_home(self, own: Learner) -> "Arm":
+        """Find the recordings, settings and folds of the lakes that a model is trained in."""
+        settings = {name: value for name, value in {**self.settings, **own.settings}.items() if value}
+        folds = () if own.settings.get(EVAL_BLOCK) == "" else self.folds
+        return replace(self, source=own.source or self.source, settings=settings, folds=folds)
 
 
 @dataclass(frozen=True)
@@ -171,7 +176,8 @@ def list_work(arm: Arm) -> Iterator[tuple[tuple[object, ...], float]]:
         if arm.forest:
             yield (lake, repr(arm.forest)), FOREST_S + estimate_decoder(arm.forest)
         for own in arm.learners:
-            home = repr(((own.source or arm.source).recordings, arm.protocol, arm.settle(own), fold))
+            home = arm.find_home(own)
+            home = repr((home.source.recordings, home.protocol, home.settings, fold if home.folds else None))
             yield (home,), estimate_lake(own.source or arm.source)
             how = (own.model, own.samples, own.epochs, own.options)
             for seed in range(own.seeds):
