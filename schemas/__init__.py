@@ -1,4 +1,7 @@
-"""Declarations of every table of the lake and of quality.json; nothing heavier than polars and pandera is imported."""
+"""Declarations that all packages share: tables, files, protocols, errors; and helpers that need none of the packages.
+
+Importing it imports nothing heavier than polars and pandera; `arrays` and `drawings` are imported where they are used.
+"""
 
 from tracklake.schemas.columns import StructureError as StructureError
 from tracklake.schemas.columns import Table as Table

@@ -12,7 +12,7 @@ from tracklake.schemas.errors import UsageError
 
 Row = dict[str, Any]
 Layers = alt.LayerChart | alt.FacetChart
-"""Type of `altair.layer`."""
+"""Charts that `altair.layer` makes."""
 
 _THEME = make_config(background=PAPER, padding=14, label=13, title=13, heading=17)
 _LEGENDS = {"labelLimit": 0, "layout": {"top": {"direction": "vertical", "margin": 0}}}

@@ -61,6 +61,10 @@ def test_the_readme_names_every_command():
     assert [name for name in COMMANDS if f"tracklake {name}" not in README] == []
 
 
+def test_the_readme_counts_the_rules():
+    assert f"findings of {len(RULES)} rules" in README
+
+
 def test_the_page_of_tables_is_current():
     assert (ROOT / "docs" / "tables.md").read_text() == write_tables(), "run `make docs`"
     assert all(f"## {table.name}\n" in write_tables() for table in TABLES)

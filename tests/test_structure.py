@@ -75,15 +75,26 @@ def test_short_helps_are_those_of_the_commands():
     assert helps == COMMANDS
 
 
+WITHOUT_COMMAND = {"assess", "revalidate", "pages", "score", "drive_findings", "drive_score", "drive_pages"}
+"""Stages that `tracklake run` or the command of another stage runs, and no command of their own."""
+
+
 def test_stage_commands_are_the_registrys():
     from tracklake.pipeline.cli.app import COMMANDS
     from tracklake.pipeline.stages.registry import STAGES
 
-    registered = {stage.name: stage.meaning for stage in STAGES}
-    without = {"assess", "revalidate", "pages", "score", "drive_findings", "drive_score", "drive_pages"}
-    assert {name: COMMANDS.get(name) for name in registered if name not in without} == {
-        name: meaning for name, meaning in registered.items() if name not in without
-    }
+    registered = {stage.name: stage.meaning for stage in STAGES if stage.name not in WITHOUT_COMMAND}
+    assert {name: COMMANDS.get(name) for name in registered} == registered
+
+
+def test_a_stage_that_others_need_has_a_command_that_messages_can_name():
+    from tracklake.pipeline.cli.app import COMMANDS
+    from tracklake.pipeline.stages.registry import STAGE_BY_NAME
+
+    needed = {name for stage in STAGE_BY_NAME.values() for name in (*stage.after, *stage.after_reconstruction)}
+    stages = [STAGE_BY_NAME[name] for name in needed & STAGE_BY_NAME.keys()]
+    assert len(stages) > 5
+    assert [stage.name for stage in stages if (stage.command or stage.name) not in COMMANDS] == []
 
 
 def test_the_package_is_typed_and_no_file_is_long():
@@ -95,6 +106,18 @@ def test_the_package_is_typed_and_no_file_is_long():
         if (lines := len(file.read_text().splitlines())) > 400
     }
     assert long == {}
+
+
+def test_no_function_is_long():
+    functions = [
+        (f"{file.relative_to(ROOT)}: {node.name}", 1 + node.end_lineno - node.lineno)
+        for folder in PACKAGES
+        for file in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    assert len(functions) > 2000
+    assert [name for name, lines in functions if lines > 60] == []
 
 
 def test_pandas_is_not_imported():
@@ -126,3 +149,11 @@ def test_every_package_says_in_one_line_what_lives_there():
             first = (ast.get_docstring(ast.parse(file.read_text())) or "").split("\n")[0]
             assert len(first.split()) >= 4, file
             assert first.endswith("."), file
+
+
+def test_the_design_page_names_every_package():
+    page = (ROOT / "docs" / "DESIGN.md").read_text().partition("\n## Code\n")[2]
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    named = sorted(name.strip(" `") for row in rows for name in row.split(","))
+    packages = sorted(f"pipeline.{file.parent.name}" for file in (ROOT / "pipeline").glob("*/__init__.py"))
+    assert named == sorted([*packages, "quality_reports", "schemas", "training"])

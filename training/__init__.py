@@ -1,4 +1,5 @@
-"""Models, their training and their evaluation, on the tensors of a lake. It imports `schemas` and nothing else of ours.
+"""Models, their training and their evaluation, on the tensors of a lake.
 
-Each package says in its first line what it holds. torch is imported only where a model needs it.
+Each package says in its first line what it holds. It imports `schemas`, and the rules of `quality_reports` to judge
+predicted scenes. torch is imported only where a model needs it.
 """

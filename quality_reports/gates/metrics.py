@@ -113,7 +113,7 @@ METRICS: tuple[Metric, ...] = (
         OF_DRIVES,
         f"a synthetic drive, and {FUSION}",
     ),
-    Metric("dataset", "highd, ngsim or custom", LABEL, OF_TRACKS[:3], selects=True),
+    Metric("dataset", "name of the dataset, as in `subsets`", LABEL, OF_TRACKS[:3], selects=True),
     Metric("recording", "name of the recording", LABEL, OF_TRACKS[:2], selects=True),
     Metric("subset", "name of the subset", LABEL, OF_TRACKS[:1], selects=True),
     Metric("drive", "name of the drive", LABEL, ("drive",), selects=True),

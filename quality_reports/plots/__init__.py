@@ -1,1 +1,1 @@
-"""Plots of the report as SVG text."""
+"""Plots: those of the report as SVG text, and the reliability plot of an evaluation."""

@@ -1,1 +1,1 @@
-"""Scores of predictions: errors and NLL, the check that comes before them, latency, and published figures."""
+"""Scores of predictions: errors and NLL, the check for future inputs that comes before them, and latency."""

@@ -1,4 +1,4 @@
-"""Constant velocity, the baseline of all models, damped, or by a Kalman filter; constant turn rate; NumPy only."""
+"""Models of motion, with NumPy only: constant, damped and Kalman-filtered velocity, and constant turn rate."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -14,18 +14,16 @@ from tracklake.training.models.prediction import Density, Prediction
 
 VELOCITY_S = 0.2
 """Length of history that the velocity is taken from, in seconds."""
-
 DECAY_S = (0.01, 1000.0)
 """Least and largest time in s after which a lateral velocity may have fallen to 37 %."""
 MEASUREMENT_RANGE_M, ACCELERATION_RANGE_M2PS3 = (1e-3, 10.0), (1e-6, 100.0)
 """Ranges that the Kalman filter's noise is fitted in."""
 AXES = ("longitudinal", "lateral")
 """Names of the axes of positions, as in the names of parameters."""
-
 TURN_S = 1.0
-"""Duration of each of the two displacements whose directions give the yaw rate, in seconds."""
+"""Duration of each of the two displacements whose directions give a constant turn rate, in seconds."""
 LEAST_SPEED_MPS = 2.0
-"""Least speed over both displacements, in m/s; a slower vehicle is taken to drive straight on."""
+"""Least speed over both of these displacements, in m/s; a slower vehicle is taken to drive straight on."""
 
 
 def velocity_ticks(protocol: Protocol) -> int:

@@ -1,1 +1,1 @@
-"""Settings, data loader, logs and checkpoints of a training, and the run that it writes."""
+"""Settings, progress and checkpoints of a training, the run that it writes, and runs opened to predict."""
