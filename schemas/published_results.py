@@ -93,7 +93,7 @@ CELL_ACCURACY: dict[str, tuple[float, ...]] = {
 """Share of instances in the predicted one of nine cells, by horizon (Choi et al. 2021)."""
 
 
-def published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
+def list_published_rows(protocol: str, datasets: tuple[str, ...] | None = None) -> pl.DataFrame:
     """List the figures published for a protocol, as rows of `schemas.evaluations.EVALUATIONS`.
 
     `datasets` are those of the part that is evaluated: figures on other public recordings are left out. None: all.

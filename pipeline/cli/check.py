@@ -103,7 +103,7 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
     for copy in left:
         terminal.print_problem(f"{root / copy.path}: {copy.reason}", label="damaged")
     if copies or not is_settled(root, manifest):
-        is_mended = _mend(root, terminal, copies=copies)
+        is_mended = _record_damage(root, terminal, copies=copies)
         outcome = "are up to date again" if is_mended else "were left so"
         terminal.print_line(f"catalog and folders did not agree with the manifest, and {outcome}")
         left = [] if is_mended else left
@@ -115,7 +115,7 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
         terminal.print_problem(f"{root / file.path}: {file.reason}", label="damaged")
     record |= {"files": len(files), "bytes": size, "damaged": [file._asdict() for file in (*damaged, *left)]}
     if damaged:
-        _mend(root, terminal, damaged)
+        _record_damage(root, terminal, damaged)
         terminal.print_problem(f"{len(damaged)} of {len(files):,} files are damaged. {_advise(root, manifest)}")
     elif left:
         terminal.print_problem(f"{len(left)} copies are damaged: run `tracklake check` again later")
@@ -125,7 +125,9 @@ def _check_files(root: Path, terminal: Terminal, record: dict[str, Any]) -> list
     return [*damaged, *left]
 
 
-def _mend(root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), copies: Sequence[str] = ()) -> bool:
+def _record_damage(
+    root: Path, terminal: Terminal, damaged: Sequence[DamagedFile] = (), copies: Sequence[str] = ()
+) -> bool:
     """Record what is damaged, and repeat the end of the session without some copies; returns whether it succeeded."""
     is_marked = False
     try:

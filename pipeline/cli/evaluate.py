@@ -29,7 +29,7 @@ from tracklake.pipeline.lake import load, refuse_lake
 from tracklake.pipeline.lake.files import MODELS
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.score import BASELINE, finished_runs
+from tracklake.pipeline.stages.score import BASELINE, list_finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.columns import PARTS
 from tracklake.schemas.comparisons import VEHICLE_ERRORS
@@ -37,7 +37,7 @@ from tracklake.schemas.errors import MissingExtraError, explain_file_errors
 from tracklake.schemas.evaluations import EVALUATIONS
 from tracklake.schemas.files import write_output
 from tracklake.schemas.protocols import RECONSTRUCTED_TRACKS
-from tracklake.schemas.published_results import published_rows
+from tracklake.schemas.published_results import list_published_rows
 from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.comparison.record import SampleRecord
 from tracklake.training.data.gathers import NEAREST
@@ -148,7 +148,7 @@ def evaluate(
         plain = part == "eval" and around == NEAREST and published and not every_tick and tensors.kept is None
         target = root / FOLDER / f"{settings.get_protocol().name}.csv" if out is None and plain and not runs else out
         _make_folders(target, vehicle_errors, evidence)
-        names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in finished_runs(root))])
+        names = dict.fromkeys(runs or [BASELINE, *sorted(path.parent.name for path in list_finished_runs(root))])
         if compare and len(names) < 2:
             raise typer.BadParameter(f"--compare needs two runs or models; got {', '.join(names)} alone")
         records = {name: SampleRecord(tensors, part) for name in names} if calibration else {}
@@ -200,7 +200,7 @@ def _make_folders(target: Path | None, vehicle_errors: Path | None, evidence: Pa
 def _tabulate(found: Iterable[Evaluation], protocol: str, comparable: tuple[str, ...]) -> pl.DataFrame:
     """Return the rows of all evaluations, and published ones of datasets that are comparable."""
     tables = [EVALUATIONS.empty(), *(own.to_table() for own in found)]
-    tables += [published_rows(protocol, comparable)] if comparable else []
+    tables += [list_published_rows(protocol, comparable)] if comparable else []
     return EVALUATIONS.validate(pl.concat(tables).sort(EVALUATIONS.key), where="evaluate")
 
 

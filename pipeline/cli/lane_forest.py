@@ -17,7 +17,7 @@ from tracklake.pipeline.cli.lane_forest_tables import show_curve, show_published
 from tracklake.pipeline.cli.options import JsonOption, LakeOption, ProtocolOption, QuietOption, read_pairs
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.lake.files import MODELS as RUNS
-from tracklake.pipeline.stages.score import finished_runs
+from tracklake.pipeline.stages.score import list_finished_runs
 from tracklake.pipeline.stages.tensors import tensor_folder
 from tracklake.schemas.errors import TracklakeError, UsageError, explain_file_errors
 from tracklake.schemas.extras import require_extras
@@ -233,7 +233,9 @@ def _open_forecasters(
     A run that cannot be opened (made for other tensors, damaged, of an unknown model, torch missing) is skipped, unless
     the user named it.
     """
-    for name in dict.fromkeys([*MODELS_BESIDE, *(runs or [file.parent.name for file in finished_runs(models.parent)])]):
+    for name in dict.fromkeys(
+        [*MODELS_BESIDE, *(runs or [file.parent.name for file in list_finished_runs(models.parent)])]
+    ):
         try:
             yield open_forecaster(name, folder, models, frozenset({"eval"}))
         except TracklakeError as refused:

@@ -20,7 +20,7 @@ from tracklake.pipeline.stages.stage import RECONSTRUCTION, StageError
 from tracklake.pipeline.transforms.resample import join_key, put_on_clock
 from tracklake.schemas.arrays import Floats, expand_ranges
 from tracklake.schemas.protocols import FILTERED_TRACKS, RECONSTRUCTED_TRACKS, RECORDED, TracksFrom
-from tracklake.training.data.gathers import locate_rows, read_samples, truth_of_ego
+from tracklake.training.data.gathers import locate_rows, read_samples, select_ego_truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.scores import find_strata, measure_samples
 from tracklake.training.models.prediction import Prediction
@@ -117,7 +117,7 @@ def _measure_model(model: Forecaster, inputs: GainInputs) -> pl.DataFrame:
     for start in range(0, len(samples), BATCH_SIZE):
         chosen, own = samples[start : start + BATCH_SIZE], vehicle[start : start + BATCH_SIZE]
         row = folder.sample_row[chosen].astype(np.int64)
-        truth = truth_of_ego(read_samples(folder, chosen, model.reads, nearest=inputs.nearest)[1])
+        truth = select_ego_truth(read_samples(folder, chosen, model.reads, nearest=inputs.nearest)[1])
         np.add.at(count, own, truth.future_mask[:, at])
         for kind, tensors in inputs.histories.items():
             observed, _ = read_samples(tensors, chosen, model.reads, nearest=inputs.nearest)

@@ -179,8 +179,8 @@ def _show_rows(relation: LakeResult, terminal: Terminal) -> None:
     table = [list(relation.columns), *cells]
     hidden = len(numeric) - len(shown)
     gap = next((place for place, column in enumerate(shown) if place != column), len(shown))
-    head, *body = [_pick(row, shown, gap if hidden else None, ELLIPSIS) for row in table]
-    print_table(terminal, head, body, right=_pick(numeric, shown, gap if hidden else None, False))
+    head, *body = [_select_cells(row, shown, gap if hidden else None, ELLIPSIS) for row in table]
+    print_table(terminal, head, body, right=_select_cells(numeric, shown, gap if hidden else None, False))
     notes = [f"{len(shown)} of {len(numeric)} columns; a wider terminal, a pipe or --out shows all"] if hidden else []
     if len(rows) > MAX_ROWS:
         notes.insert(0, f"the first {MAX_ROWS} of {relation.count():,} rows; a pipe or --out FILE.csv gives all")
@@ -189,7 +189,7 @@ def _show_rows(relation: LakeResult, terminal: Terminal) -> None:
         _print_count(terminal, len(rows), "".join(f"; {note}" for note in notes))
 
 
-def _pick(row: Sequence[T], shown: Sequence[int], gap: int | None, filling: T) -> list[T]:
+def _select_cells(row: Sequence[T], shown: Sequence[int], gap: int | None, filling: T) -> list[T]:
     """Return the cells of the columns shown, with one more where columns are left out."""
     cells = [row[column] for column in shown]
     return cells if gap is None else [*cells[:gap], filling, *cells[gap:]]

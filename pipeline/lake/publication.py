@@ -246,11 +246,6 @@ def is_synced(root: Path, address: str, *, remote: bool) -> bool:
     return recorded is not None and recorded[remote] == hash_root(address if remote else root)
 
 
-def was_synced(root: Path, address: str) -> bool:
-    """Return whether the lake in a folder has ever been the one at an address."""
-    return address in _read_agreements(root)
-
-
 def _read_agreements(root: Path) -> dict[str, Any]:
     try:
         return dict(read_json(root / SYNCED))

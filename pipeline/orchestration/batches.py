@@ -27,7 +27,7 @@ from tracklake.pipeline.stages.stage import INGEST, Job
 from tracklake.schemas.errors import FileAccessError
 
 T = TypeVar("T")
-Outcome = tuple["Call", Any]
+CallResult = tuple["Call", Any]
 """A call, and its result or the exception that it raised."""
 
 LASTING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.EROFS, errno.EACCES, errno.EPERM)
@@ -71,7 +71,7 @@ class Engine(Protocol):
     slots: int
     batch_calls: int
 
-    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+    def run_calls(self, stage: str, calls: Sequence[Call]) -> Iterator[CallResult]:
         """Yield the outcome of each call as it ends."""
 
 
@@ -83,7 +83,7 @@ class Threads:
         self.batch_calls = 1
         self._stopped = threading.Event()
 
-    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+    def run_calls(self, stage: str, calls: Sequence[Call]) -> Iterator[CallResult]:
         """Yield the outcome of each call as it ends."""
         del stage
         for call in calls:
@@ -113,7 +113,7 @@ def name_batch(calls: Sequence[Call]) -> str:
 
 
 def build_group(
-    lake: str, stage: str, jobs: Sequence[Job], settings: Settings, part: Manifest | None = None
+    lake: str, stage: str, jobs: Sequence[Job], settings: Settings, readable: Manifest | None = None
 ) -> list[Commit]:
     """Do one stage's work on a group of recordings: read, transform, validate, write; returns the commits to make.
 
@@ -126,28 +126,28 @@ def build_group(
         stage: name of the stage.
         jobs: recordings, or one job over the whole lake, which is done in a folder.
         settings: settings of the run.
-        part: what jobs on recordings read of the manifest (`select_part`); None, of a lake in a folder: it is read.
+        readable: what jobs on recordings read of the manifest (`narrow_for_jobs`); None for a lake in a folder.
     """
     origin = find_own_origin(lake)
     if not any(job.tail for job in jobs):
         return send_commits(Path(lake), _build(Path(lake), stage, jobs, settings, None))
-    part = part or select_part(load(Path(lake)), stage, jobs, settings)
+    readable = readable or narrow_for_jobs(load(Path(lake)), stage, jobs, settings)
     if origin is None:
-        return _build(Path(lake), stage, jobs, settings, part)
-    with open_workspace(origin, part) as root:
-        return send_commits(root, _build(root, stage, jobs, settings, part))
+        return _build(Path(lake), stage, jobs, settings, readable)
+    with open_workspace(origin, readable) as root:
+        return send_commits(root, _build(root, stage, jobs, settings, readable))
 
 
-def _build(root: Path, stage: str, jobs: Sequence[Job], settings: Settings, part: Manifest | None) -> list[Commit]:
+def _build(root: Path, stage: str, jobs: Sequence[Job], settings: Settings, readable: Manifest | None) -> list[Commit]:
     if stage == INGEST:
-        return try_again(lambda: [ingest.build(root, job, settings.slice_entries, part) for job in jobs])
-    return try_again(lambda: planner.build_jobs(STAGE_BY_NAME[stage], root, jobs, settings, part))
+        return try_again(lambda: [ingest.build(root, job, settings.slice_entries, readable) for job in jobs])
+    return try_again(lambda: planner.build_jobs(STAGE_BY_NAME[stage], root, jobs, settings, readable))
 
 
-def select_part(manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Manifest:
+def narrow_for_jobs(manifest: Manifest, stage: str, jobs: Sequence[Job], settings: Settings) -> Manifest:
     """Return the part of a manifest that jobs on recordings read; it is small, and fit to be sent to a worker."""
     if stage != INGEST:
-        return planner.select_part(manifest, STAGE_BY_NAME[stage], jobs, settings)
+        return planner.narrow_manifest(manifest, STAGE_BY_NAME[stage], jobs, settings)
     files = {file.sha256 for job in jobs for file in ingest.list_files(job)}
     known = {sha256: manifest.sources[sha256] for sha256 in files & manifest.sources.keys()}
     return replace(manifest, commits={}, sources=known, retired=(), ingested_from=())
@@ -165,10 +165,10 @@ def make_group_call(lake: str, manifest: Manifest, stage: str, jobs: Sequence[Jo
 
     It carries what the jobs read of the manifest: reading thousands of commits takes longer than a small job.
     """
-    part = select_part(manifest, stage, jobs, settings) if any(job.tail for job in jobs) else None
+    readable = narrow_for_jobs(manifest, stage, jobs, settings) if any(job.tail for job in jobs) else None
     if find_address(lake) is not None:
         settings = settings.model_copy(update={"lake": Path(lake), "cache": None})  # no folder of this machine
-    return Call(build_group, (lake, stage, jobs, settings, part), tuple(job.title for job in jobs))
+    return Call(build_group, (lake, stage, jobs, settings, readable), tuple(job.title for job in jobs))
 
 
 def find_own_origin(lake: str) -> Origin | None:

@@ -23,7 +23,7 @@ from distributed.scheduler import KilledWorker
 from distributed.system import MEMORY_LIMIT
 
 from tracklake.pipeline.lake.checksums import forget_checksums
-from tracklake.pipeline.orchestration.batches import Call, Outcome
+from tracklake.pipeline.orchestration.batches import Call, CallResult
 from tracklake.pipeline.settings import Settings
 from tracklake.schemas.errors import TracklakeError
 
@@ -73,7 +73,7 @@ class DaskWorkers:
         self._missing_since: float | None = None
         self._count_slots(client.nthreads().values())
 
-    def do(self, stage: str, calls: Sequence[Call]) -> Iterator[Outcome]:
+    def run_calls(self, stage: str, calls: Sequence[Call]) -> Iterator[CallResult]:
         """Yield the outcome of each call as it ends.
 
         A call that was under way on a worker when it died is done again on another, and at last alone: what shares a
@@ -95,7 +95,7 @@ class DaskWorkers:
                 else:
                     yield call, made
 
-    def _map(self, stage: str, calls: Sequence[Call], priority: int = 0) -> Iterator[Outcome]:
+    def _map(self, stage: str, calls: Sequence[Call], priority: int = 0) -> Iterator[CallResult]:
         """Send calls to the workers, and yield their outcomes as they end."""
         self.check_workers()
         batch = uuid.uuid4().hex
@@ -142,7 +142,7 @@ class DaskWorkers:
             WorkersError: as above, or the scheduler is lost.
         """
         with self._hold_client():
-            threads = self._ask(self._client.nthreads)
+            threads = self._call_client(self._client.nthreads)
             workers = threads.keys()
             if workers:
                 self._missing_since = None
@@ -175,7 +175,7 @@ class DaskWorkers:
         self.slots = max(sum(threads), 1)
         self.batch_calls = 2 * self.slots
 
-    def _ask(self, question: Callable[..., Any], *arguments: Any, **options: Any) -> Any:  # noqa: ANN401  (untyped in distributed)
+    def _call_client(self, question: Callable[..., Any], *arguments: Any, **options: Any) -> Any:  # noqa: ANN401  (untyped in distributed)
         """Return what a method of the client answers.
 
         Raises:
@@ -201,7 +201,7 @@ class DaskWorkers:
             WorkersError: a worker lacks something, or has another version.
         """
         here = {"Python": python_version(), **_list_releases()}
-        run, options = partial(self._ask, self._client.run), {"workers": list(workers), "on_error": "return"}
+        run, options = partial(self._call_client, self._client.run), {"workers": list(workers), "on_error": "return"}
         fit = set()
         faults: dict[str, list[str]] = {}
         for name, own in here.items():
@@ -238,7 +238,7 @@ class DaskWorkers:
 
     def _ask_scheduler(self, package: str) -> str | PackageNotFoundError:
         try:
-            return str(self._ask(self._client.run_on_scheduler, version, package))
+            return str(self._call_client(self._client.run_on_scheduler, version, package))
         except PackageNotFoundError as missing:
             return missing
 

@@ -27,8 +27,8 @@ from tracklake.pipeline.lake.session_end import WRITER
 from tracklake.pipeline.orchestration.artifacts import name_run
 from tracklake.pipeline.orchestration.batches import (
     Call,
+    CallResult,
     Engine,
-    Outcome,
     Threads,
     divide_calls,
     locate_for_workers,
@@ -65,7 +65,7 @@ LOCK_POLL_S = 1.0
 class BatchFailedError(TracklakeError):
     """The end of a batch in which some calls failed, or which broke off; it carries the outcomes that there are."""
 
-    def __init__(self, outcomes: list[Outcome], broken: Exception | None) -> None:
+    def __init__(self, outcomes: list[CallResult], broken: Exception | None) -> None:
         failures = [describe_error(made) for _, made in outcomes if isinstance(made, BaseException)]
         said = [str(broken)] if broken is not None else failures
         super().__init__(f"{len(failures)} of {len(outcomes)} failed: {said[0]}")
@@ -74,10 +74,10 @@ class BatchFailedError(TracklakeError):
 
 
 @task(task_run_name="{stage} {title}", cache_policy=NO_CACHE, persist_result=False)
-def do_batch(stage: str, title: str, do: Callable[[], Iterator[Outcome]]) -> list[Outcome]:
+def do_batch(stage: str, title: str, do: Callable[[], Iterator[CallResult]]) -> list[CallResult]:
     """Do one stage's work on a batch of recordings, and return its outcomes."""
     del title
-    outcomes: list[Outcome] = []
+    outcomes: list[CallResult] = []
     broken: Exception | None = None
     try:
         for call, made in do():
@@ -91,7 +91,7 @@ def do_batch(stage: str, title: str, do: Callable[[], Iterator[Outcome]]) -> lis
     return outcomes
 
 
-def _do_calls(engine: Engine, stage: str, calls: Sequence[Call]) -> Iterator[list[Outcome]]:
+def _do_calls(engine: Engine, stage: str, calls: Sequence[Call]) -> Iterator[list[CallResult]]:
     """Do a stage's calls and yield the outcomes of each batch as it ends.
 
     Raises:
@@ -99,11 +99,11 @@ def _do_calls(engine: Engine, stage: str, calls: Sequence[Call]) -> Iterator[lis
     """
     reporter().begin(stage, sum(len(call.titles) for call in calls))
     batches = divide_calls(engine, calls)
-    futures = [do_batch.submit(stage, name_batch(batch), partial(engine.do, stage, batch)) for batch in batches]
+    futures = [do_batch.submit(stage, name_batch(batch), partial(engine.run_calls, stage, batch)) for batch in batches]
     broken = None
     for future in as_completed(futures):
         future.wait()
-        made: list[Outcome] | BaseException = future.state.result(raise_on_failure=False)
+        made: list[CallResult] | BaseException = future.state.result(raise_on_failure=False)
         if isinstance(made, BatchFailedError):
             broken = broken or made.broken
             made = made.outcomes
@@ -218,10 +218,12 @@ def do_work(request: RunRequest, plan: RunPlan, lock_timeout_s: float) -> tuple[
     Returns what was done, and the lake as it is then.
     """
     with _open_engine(request) as engine:
-        return _work(request, plan, lock_timeout_s, engine)
+        return _work_until_sound(request, plan, lock_timeout_s, engine)
 
 
-def _work(request: RunRequest, plan: RunPlan, lock_timeout_s: float, engine: Engine) -> tuple[RunResult, Manifest]:
+def _work_until_sound(
+    request: RunRequest, plan: RunPlan, lock_timeout_s: float, engine: Engine
+) -> tuple[RunResult, Manifest]:
     result = RunResult()
     manifest = _work_once(request, plan, result, lock_timeout_s, engine)
     if (

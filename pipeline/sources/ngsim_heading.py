@@ -105,7 +105,7 @@ def read_heading(head: bytes, where: str, mapping: ColumnMapping | None = None) 
         return _map_fields(header, rows, at, mapping)
     if header is None or at is None:
         return _read_bare(lines)
-    known, units = _understand(header, where)
+    known, units = _match_names(header, where)
     lengths = Counter(len(_split(row)) for row in rows if row.strip())
     most = max(lengths, key=lambda length: lengths[length], default=len(header))
     if most == len(header) + 1:
@@ -135,7 +135,7 @@ def _find_header(lines: Sequence[str]) -> int | None:
         fields = [each for each in _split(line.lstrip("#% ")) if each]
         is_comment = line.lstrip().startswith(("#", "%"))
         named = len(fields) > 1 and not any(map(_is_number, fields)) and "\0" not in line and "\ufffd" not in line
-        if named and (not is_comment or set(ESSENTIAL) <= set(_understand(fields, "")[0])):
+        if named and (not is_comment or set(ESSENTIAL) <= set(_match_names(fields, "")[0])):
             return number
         if line.strip() and not is_comment:
             return None
@@ -149,7 +149,7 @@ def _is_number(text: str) -> bool:
         return text.strip().lower() in NULL_WORDS
 
 
-def _understand(header: Sequence[str], where: str) -> tuple[list[str], dict[str, str]]:
+def _match_names(header: Sequence[str], where: str) -> tuple[list[str], dict[str, str]]:
     """Match names by case, underscores, blanks and units in parentheses; return NGSIM's names, and the units."""
     names, units = [], {}
     for given in header:

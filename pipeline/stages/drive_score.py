@@ -80,7 +80,7 @@ STAGE = Stage(
 )
 
 
-def finished_drive_runs(root: Path) -> list[Path]:
+def list_finished_drive_runs(root: Path) -> list[Path]:
     """Return metrics.json of every run on drives, sorted by name; unfinished ones are hidden and left out."""
     return sorted((root / MODELS / FOLDER).glob("[!.]*/metrics.json"))
 
@@ -93,7 +93,7 @@ def collect_drive_scores(root: Path, manifest: Manifest, skip: Callable[[str], N
     """
     commit = manifest.commits.get(NAME)
     scores = []
-    for path in finished_drive_runs(root) if commit is not None else ():
+    for path in list_finished_drive_runs(root) if commit is not None else ():
         try:
             evaluation = read_json(path)["evaluation"]
             rows = [row for row in evaluation["scores"] if row["stratum"] == "all"]

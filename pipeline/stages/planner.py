@@ -173,7 +173,7 @@ def build_jobs(
     if not stage.batch_entries:
         return [build_job(stage, root, job, settings, manifest) for job in jobs]
     started = time.perf_counter()
-    manifest = select_part(manifest or load_recent(root), stage, jobs, settings)
+    manifest = narrow_manifest(manifest or load_recent(root), stage, jobs, settings)
     _prepare_files(root, [file for job in jobs for file in _list_inputs(stage, manifest, job, settings)], jobs)
     results = stage.build([LakeReader(root, manifest, stage.list_inputs(settings), job) for job in jobs], settings)
     assert isinstance(results, list)
@@ -192,7 +192,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings, manifest: 
         root: folder of the lake.
         job: what is to be built.
         settings: settings of the run.
-        manifest: the lake's manifest, or what the job reads of it (`select_part`); None: it is read.
+        manifest: the lake's manifest, or what the job reads of it (`narrow_manifest`); None: it is read.
 
     Raises:
         DamagedFileError: a file that it reads is not as it was written.
@@ -202,7 +202,7 @@ def build_job(stage: Stage, root: Path, job: Job, settings: Settings, manifest: 
     if stage.batch_entries:
         return build_jobs(stage, root, [job], settings, manifest)[0]
     started = time.perf_counter()
-    manifest = select_part(manifest or load_recent(root), stage, [job], settings)
+    manifest = narrow_manifest(manifest or load_recent(root), stage, [job], settings)
     _prepare_files(root, _list_inputs(stage, manifest, job, settings), [job])
     files: dict[str, list[LakeFile]] = {}
     info: dict[str, Any] = {}
@@ -233,7 +233,7 @@ def _prepare_files(root: Path, files: Iterable[LakeFile], jobs: Sequence[Job]) -
     verify_files(root, needed)
 
 
-def select_part(manifest: Manifest, stage: Stage, jobs: Sequence[Job], settings: Settings) -> Manifest:
+def narrow_manifest(manifest: Manifest, stage: Stage, jobs: Sequence[Job], settings: Settings) -> Manifest:
     """Return what jobs may read of a manifest: what was made of the whole lake, and of their recordings.
 
     It is small, and fit to be sent to a worker: looking at thousands of other commits would take longer than a small

@@ -16,10 +16,10 @@ from tracklake.pipeline.lake import LakeError, Manifest, open_stored, scan
 from tracklake.pipeline.lake.files import REPORTS, remove_files
 from tracklake.pipeline.settings import PROTOCOL_SETTINGS, Settings
 from tracklake.pipeline.sources import SOURCES
-from tracklake.pipeline.stages.drive_score import collect_drive_scores, finished_drive_runs
+from tracklake.pipeline.stages.drive_score import collect_drive_scores, list_finished_drive_runs
 from tracklake.pipeline.stages.pages import describe_origin, find_pages, write_report_file
 from tracklake.pipeline.stages.readers import LakeReader
-from tracklake.pipeline.stages.score import collect_scores, finished_runs
+from tracklake.pipeline.stages.score import collect_scores, list_finished_runs
 from tracklake.pipeline.stages.stage import Stage, StageResult
 from tracklake.quality_reports.pages.page_names import DRIVES_FOLDER, FOLDER
 from tracklake.quality_reports.rules.registry import RULES, resolve, select_thresholds
@@ -60,8 +60,8 @@ SHOWN_VERSIONS = ("polars", "pyarrow", "duckdb", "pandera", "prefect", "numpy")
 def _find_inputs(root: Path, manifest: Manifest, settings: Settings) -> dict[str, dict[str, Any]]:
     """Return everything in the lake, the subsets' pages and the models' runs among it, as the report's inputs."""
     commits = {key: commit.fingerprint for key, commit in manifest.commits.items() if commit.stage != "report"}
-    paths = {path.parent.name: path for path in finished_runs(root)}
-    paths |= {f"onboard/{path.parent.name}": path for path in finished_drive_runs(root)}
+    paths = {path.parent.name: path for path in list_finished_runs(root)}
+    paths |= {f"onboard/{path.parent.name}": path for path in list_finished_drive_runs(root)}
     runs = {name: hash_chunks([path.read_bytes()], 16) for name, path in paths.items()}
     return {"": {"commits": commits, "runs": runs, **_find_thresholds(manifest, settings)}}
 

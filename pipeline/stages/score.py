@@ -48,7 +48,7 @@ STAGE = Stage(
 )
 
 
-def finished_runs(root: Path) -> list[Path]:
+def list_finished_runs(root: Path) -> list[Path]:
     """Return metrics.json of every run in the lake, sorted by name; an unfinished run is hidden and left out."""
     return sorted(path for path in (root / MODELS).glob("*/metrics.json") if not path.parent.name.startswith("."))
 
@@ -64,7 +64,7 @@ def collect_scores(root: Path, manifest: Manifest, skip: Callable[[str], None]) 
     fetch_files(root, (file for file in commit.all_files if file.path.endswith(f"/{INDEX_FILE}")))
     index = read_index(root / commit.info["path"])
     scores = []
-    for path in finished_runs(root):
+    for path in list_finished_runs(root):
         try:
             config, scored = read_config(path.parent), _read_score(path)
         except (StaleRunError, FileNotFoundError) as stale:

@@ -47,12 +47,12 @@ def find_surroundings(tracks: pl.DataFrame) -> Surroundings:
     leader, follower = np.full(len(order), NO_ROW), np.full(len(order), NO_ROW)
     leader[order[:-1][same_lane]] = order[1:][same_lane]
     follower[order[1:][same_lane]] = order[:-1][same_lane]
-    left = _beside(frame, lane, front, rear, -1)
-    right = _beside(frame, lane, front, rear, +1)
+    left = _find_beside(frame, lane, front, rear, -1)
+    right = _find_beside(frame, lane, front, rear, +1)
     return Surroundings(leader, follower, *left, *right)
 
 
-def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, side: int) -> list[Integers]:
+def _find_beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, side: int) -> list[Integers]:
     """Find preceding, alongside and following rows in an adjacent lane.
 
     Positions become distances along one line on which every (frame, lane) has its own stretch, so that one binary
@@ -65,14 +65,14 @@ def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, si
     target = own + side * stretch
     by_front, by_rear = np.argsort(own + front, kind="stable"), np.argsort(own + rear, kind="stable")
     fronts, rears = (own + front)[by_front], (own + rear)[by_rear]
-    preceding = _valid(by_rear, np.searchsorted(rears, target + front, side="right"), own, target)
-    following = _valid(by_front, np.searchsorted(fronts, target + rear, side="left") - 1, own, target)
+    preceding = _select_inside(by_rear, np.searchsorted(rears, target + front, side="right"), own, target)
+    following = _select_inside(by_front, np.searchsorted(fronts, target + rear, side="left") - 1, own, target)
     # Alongside: the nearest fronts behind and ahead of the own front that overlap lengthwise.
     near = np.searchsorted(fronts, target + front, side="left")
     alongside = np.full(len(frame), NO_ROW)
     least = np.full(len(frame), np.iinfo(np.int64).max)
     for step in (-1, 0):
-        candidate = _valid(by_front, near + step, own, target)
+        candidate = _select_inside(by_front, near + step, own, target)
         beside = (candidate >= 0) & (front[candidate] >= rear) & (rear[candidate] <= front)
         distance = np.abs(front[candidate] + rear[candidate] - front - rear)
         closer = beside & (distance < least)
@@ -80,7 +80,7 @@ def _beside(frame: Integers, lane: Integers, front: Integers, rear: Integers, si
     return [preceding, alongside, following]
 
 
-def _valid(order: Integers, place: Integers, own: Integers, target: Integers) -> Integers:
+def _select_inside(order: Integers, place: Integers, own: Integers, target: Integers) -> Integers:
     """Return the rows at positions of a sorted order, NO_ROW outside the searched lane and frame."""
     inside = (place >= 0) & (place < len(order))
     rows = order[np.clip(place, 0, len(order) - 1)]

@@ -190,16 +190,16 @@ class Scenery:
 
     def past_accel(self, key: Key, tenths: int) -> float | None:
         """Return the acceleration some tenths of a second before; between two frames the mean of both."""
-        around = self._around(key, tenths)
+        around = self._find_entries_around(key, tenths)
         return None if around is None else sum(self.entries[each].accel for each in around) / 2
 
     def past_lateral_speed(self, key: Key, tenths: int) -> float | None:
         """Return the speed to the right some tenths of a second before; between two frames the mean of both."""
-        speeds = [self.lateral_speed(each) for each in self._around(key, tenths) or ()]
+        speeds = [self.lateral_speed(each) for each in self._find_entries_around(key, tenths) or ()]
         known = [speed for speed in speeds if speed is not None]
         return sum(known) / 2 if len(known) == 2 else None
 
-    def _around(self, key: Key, tenths: int) -> tuple[Key, Key] | None:
+    def _find_entries_around(self, key: Key, tenths: int) -> tuple[Key, Key] | None:
         frames = tenths * self.surface.rate_hz / 10
         if self.unbroken[key] < frames:
             return None

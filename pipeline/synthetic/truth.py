@@ -71,7 +71,7 @@ class Found:
     hindmost: dict[str, float] = field(default_factory=dict)
 
 
-def _usable(line: str, separator: str | None, fields: int) -> list[str] | None:
+def _split_row(line: str, separator: str | None, fields: int) -> list[str] | None:
     """Split a line into fields; None if it is no row of that many fields."""
     if "\0" in line or not line.strip():
         return None
@@ -105,7 +105,7 @@ def _read_meta(
         count = FileCount(name, "highd", recording)
         for line in _lines(folder / name)[1:]:
             count.read += 1
-            if _usable(line, ",", fields) is None:
+            if _split_row(line, ",", fields) is None:
                 count.malformed += 1
             else:
                 count.kept += 1
@@ -179,7 +179,7 @@ def _read_rows(
     wanted = tuple(wanted)
     for line in lines:
         count.read += 1
-        parts = _usable(line, separator, fields)
+        parts = _split_row(line, separator, fields)
         try:
             numbers = [_number(parts[place]) for place in wanted] if parts else None
         except ValueError:

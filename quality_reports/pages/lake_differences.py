@@ -100,7 +100,7 @@ def compare(then: Side, now: Side) -> Row:
     """
     sides = (then, now)
     subsets = [_query_section(side, SUBSETS) for side in sides]
-    both = [_shared(subsets, name) for name in ("subset", "recording")]
+    both = [_find_shared(subsets, name) for name in ("subset", "recording")]
     compared: Row = {
         "headline": _list_changes({}, *(query(side.connection, "headline")[0] for side in sides), keep_same=True),
         "made_with": _list_differing(*(dict(_leaves(plain(side.made_with))) for side in sides)),
@@ -129,7 +129,7 @@ def _query_section(side: Side, section: Section) -> list[Row]:
     return [{name: value for name, value in row.items() if name not in section.left_out} for row in rows]
 
 
-def _shared(subsets: Sequence[list[Row]], name: str) -> set[Key]:
+def _find_shared(subsets: Sequence[list[Row]], name: str) -> set[Key]:
     """Return the pairs (dataset, subset) or (dataset, recording) that both lakes hold."""
     then, now = ({(row["dataset"], row[name]) for row in rows} for rows in subsets)
     return then & now

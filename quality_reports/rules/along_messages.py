@@ -131,7 +131,7 @@ def place_messages(
         .sort("row")
     )
     east, north = measure_way((pl.col("lat_deg_ego"), pl.col("lon_deg_ego")), (pl.col("lat_deg"), pl.col("lon_deg")))
-    (own_east, own_north), (sent_east, sent_north) = _carry("_ego"), _carry("")
+    (own_east, own_north), (sent_east, sent_north) = _move_to_tick("_ego"), _move_to_tick("")
     ahead, right = turn_to_heading(
         (east + sent_east - own_east, north + sent_north - own_north), pl.col("heading_deg_ego")
     )
@@ -184,7 +184,7 @@ def wrap_degrees(angle: pl.Expr) -> pl.Expr:
     return angle.cast(pl.Float64) - 360 * (angle.cast(pl.Float64) / 360).round()
 
 
-def _carry(suffix: str) -> Pair:
+def _move_to_tick(suffix: str) -> Pair:
     """Return the way of a vehicle from its state of this suffix to the tick, to the east and to the north."""
     way = (pl.col("now_s") - pl.col(f"time_s{suffix}")) * pl.col(f"speed_mps{suffix}").fill_null(0)
     heading = pl.col(f"heading_deg{suffix}").cast(pl.Float64).radians()

@@ -81,7 +81,7 @@ def measure_fragments(scene: Scene) -> Floats:
     """
     ends = scene.once(find_track_ends)
     begin, end = ends.section_m
-    return _place(
+    return _put_at_rows(
         scene,
         (ends.first[ends.appears], (ends.start_m - begin)[ends.appears]),
         (ends.last[ends.vanishes], (end - ends.end_m)[ends.vanishes]),
@@ -96,7 +96,7 @@ def measure_missed_sections(scene: Scene) -> Floats:
     """
     ends = scene.once(find_track_ends)
     appeared, vanished = _find_appeared(ends), _find_vanished(ends)
-    return _place(
+    return _put_at_rows(
         scene,
         (ends.first[appeared.tracks], ends.start_m[appeared.tracks] - appeared.upstream_m),
         (ends.last[vanished.tracks], vanished.downstream_m - ends.end_m[vanished.tracks]),
@@ -138,26 +138,26 @@ class _Missed:
 
 def _find_vanished(ends: TrackEnds) -> _Missed:
     """Find the tracks that cross a cross section and vanish before the next one."""
-    upstream, downstream = _surround(ends.cross_sections_m, ends.end_m)
+    upstream, downstream = _find_enclosing_sections(ends.cross_sections_m, ends.end_m)
     tracks = np.flatnonzero(ends.vanishes & (ends.start_m < upstream) & np.isfinite(downstream))
     return _Missed(tracks, upstream[tracks], downstream[tracks])
 
 
 def _find_appeared(ends: TrackEnds) -> _Missed:
     """Find the tracks that appear behind a cross section and cross the next one."""
-    upstream, downstream = _surround(ends.cross_sections_m, ends.start_m)
+    upstream, downstream = _find_enclosing_sections(ends.cross_sections_m, ends.start_m)
     tracks = np.flatnonzero(ends.appears & (ends.end_m >= downstream) & np.isfinite(upstream))
     return _Missed(tracks, upstream[tracks], downstream[tracks])
 
 
-def _surround(places: Floats, x_m: Floats) -> tuple[Floats, Floats]:
+def _find_enclosing_sections(places: Floats, x_m: Floats) -> tuple[Floats, Floats]:
     """Return the last cross section not ahead of each position, and the next one; infinite where there is none."""
     padded = np.concatenate([[-np.inf], places, [np.inf]])
     passed = np.searchsorted(places, x_m, side="right")
     return padded[passed], padded[passed + 1]
 
 
-def _place(scene: Scene, *ends: tuple[Integers, Floats]) -> Floats:
+def _put_at_rows(scene: Scene, *ends: tuple[Integers, Floats]) -> Floats:
     """Put distances at rows, the greater where there are two, NaN elsewhere; rounded to 1 mm."""
     values = np.full(scene.height, np.nan)
     for rows, distance_m in ends:

@@ -11,11 +11,11 @@ from tracklake.quality_reports.rules.findings import find, join_runs, require_on
 from tracklake.quality_reports.rules.registry import (
     RULES,
     Rule,
-    checkable,
     columns_needed,
     columns_read,
     resolve,
     select_broken,
+    select_checkable,
 )
 from tracklake.quality_reports.rules.scene import SUBSET_COLUMNS, VEHICLE_COLUMNS, Scene
 from tracklake.quality_reports.rules.scores import (
@@ -71,7 +71,7 @@ def judge_slices(
     """
     limits = resolve(rules, thresholds)
     all_limits = resolve(RULES, limits)  # scores need some whatever the rules are
-    checked = checkable(rules, lacking)
+    checked = select_checkable(rules, lacking)
     unchecked = tuple(rule for rule in rules if rule not in checked)
     scored = [name for name in COLUMNS_SCORED if not set(trace([name])) & set(lacking)]
     found, vehicles, tallies = [], [], []

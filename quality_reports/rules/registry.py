@@ -25,13 +25,13 @@ __all__ = [
     "Threshold",
     "ThresholdError",
     "as_schema",
-    "checkable",
     "columns_needed",
     "columns_read",
     "describe",
     "find_threshold_faults",
     "resolve",
     "select_broken",
+    "select_checkable",
     "select_thresholds",
 ]
 
@@ -45,7 +45,7 @@ class ThresholdError(UsageError):
     """A threshold's name is unknown or its value is no number."""
 
 
-def checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
+def select_checkable(rules: Sequence[Rule], lacking: Collection[str]) -> tuple[Rule, ...]:
     """Select the rules that can be checked where these columns, of the lake's tables or derived, are lacking."""
     return tuple(rule for rule in rules if not {*rule.columns, *rule.reads} & set(lacking))
 

@@ -10,7 +10,7 @@ from tracklake.schemas.published_results import (
     CHOI_2021,
     KIM_2020,
     PUBLISHED,
-    published_rows,
+    list_published_rows,
 )
 from tracklake.training.models import MODELS
 
@@ -20,7 +20,7 @@ ELSEWHERE = {"MHA-LSTM", "STDAN"}
 
 @pytest.mark.parametrize("protocol", list(PROTOCOLS))
 def test_published_rows_keep_the_table_s_rules_and_are_never_taken_for_measured_ones(protocol):
-    rows = EVALUATIONS.validate(published_rows(protocol), where=protocol)
+    rows = EVALUATIONS.validate(list_published_rows(protocol), where=protocol)
     assert rows.height > 0
     assert rows["origin"].unique().to_list() == ["published"]
     assert (rows["reference"] != "").all()
@@ -41,7 +41,7 @@ def test_every_line_names_known_protocols_models_and_figures():
 
 
 def errors(protocol, model, dataset, column="rmse_m"):
-    rows = published_rows(protocol).filter(model=model, dataset=dataset)
+    rows = list_published_rows(protocol).filter(model=model, dataset=dataset)
     return [group[column].to_list() for _, group in rows.group_by("reference", maintain_order=True)]
 
 
@@ -60,13 +60,13 @@ def test_some_of_them_as_printed():
 
 def test_figures_of_other_recordings_are_left_out():
     def datasets(protocol, *present):
-        return set(published_rows(protocol, present)["dataset"])
+        return set(list_published_rows(protocol, present)["dataset"])
 
     assert datasets("csp", "all", "ngsim") == {"ngsim"}
     assert datasets("csp", "all", "highd", "ngsim") == {"highd", "ngsim"}
     assert datasets("csp-2018", "all", "highd") == set()
     assert datasets("grid-2021", "all", "highd") == {"own"}
-    assert published_rows("my-own").height == 0
+    assert list_published_rows("my-own").height == 0
 
 
 def test_cells_of_the_grid():

@@ -18,7 +18,7 @@ from tracklake.schemas.arrays import Flags, Floats, Integers
 from tracklake.schemas.comparisons import ANY_RULE, FEASIBILITY, FEASIBILITY_RULES
 from tracklake.schemas.tensors import NOMINAL_LANE_M
 from tracklake.training.comparison.bootstrap import estimate_shares
-from tracklake.training.data.gathers import NEAREST, locate_rows, read_samples, truth_of_ego
+from tracklake.training.data.gathers import NEAREST, locate_rows, read_samples, select_ego_truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.evaluation.scores import find_vehicles
 from tracklake.training.runs.forecasters import Forecaster
@@ -41,7 +41,7 @@ def measure_feasibility(model: Forecaster, folder: TensorFolder, part: str, near
     squares: list[Floats] = []
     for batch in _cut_scenes(scene):
         observed, truth = read_samples(folder, samples[batch], model.reads, nearest=nearest)
-        own = truth_of_ego(truth)
+        own = select_ego_truth(truth)
         predicted = model.predictor.predict(observed).position_m
         history = observed.history if observed.history.ndim == 3 else observed.history[:, 0]
         for position, found in ((predicted, broken), (own.future, true)):

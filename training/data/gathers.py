@@ -285,7 +285,7 @@ def read_samples(folder: Folder, samples: npt.ArrayLike, reads: Reads, *, neares
     return gather_nearest(folder, samples, nearest=nearest)
 
 
-def truth_of_ego(truth: Truth[Any]) -> Truth[Any]:
+def select_ego_truth(truth: Truth[Any]) -> Truth[Any]:
     """Return the truth of the samples themselves: of scenes, that of vehicle 0."""
     if truth.future.ndim == 3:
         return truth

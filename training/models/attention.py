@@ -15,7 +15,7 @@ from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.gathers import NEAREST
 from tracklake.training.data.observed import ObservedScene, Truth
 from tracklake.training.models.gaussians import Gaussian, gaussian_nll, to_gaussian, to_prediction
-from tracklake.training.models.motion import velocity_ticks
+from tracklake.training.models.motion import count_velocity_ticks
 from tracklake.training.models.network import Network, check_choice, check_phase, find_anchored, to_numpy
 from tracklake.training.models.prediction import Prediction
 
@@ -163,7 +163,7 @@ class SceneAttention(Network):
         self.raw, self.sizes, self.lanes = inputs == "positions", sizes, lanes
         self.nearest, self.range_m, self.ego_only = nearest, range_m, ego_only
         self.rate_hz = protocol.rate_hz
-        self.ticks = velocity_ticks(protocol)
+        self.ticks = count_velocity_ticks(protocol)
         self.nll_weight, self.distance_weight = nll_weight, distance_weight
         ahead = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)
         self.ahead: Tensor

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from tracklake.schemas.protocols import Protocol
-from tracklake.training.models.motion import velocity_ticks
+from tracklake.training.models.motion import count_velocity_ticks
 from tracklake.training.models.network import PlaceNetwork, Straight
 
 SPEED_SCALE_MPS = 15.0
@@ -26,7 +26,7 @@ class DeviationLstm(PlaceNetwork):
     def __init__(self, protocol: Protocol, *, hidden: int = 48, anchoring: str = "both") -> None:
         super().__init__()
         self.rate_hz = protocol.rate_hz
-        self.ticks = velocity_ticks(protocol)
+        self.ticks = count_velocity_ticks(protocol)
         self.straight = Straight(protocol, anchoring=anchoring)
         self.steps = protocol.horizon_ticks
         self.encoder = nn.LSTM(6, hidden, batch_first=True)

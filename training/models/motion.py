@@ -26,7 +26,7 @@ LEAST_SPEED_MPS = 2.0
 """Least speed over both of these displacements, in m/s; a slower vehicle is taken to drive straight on."""
 
 
-def velocity_ticks(protocol: Protocol) -> int:
+def count_velocity_ticks(protocol: Protocol) -> int:
     """Return the ticks of history that the velocity is taken from: one at 5 Hz, two at 10 Hz."""
     return min(max(1, round(VELOCITY_S * protocol.rate_hz)), protocol.history_ticks - 1)
 
@@ -48,7 +48,7 @@ class ConstantVelocity:
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        self.ticks = velocity_ticks(protocol)
+        self.ticks = count_velocity_ticks(protocol)
         self.steps = np.arange(1, protocol.horizon_ticks + 1, dtype=np.float32)[:, None]
 
     def predict(self, observed: Observed[Singles]) -> Prediction:
@@ -76,7 +76,7 @@ class DampedVelocity(ConstantVelocity):
         """Return `decay_s`, unless it is given."""
         if "decay_s" in given:
             return {}
-        ticks, steps = velocity_ticks(protocol), np.arange(1.0, protocol.horizon_ticks + 1)
+        ticks, steps = count_velocity_ticks(protocol), np.arange(1.0, protocol.horizon_ticks + 1)
         velocity = np.zeros(protocol.history_ticks)
         velocity[-1], velocity[-1 - ticks] = 1 / ticks, -1 / ticks
 
@@ -213,7 +213,7 @@ class ConstantTurnRate:
 
     def __init__(self, protocol: Protocol) -> None:
         self.rate_hz = protocol.rate_hz
-        self.ticks = velocity_ticks(protocol)
+        self.ticks = count_velocity_ticks(protocol)
         self.turn_ticks = min(max(1, round(TURN_S * protocol.rate_hz)), (protocol.history_ticks - 1) // 2)
         self.ahead_s = np.arange(1, protocol.horizon_ticks + 1) / protocol.rate_hz
 

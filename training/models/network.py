@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import Protocol
 from tracklake.training.data.observed import Observed, Truth
-from tracklake.training.models.motion import extrapolate, velocity_ticks
+from tracklake.training.models.motion import count_velocity_ticks, extrapolate
 from tracklake.training.models.prediction import Prediction
 
 Result = TypeVar("Result")
@@ -84,7 +84,7 @@ class Straight(nn.Module):
 
     def __init__(self, protocol: Protocol, *, anchoring: str) -> None:
         super().__init__()
-        self.ticks = velocity_ticks(protocol)
+        self.ticks = count_velocity_ticks(protocol)
         steps = torch.arange(1, protocol.horizon_ticks + 1, dtype=torch.float32)[:, None]
         self.steps: Tensor
         self.register_buffer("steps", steps * find_anchored(anchoring), persistent=False)  # (F, 2)

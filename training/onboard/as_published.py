@@ -217,7 +217,7 @@ def compare_forests(
     number = number_vehicles(samples)
     maneuver = samples.maneuver[:, None]
     right = {name: own[:, :1] == maneuver for name, own in decided.items()}
-    common = {CONSTANT: maneuver == _pick(maneuver)}
+    common = {CONSTANT: maneuver == _find_commonest(maneuver)}
     yield from _compare_values(("maneuver", None, None), [None], right | common, number)
     for code, name in enumerate(LATERAL_MANEUVERS):
         of = np.flatnonzero(samples.maneuver == code)
@@ -235,14 +235,16 @@ def compare_forests(
         nine = {name: (own == true).all(axis=-1) & inside for name, own in cells.items()}
         endless = {name: (own.clip(-1, 1) == true.clip(-1, 1)).all(axis=-1) for name, own in cells.items()}
         cell, clipped = (number_cells(own[..., 0], own[..., 1]) for own in (true, true.clip(-1, 1)))
-        said = {name: number_cells(own[..., 0], own[..., 1]) for name, own in cells.items()} | {CONSTANT: _pick(cell)}
+        said = {name: number_cells(own[..., 0], own[..., 1]) for name, own in cells.items()} | {
+            CONSTANT: _find_commonest(cell)
+        }
         rest = {name: compare_with_rest(own, cell) for name, own in said.items()}
-        nine[CONSTANT], endless[CONSTANT] = cell == _pick(cell), clipped == _pick(clipped)
+        nine[CONSTANT], endless[CONSTANT] = cell == _find_commonest(cell), clipped == _find_commonest(clipped)
         for figure, values in (("cell", nine), ("cell_clipped", endless), ("one_against_rest", rest)):
             yield from _compare_values((figure, model, grid), list(V2V.scored_s), values, number)
 
 
-def _pick(codes: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _find_commonest(codes: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Pick the commonest of codes (B, T) at each horizon: (T,); those below 0 do not count."""
     most = [np.bincount(own[own >= 0], minlength=1).argmax() for own in codes.T]
     return np.array(most, dtype=codes.dtype)

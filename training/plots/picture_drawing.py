@@ -141,7 +141,7 @@ class _Channels:
         )
 
 
-def _either(test: str, yes: str | float | list[int], no: str | float | list[int]) -> dict[str, Any]:
+def _make_condition(test: str, yes: str | float | list[int], no: str | float | list[int]) -> dict[str, Any]:
     """Make the values of a channel by a Vega expression."""
     return {"condition": {"test": test, "value": yes}, "value": no}
 
@@ -151,9 +151,9 @@ def _draw_road(to: _Channels) -> Iterator[alt.Chart]:
     asphalt = markings.transform_filter(edge).transform_aggregate(top="min(y_m)", bottom="max(y_m)")
     yield asphalt.mark_rect(color=ASPHALT).encode(y=to.across("top:Q"), y2="bottom:Q")
     yield markings.mark_rule().encode(
-        color=_either(edge, MUTED, LANE_LINE),
-        strokeWidth=_either(edge, 2, 1.5),
-        strokeDash=_either(edge, SOLID, LANE_DASH),
+        color=_make_condition(edge, MUTED, LANE_LINE),
+        strokeWidth=_make_condition(edge, 2, 1.5),
+        strokeDash=_make_condition(edge, SOLID, LANE_DASH),
     )
     names = name_rows("lanes").mark_text(align="left", dx=10, color=MUTED, fontSize=13)
     yield names.encode(x=alt.value(WIDTH), y=to.across("y_m:Q"), text="lane:N")
@@ -186,21 +186,21 @@ def _draw_paths(to: _Channels) -> Iterator[alt.Chart]:
         fill=to.fill,
         detail=["ellipse:N", "own:N", "sigmas:N"],
         order="order:Q",
-        strokeWidth=_either(inner, 1.2, 0.8),
-        strokeOpacity=_either(own, 0.9, 0.5),
+        strokeWidth=_make_condition(inner, 1.2, 0.8),
+        strokeOpacity=_make_condition(own, 0.9, 0.5),
         fillOpacity=faint,
     )
     futures = name_rows("paths", "datum.kind !== 'history'").mark_line(clip=True)
     yield futures.encode(
         **place,
-        strokeDash=_either("datum.kind === 'truth'", TRUTH_DASH, SOLID),
+        strokeDash=_make_condition("datum.kind === 'truth'", TRUTH_DASH, SOLID),
         detail=["path:N", "kind:N", "role:N"],
         order="tick:Q",
-        strokeWidth=_either(f"datum.role === 'own' && !({thin})", 2, 1.2),
-        strokeOpacity=_either(thin, 0.55, 1),
+        strokeWidth=_make_condition(f"datum.role === 'own' && !({thin})", 2, 1.2),
+        strokeOpacity=_make_condition(thin, 0.55, 1),
     )
     marked = name_rows("paths", "datum.marked").mark_point(strokeWidth=1.6, opacity=1, clip=True)
-    yield marked.encode(**place, fill=to.fill, shape=to.shape, size=_either("datum.kind === 'history'", 12, 50))
+    yield marked.encode(**place, fill=to.fill, shape=to.shape, size=_make_condition("datum.kind === 'history'", 12, 50))
     labels = name_rows("probabilities").encode(x=to.along("x_m:Q"), y=to.across("y_m:Q"))
     yield labels.mark_rule(strokeWidth=0.8, opacity=0.7).encode(x2="end_x_m:Q", y2="end_y_m:Q", stroke=to.stroke)
     text = partial(labels.encode(text="label:N").mark_text, align="left", dx=3, fontSize=13)
@@ -235,7 +235,7 @@ def _draw_error(to: _Channels, error: str, has_density: bool) -> Layers:
     return alt.layer(
         *(under if signed else ()),
         errors.mark_line(clip=True).encode(
-            stroke=to.stroke, detail=["vehicle_id:N", "own:N"], strokeWidth=_either("datum.own", 2, 0.7)
+            stroke=to.stroke, detail=["vehicle_id:N", "own:N"], strokeWidth=_make_condition("datum.own", 2, 0.7)
         ),
         own.transform_filter("datum.second")
         .mark_point(opacity=1, size=45)

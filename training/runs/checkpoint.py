@@ -109,14 +109,14 @@ def open_log(path: Path, rows: list[Row]) -> Iterator[Callable[[Row], None]]:
         yield write_row
 
 
-def unfinished_folder(run: Path) -> Path:
+def locate_unfinished(run: Path) -> Path:
     """Return the folder where a run's training keeps checkpoint and logs; hidden, so that it is not taken for a run."""
     return run.parent / f".{run.name}.unfinished"
 
 
 def is_unfinished(run: Path) -> bool:
     """Return whether there is a checkpoint to resume from."""
-    return (unfinished_folder(run) / CHECKPOINT_FILE).is_file()
+    return (locate_unfinished(run) / CHECKPOINT_FILE).is_file()
 
 
 @contextmanager
@@ -125,7 +125,7 @@ def claim_folder(run: Path, *, resume: bool | None = False) -> Iterator[Path]:
 
     To resume (True) there must be a checkpoint; where that is not decided (None), there must be none to lose.
     """
-    folder, of_run = unfinished_folder(run), f"training of the run `{run.name}`"
+    folder, of_run = locate_unfinished(run), f"training of the run `{run.name}`"
     if resume is None and is_unfinished(run):
         raise UnfinishedError(f"{folder}: a {of_run} was interrupted; resume it (`--resume`), or {RESTART}")
     if resume and not is_unfinished(run):

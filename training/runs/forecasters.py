@@ -9,7 +9,7 @@ from tracklake.schemas.arrays import Integers
 from tracklake.schemas.errors import TracklakeError, UsageError
 from tracklake.schemas.run_config import StaleRunError
 from tracklake.schemas.text import find_similar
-from tracklake.training.data.gathers import NEAREST, read_samples, truth_of_ego
+from tracklake.training.data.gathers import NEAREST, read_samples, select_ego_truth
 from tracklake.training.data.observed import Reads, Truth
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS, Predictor, find_model
@@ -51,7 +51,7 @@ class Forecaster:
         for start in range(0, len(samples), BATCH_SIZE):
             chosen = slice(start, start + BATCH_SIZE)
             observed, everything = read_samples(folder, samples[chosen], self.reads, nearest=nearest)
-            prediction, truth = self.predictor.predict(observed), truth_of_ego(everything)
+            prediction, truth = self.predictor.predict(observed), select_ego_truth(everything)
             wanted, found = truth.future.shape, prediction.position_m.shape
             if found != wanted:
                 raise TracklakeError(f"`{self.name}`: expected places of shape {wanted}, got {found}")

@@ -55,7 +55,7 @@ def _separate(lines: bytes) -> bytes:
 
 def squeeze_blanks(data: bytes) -> bytes:
     """Reduce runs of blanks, tabs and carriage returns to one blank, and to none at both ends of a line."""
-    return b"".join(_squeeze(block) for block in cut_at_lines(data))
+    return b"".join(_squeeze_block(block) for block in cut_at_lines(data))
 
 
 def cut_at_lines(data: bytes, size: int = CACHED_BYTES) -> Iterator[bytes]:
@@ -67,7 +67,7 @@ def cut_at_lines(data: bytes, size: int = CACHED_BYTES) -> Iterator[bytes]:
         start = end
 
 
-def _squeeze(data: bytes) -> bytes:
+def _squeeze_block(data: bytes) -> bytes:
     text = np.frombuffer(data, np.uint8)
     blank = text == 32
     if b"\t" in data or b"\r" in data:

@@ -170,7 +170,7 @@ def _is_sound(layout: Layout) -> pl.Expr:
     return pl.all_horizontal(sound)
 
 
-def _outside(name: str, low: float | None, high: float | None) -> pl.Expr:
+def _is_outside(name: str, low: float | None, high: float | None) -> pl.Expr:
     below = pl.lit(value=False) if low is None else pl.col(name) < low
     above = pl.lit(value=False) if high is None else pl.col(name) > high
     return (below | above).fill_null(value=False)
@@ -259,7 +259,9 @@ def _list_value_reasons(layout: Layout, numeric: list[str]) -> list[pl.Expr]:
             reasons.append(_reject_if(unread & ~whole, f"not a plain whole number: {name}"))
             reasons.append(_reject_if(unread, f"out of range: {name}"))
     reasons += [_reject_if(pl.col(name).is_null(), f"empty: {name}") for name in sorted(layout.required)]
-    reasons += [_reject_if(_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()]
+    reasons += [
+        _reject_if(_is_outside(name, *limits), f"out of range: {name}") for name, limits in layout.bounds.items()
+    ]
     reasons += [
         _reject_if(_not_among(pl.col(name), allowed), f"unknown value: {name}")
         for name, allowed in layout.choices.items()

@@ -146,7 +146,7 @@ def _choose(scan: Scan, predicted: Predicted, choice: _Choice) -> None:
         others = others[~np.isnan(predicted.size_m[others, 0])]
         rivals = expect_boxes(predicted.centre_m[others], predicted.covariance_m2[others], predicted.size_m[others])
         heading = predicted.heading_rad[np.concatenate([row, others])]
-        parted = _absorb(scan, choice, row, join_boxes(pick_boxes(boxes, pair), rivals), heading)
+        parted = _assign_free_returns(scan, choice, row, join_boxes(pick_boxes(boxes, pair), rivals), heading)
         if not parted:
             return
 
@@ -251,7 +251,7 @@ def _find_pairs(vehicle: Integers, segment: Integers, row: Integers, column: Int
     return np.asarray(order[np.searchsorted(key, row * width + column, sorter=order)])
 
 
-def _absorb(scan: Scan, choice: _Choice, row: Integers, boxes: Boxes, heading: Floats) -> bool:
+def _assign_free_returns(scan: Scan, choice: _Choice, row: Integers, boxes: Boxes, heading: Floats) -> bool:
     """Give vehicles the free returns within their boxes, and cluster again what their clusters hold beyond.
 
     Args:

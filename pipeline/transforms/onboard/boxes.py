@@ -200,7 +200,10 @@ def _measure_edges(
     has_across = np.bincount(owner[faces.across_sure], minlength=count) > 0
     has_along = np.bincount(owner[faces.along], minlength=count) > 0
     far = np.column_stack(
-        [_reach(place[:, 0], owner, faces.along, corner[:, 0]), _reach(place[:, 1], owner, faces.across, corner[:, 1])]
+        [
+            _find_greatest(place[:, 0], owner, faces.along, corner[:, 0]),
+            _find_greatest(place[:, 1], owner, faces.across, corner[:, 1]),
+        ]
     )
     # Distance of neighboring returns along each face, near its low and its high end.
     u, v = np.maximum(np.abs(corner), 1e-3).T
@@ -248,7 +251,7 @@ def _average(values: Floats, owner: Integers, chosen: Flags, count: int) -> _Edg
     return _Edge(mean, RANGE_NOISE_M**2 / number + SHAPE_M**2)
 
 
-def _reach(values: Floats, owner: Integers, chosen: Flags, least: Floats) -> Floats:
+def _find_greatest(values: Floats, owner: Integers, chosen: Flags, least: Floats) -> Floats:
     """Return the greatest of each vehicle's chosen values, or `least` where it has none."""
     most = least.copy()
     np.maximum.at(most, owner[chosen], values[chosen])

@@ -245,7 +245,7 @@ def merge_stations(tracks: Tracks, pairs: Integers) -> Tracks:
     tracks.rival[lidar], tracks.rivalry[lidar], tracks.strikes[lidar] = TENTATIVE, 0, 0
     keep = np.ones(len(tracks.chain), dtype=bool)
     keep[station] = False
-    return tracks.take(keep)
+    return tracks.select(keep)
 
 
 def _square(away: Floats, covariance: Floats) -> Floats:

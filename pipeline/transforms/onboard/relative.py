@@ -45,7 +45,7 @@ class RelativeMessages:
     age_s: Floats
     accuracy_m: Floats
 
-    def take(self, rows: slice | Integers | Flags) -> "RelativeMessages":
+    def select(self, rows: slice | Integers | Flags) -> "RelativeMessages":
         """Return some of the messages."""
         return RelativeMessages(**{each.name: getattr(self, each.name)[rows] for each in fields(self)})
 

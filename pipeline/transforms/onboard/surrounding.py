@@ -150,11 +150,11 @@ class Tracker:
         if not ego.known[tick]:
             return
         self._predict(tick)
-        self._hear(tick)
+        self._apply_messages(tick)
         log = TickLog(tick)
         if scan is not None and self._sensors.measure is not None:
-            self._see(tick, scan, log)
-        self._look(tick, log)
+            self._apply_scan(tick, scan, log)
+        self._apply_image(tick, log)
         self._find_headings()
         self._merge(tick)
         self._end(tick)
@@ -168,16 +168,16 @@ class Tracker:
         noise = make_noise(STEP_S, tracks.offset_m, np.hypot(ODOMETRY_M, ODOMETRY_RAD * range_m))
         tracks.state, tracks.covariance = predict(tracks.state, tracks.covariance, self._transition, noise)
 
-    def _hear(self, tick: int) -> None:
+    def _apply_messages(self, tick: int) -> None:
         """Correct tracks by the messages that arrived, and start those of vehicles that were not heard before."""
-        messages = self._messages.take(slice(self._first[tick], self._first[tick + 1]))
+        messages = self._messages.select(slice(self._first[tick], self._first[tick + 1]))
         if not len(messages.tick):
             return
         yaw = float(self._ego.odometry_rad[tick])
         place_m = turn(messages.centre_m, yaw) + self._ego.odometry_m[tick]
         new = ~np.isin(messages.vehicle_id, self._tracks.vehicle_id)
         if new.any():
-            fresh = messages.take(new)
+            fresh = messages.select(new)
             offset_m = compute_offset_m(
                 fresh.accuracy_m, np.hypot(*fresh.centre_m.T), float(self._ego.heading_sigma_rad[tick])
             )
@@ -189,7 +189,7 @@ class Tracker:
         order = np.argsort(tracks.vehicle_id, kind="stable")
         rows = order[np.searchsorted(tracks.vehicle_id, messages.vehicle_id, sorter=order)]
         old = np.flatnonzero(~new)
-        update_by_messages(tracks, rows[old], messages.take(old), place_m[old], yaw)
+        update_by_messages(tracks, rows[old], messages.select(old), place_m[old], yaw)
         size = np.stack((messages.length_m, messages.width_m), 1)
         tracks.size_m[rows, :2] = np.where(np.isnan(size), tracks.size_m[rows, :2], size)
         tracks.sized[rows] |= ~np.isnan(size).any(1)
@@ -200,7 +200,7 @@ class Tracker:
         stated = slow & ~np.isnan(messages.heading_rad)
         tracks.heading_rad[rows[stated]] = messages.heading_rad[stated] + yaw
 
-    def _see(self, tick: int, scan: Scan, log: TickLog) -> None:
+    def _apply_scan(self, tick: int, scan: Scan, log: TickLog) -> None:
         """Correct tracks by the LiDAR's clusters, and start those of clusters that are no known vehicle's."""
         assert self._sensors.measure is not None
         tracks, back_s = self._tracks, tick / TICK_RATE_HZ - scan[0]
@@ -245,7 +245,7 @@ class Tracker:
         unsent = rows[~self._tracks.sized[rows]]
         size[unsent, :2] = np.fmax(size[unsent, :2], measured.size_m[which][~self._tracks.sized[rows]])
 
-    def _look(self, tick: int, log: TickLog) -> None:
+    def _apply_image(self, tick: int, log: TickLog) -> None:
         """Correct tracks by the camera's boxes of the latest image."""
         moment_s = tick / TICK_RATE_HZ
         if self._sensors.camera is None or self._sensors.match_boxes is None or not len(self._tracks.chain):
@@ -265,7 +265,7 @@ class Tracker:
 
     def _expect(self, rows: Integers, ego_m: Floats, yaw: float, back_s: float) -> Predicted:
         """Return vehicles as the ego would see them `back_s` before the tick, from its place then."""
-        tracks = self._tracks.take(rows)
+        tracks = self._tracks.select(rows)
         place_m = tracks.state[:, POSITION] - tracks.state[:, VELOCITY] * back_s
         size_m = np.where(tracks.sized[:, None], tracks.size_m[:, :2], np.nan)
         ids = np.where(tracks.vehicle_id == TENTATIVE, FIRST_TENTATIVE_ID + tracks.chain, tracks.vehicle_id)
@@ -316,7 +316,7 @@ class Tracker:
         keep = (heard | seen & ~is_lost(tracks, tick)) & ~missed
         if not keep.all():
             self.counts["tracks_ended"] += int((~keep & (tracks.vehicle_id != TENTATIVE)).sum())
-            self._tracks = tracks.take(keep)
+            self._tracks = tracks.select(keep)
 
     def _find_pose(self, tick: int, back_s: float) -> tuple[Floats, float]:
         """Return the ego's place and heading in the frame of odometry, `back_s` before a tick."""

@@ -53,7 +53,7 @@ class TickLog:
 
     def finish(self, tracks: Tracks) -> None:
         """Note the tick's final tracks, those that are confirmed."""
-        self.tracks = tracks.take(np.flatnonzero(tracks.vehicle_id != TENTATIVE))
+        self.tracks = tracks.select(np.flatnonzero(tracks.vehicle_id != TENTATIVE))
         self.tracks.covariance = self.tracks.covariance.astype(np.float32)
 
 

@@ -83,7 +83,7 @@ class Tracks:
     lean: Floats
     strikes: Integers
 
-    def take(self, rows: Integers | Flags) -> "Tracks":
+    def select(self, rows: Integers | Flags) -> "Tracks":
         """Return some of the tracks."""
         return Tracks(**{each.name: getattr(self, each.name)[rows] for each in fields(self)})
 

@@ -12,7 +12,7 @@ from tracklake.schemas import TRACKS
 KEY = ("vehicle_id", "frame")
 MOTION = ("x_m", "y_m", "speed_mps", "accel_mps2", "lateral_speed_mps")
 """Columns of `tracks` that the new positions bring with them."""
-AROUND = ("lane", "leader_id", "follower_id", "heading_rad")
+FILLED = ("lane", "leader_id", "follower_id", "heading_rad")
 """Columns of `tracks` that an entry which fills a gap takes from the entries on both sides of the gap."""
 
 
@@ -53,9 +53,9 @@ def replace_positions(
 
 def _fill_gaps(added: pl.DataFrame, tracks: pl.DataFrame, facts: Mapping[str, Any]) -> pl.DataFrame:
     """Return rows of `tracks` for entries that lie in gaps, with what the sides of each gap say."""
-    known = tracks.select(*KEY, *AROUND, at=pl.col("frame"))
+    known = tracks.select(*KEY, *FILLED, at=pl.col("frame"))
     rows = added.select(*KEY, *(pl.col(name).cast(TRACKS.dtypes[name]) for name in MOTION)).sort(KEY)
-    before, after = (known.rename({name: f"{side}_{name}" for name in ("at", *AROUND)}) for side in ("before", "after"))
+    before, after = (known.rename({name: f"{side}_{name}" for name in ("at", *FILLED)}) for side in ("before", "after"))
     rows = rows.join_asof(before, on="frame", by="vehicle_id", strategy="backward", check_sortedness=False)
     rows = rows.join_asof(after, on="frame", by="vehicle_id", strategy="forward", check_sortedness=False)
     frame = pl.col("frame")

@@ -192,7 +192,7 @@ class _Programs:
         length = self.find_lengths(guess, 1.0)
         ahead = []
         for one, way in zip(self.rows, guess, strict=True):
-            own = self.spread(one, length)
+            own = self.repeat_by_piece(one, length)
             product = (one.slack + own * way.slack) * (one.force + own * way.force)
             if way.excess is not None:
                 product += (one.excess + own * way.excess) * (one.spare - own * way.force)
@@ -200,13 +200,13 @@ class _Programs:
         aim = self.gap * np.clip(self.add_up(ahead) / self.count / np.maximum(self.gap, TINY), 0, 1) ** 3
         targets: list[tuple[Floats, Floats | None]] = []
         for one, way, (product, priced) in zip(self.rows, guess, plain, strict=True):
-            own = self.spread(one, aim)
+            own = self.repeat_by_piece(one, aim)
             second = None if priced is None or way.excess is None else priced - way.excess * way.force - own
             targets.append((np.where(one.valid, product + way.slack * way.force - own, 0.0), second))
         d, ways = newton.find_direction(targets)
         length = np.where(self.solved, 0.0, self.find_lengths(ways, TO_THE_BOUND))
         for one, way in zip(self.rows, ways, strict=True):
-            own = self.spread(one, length)
+            own = self.repeat_by_piece(one, length)
             one.slack += own * way.slack
             one.force += own * way.force
             if way.excess is not None:
@@ -215,7 +215,7 @@ class _Programs:
         self.d += np.repeat(length, self.size) * d
         return bool((length > LEAST_STEP).any())
 
-    def spread(self, one: Rows, values: Floats) -> Floats:
+    def repeat_by_piece(self, one: Rows, values: Floats) -> Floats:
         """Return values per piece (P,) at the rows of one form (R,)."""
         return values if one.at is not None else np.repeat(values, self.size)[: len(one.bound)]
 

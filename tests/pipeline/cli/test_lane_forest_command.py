@@ -64,10 +64,10 @@ def test_what_a_person_reads(done):
 
 
 def test_a_forest_is_no_run(done, copied):
-    from tracklake.pipeline.stages.score import finished_runs
+    from tracklake.pipeline.stages.score import list_finished_runs
 
     assert done.code == 0
-    assert finished_runs(copied) == []
+    assert list_finished_runs(copied) == []
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from tracklake.pipeline.lake.publication import publish_lake
 from tracklake.pipeline.lake.transfers import fetch_files, send_commits
 from tracklake.pipeline.lake.working_copy import hold_copy, locate_origin, open_workspace
 from tracklake.pipeline.orchestration import api, flows
-from tracklake.pipeline.orchestration.batches import build_group, select_part
+from tracklake.pipeline.orchestration.batches import build_group, narrow_for_jobs
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages.planner import Planner
 from tracklake.schemas import SUBSET_STATUS, SUBSETS
@@ -272,7 +272,7 @@ def test_a_worker_on_another_machine_builds_with_the_address_alone(two_recording
     settings = Settings(lake=origin.copy)
     with hold_copy(origin) as root, open_for_writing(root) as writer:
         jobs = Planner(root, writer.manifest, settings).plan("validate")
-        message = (bucket, "validate", jobs, settings, select_part(writer.manifest, "validate", jobs, settings))
+        message = (bucket, "validate", jobs, settings, narrow_for_jobs(writer.manifest, "validate", jobs, settings))
         done = subprocess.run(
             [sys.executable, "-c", WORKER],
             input=pickle.dumps(message).hex(),

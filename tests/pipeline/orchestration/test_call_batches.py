@@ -102,7 +102,7 @@ def test_nothing_of_a_batch_is_committed_where_a_file_has_vanished(tmp_path):
 def test_calls_that_have_not_begun_when_threads_stop_are_left_out():
     threads = Threads(1)
     outcomes = []
-    for call, made in threads.do("toy", make_calls(3)):
+    for call, made in threads.run_calls("toy", make_calls(3)):
         outcomes.append((call.titles, made))
         threads.stop()
     assert outcomes == [(("000",), 0)]

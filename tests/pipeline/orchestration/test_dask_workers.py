@@ -121,7 +121,7 @@ def read(root: Path | str) -> list:
 
 
 def test_results_and_errors_come_back_by_recording(workers):
-    outcomes = list(workers.do("toy", make_calls(toy_calls.add, (1, 2), (-1, 2), (3, 4))))
+    outcomes = list(workers.run_calls("toy", make_calls(toy_calls.add, (1, 2), (-1, 2), (3, 4))))
     made = {call.titles[0]: result for call, result in outcomes}
     assert (made["00"], made["02"]) == (3, 7)
     assert isinstance(made["01"], ValueError)
@@ -135,7 +135,7 @@ def test_warnings_of_local_workers_reach_the_log_and_full_memory_pauses_none(wor
     handler = QueueHandler(logged)
     logging.getLogger("tracklake").addHandler(handler)
     try:
-        ((_, pauses_at),) = workers.do("toy", make_calls(toy_calls.warn, ("tried again",)))
+        ((_, pauses_at),) = workers.run_calls("toy", make_calls(toy_calls.warn, ("tried again",)))
         assert logged.get(timeout=10).getMessage() == "tried again"
     finally:
         logging.getLogger("tracklake").removeHandler(handler)
@@ -151,7 +151,7 @@ def test_workers_that_cannot_be_started_are_an_error_that_names_the_guard_of_scr
 def test_a_worker_that_hangs_or_runs_an_old_release_is_an_error(workers, monkeypatch):
     monkeypatch.setattr(dask_workers, "ANSWER_S", 0.5)
     with pytest.raises(WorkersError, match=r"did not answer within 0\.5 s: it hangs"):
-        workers._ask(workers._client.run, time.sleep, 1.0)
+        workers._call_client(workers._client.run, time.sleep, 1.0)
     monkeypatch.undo()
     names = workers._client.nthreads().keys()
     assert workers.refuse_unfit(names) == set(names)
@@ -202,7 +202,7 @@ def test_what_is_queued_is_cancelled_and_a_worker_that_joins_later_is_looked_at(
 
     def do(workers: DaskWorkers) -> None:
         with pytest.raises(WorkersError) as refused:
-            list(workers.do("toy", calls))
+            list(workers.run_calls("toy", calls))
         failed.append(str(refused.value))
 
     settings = Settings(runner="dask", dask_address=address)
@@ -217,7 +217,7 @@ def test_what_is_queued_is_cancelled_and_a_worker_that_joins_later_is_looked_at(
     time.sleep(1.0)
     assert len(list(tmp_path.glob("[0-9]"))) == begun < 8
     with open_workers(settings, [tmp_path]) as workers:
-        assert [made for _, made in workers.do("toy", make_calls(toy_calls.add, (1, 2)))] == [3]
+        assert [made for _, made in workers.run_calls("toy", make_calls(toy_calls.add, (1, 2)))] == [3]
         other = start(address, **unlike)
         do(workers)
     assert f"{other}: tracklake is missing, polars 0.1 instead of {polars.__version__}, scipy is missing" in failed[1]
@@ -231,7 +231,7 @@ def test_the_client_is_not_closed_while_it_is_asked(start, tmp_path):
 
     def do(workers: DaskWorkers) -> None:
         with pytest.raises(WorkersError, match="connection to the scheduler was lost"):
-            list(workers.do("toy", make_calls(toy_calls.wait, *((tmp_path, number) for number in range(8)))))
+            list(workers.run_calls("toy", make_calls(toy_calls.wait, *((tmp_path, number) for number in range(8)))))
         ended.append(workers)
 
     with open_workers(Settings(runner="dask", dask_address=start()), [tmp_path]) as workers:
@@ -255,7 +255,7 @@ def test_a_worker_sees_the_lake(start, tmp_path):
         open_workers(Settings(runner="dask", dask_address=start()), [tmp_path / "nowhere"]) as workers,
         pytest.raises(WorkersError, match="nowhere is not seen"),
     ):
-        list(workers.do("toy", make_calls(toy_calls.add, (1, 2))))
+        list(workers.run_calls("toy", make_calls(toy_calls.add, (1, 2))))
 
 
 @pytest.mark.thorough

@@ -9,7 +9,7 @@ from stage_runs import find_outstanding
 from tracklake.pipeline.lake import load
 from tracklake.pipeline.settings import Settings
 from tracklake.pipeline.stages import drive_score
-from tracklake.pipeline.stages.score import finished_runs
+from tracklake.pipeline.stages.score import list_finished_runs
 from tracklake.schemas.errors import TracklakeError
 
 
@@ -18,7 +18,7 @@ def test_drives_are_scored_apart_from_tracks(tmp_path):
     (commit,) = score_drives(tmp_path, ["one"])
     written = [file.path for file in commit.files["models"]]
     assert written == ["models/onboard/ctrv/config.json", "models/onboard/ctrv/metrics.json"]
-    assert finished_runs(tmp_path) == []
+    assert list_finished_runs(tmp_path) == []
     skipped = []
     (score,) = drive_score.collect_drive_scores(tmp_path, load(tmp_path), skipped.append)
     assert (score["model"], score["part"], [row["seconds"] for row in score["rows"]]) == (

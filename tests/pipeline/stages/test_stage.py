@@ -11,7 +11,7 @@ from tracklake.pipeline.ingest import ingest
 from tracklake.pipeline.ingest.discovery import Digests, discover
 from tracklake.pipeline.lake import Commit, LakeFile, load, open_for_writing, scan
 from tracklake.pipeline.settings import Settings
-from tracklake.pipeline.stages.planner import build_job, select_part
+from tracklake.pipeline.stages.planner import build_job, narrow_manifest
 from tracklake.pipeline.stages.stage import Stage, StageError, StageResult
 from tracklake.schemas import BSM, SPLITS, SUBSET_STATUS, TRACKS, VEHICLES, StructureError
 
@@ -197,17 +197,17 @@ def test_a_part_of_the_manifest_is_what_jobs_may_read(root):
     )
     manifest = replace(manifest, commits={**manifest.commits, made.key: made})
     (job, _) = plan_stage(root, "toy", SETTINGS, STAGES)
-    part = select_part(manifest, TOY, [job], SETTINGS)
+    part = narrow_manifest(manifest, TOY, [job], SETTINGS)
     assert sorted(part.commits) == ["ingest/highd/01", "report"]
     assert part.commits["ingest/highd/01"] == manifest.commits["ingest/highd/01"]
     assert part.commits["report"] == Commit("report", "f", {SPLITS.name: splits[:1]}, {}, {"n": 1})
     page = Stage(**{**vars(TOY), "name": "page", "after": ()})
-    read = select_part(manifest, page, [job], SETTINGS).commits["report"]
+    read = narrow_manifest(manifest, page, [job], SETTINGS).commits["report"]
     assert (read.files, read.built_from) == ({SPLITS.name: splits}, {})
     after_it = Stage(**{**vars(TOY), "after": ("ingest", "report")})
-    read = select_part(manifest, after_it, [job], SETTINGS).commits["report"]
+    read = narrow_manifest(manifest, after_it, [job], SETTINGS).commits["report"]
     assert (read.files, read.built_from) == (made.files, {})
-    assert select_part(manifest, TOTAL, [], SETTINGS) is manifest
+    assert narrow_manifest(manifest, TOTAL, [], SETTINGS) is manifest
     hidden = Stage(**{**vars(TOY), "build": lambda reader, _: {SUBSET_STATUS: reader.table(SPLITS)}})
     with pytest.raises(LookupError, match=r"reads `splits`, which report makes"):
         build_job(hidden, root, job, SETTINGS, manifest)

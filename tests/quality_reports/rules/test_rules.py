@@ -14,10 +14,10 @@ from tracklake.quality_reports.rules.registry import (
     RULES,
     ThresholdError,
     as_schema,
-    checkable,
     describe,
     resolve,
     select_broken,
+    select_checkable,
 )
 from tracklake.schemas import SUBSETS, TRACKS, VEHICLES
 from tracklake.schemas.columns import SEVERITIES
@@ -228,8 +228,8 @@ def test_defaults_lie_within_their_bounds():
 
 
 def test_rules_are_checkable_where_nothing_they_read_is_lacking():
-    assert checkable(RULES, ()) == RULES
-    names = {rule.name for rule in checkable(RULES, ("gap_m", "lane_markings_m", "accel_mps2"))}
+    assert select_checkable(RULES, ()) == RULES
+    names = {rule.name for rule in select_checkable(RULES, ("gap_m", "lane_markings_m", "accel_mps2"))}
     lost = {
         "negative_headway", "negative_headway_recorded", "headway_mismatch", "outside_lane", "high_acceleration",
         "low_constant_speed", "high_jerk", "jerk_flicker", "hard_deceleration", "acceleration_bound",

@@ -16,7 +16,7 @@ from tracklake.schemas.errors import UsageError
 from tracklake.schemas.protocols import CSP
 from tracklake.training.models import MODELS, find_model
 from tracklake.training.models.attention import MultiHeadAttention, describe_vehicles
-from tracklake.training.models.motion import velocity_ticks
+from tracklake.training.models.motion import count_velocity_ticks
 
 H, F = CSP.history_ticks, CSP.horizon_ticks
 TEN_HZ = replace(CSP, rate_hz=10)
@@ -242,7 +242,7 @@ def test_an_untrained_network_predicts_constant_velocity_of_every_vehicle():
 def test_velocities_are_taken_from_known_ticks():
     """10 Hz: two ticks. x of the three vehicles: 0 1 2 4 8, and its last 2, and its last 1."""
     protocol = replace(TEN_HZ, history_s=0.4)
-    assert (protocol.history_ticks, velocity_ticks(protocol)) == (5, 2)
+    assert (protocol.history_ticks, count_velocity_ticks(protocol)) == (5, 2)
     observed, _ = wander(0, 1, 3, present=1.0, protocol=protocol)
     x = np.array([[0, 1, 2, 4, 8], [4, 4, 4, 4, 8], [8, 8, 8, 8, 8]], dtype=np.float32)
     history = np.stack([x, 0 * x], axis=-1)[None]

@@ -18,7 +18,7 @@ from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
 from tracklake.training.models.fitting import Fit, fit_model, search, sum_moments
-from tracklake.training.models.motion import DampedVelocity, KalmanConstantVelocity, velocity_ticks
+from tracklake.training.models.motion import DampedVelocity, KalmanConstantVelocity, count_velocity_ticks
 from tracklake.training.runs.forecasters import open_forecaster
 from tracklake.training.train import train
 
@@ -55,7 +55,7 @@ def test_sums_give_the_errors_of_a_loop_over_samples(seed, samples, protocol, ba
     with mock.patch("tracklake.training.models.fitting.BATCH", batch):
         order = draw.permutation(samples)
         moments = sum_moments(Samples(history, truth, protocol), order)
-    ticks, steps = velocity_ticks(protocol), np.arange(1, protocol.horizon_ticks + 1)
+    ticks, steps = count_velocity_ticks(protocol), np.arange(1, protocol.horizon_ticks + 1)
     weights = np.zeros((1, len(steps), protocol.history_ticks))
     weights[0, :, -1], weights[0, :, -1 - ticks] = steps / ticks, -steps / ticks
     count, squares = sum_errors(MODELS["constant-velocity"].build(protocol).predict(observe(history)).position_m, truth)

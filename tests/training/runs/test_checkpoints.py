@@ -21,7 +21,7 @@ from tracklake.training.runs.checkpoint import (
     UnfinishedError,
     claim_folder,
     is_unfinished,
-    unfinished_folder,
+    locate_unfinished,
 )
 from tracklake.training.train import TrainConfig, TrainingInterruptedError, train
 
@@ -123,7 +123,7 @@ def test_killed_between_checkpoints_it_goes_on_from_the_last_one(tensors, tmp_pa
     run = tmp_path / "run"
     with pytest.raises(RuntimeError):
         train("forgetful", tensors, run, replace(CONFIG, checkpoint_s=1e-9), stop_after(4, RuntimeError))
-    unfinished = unfinished_folder(run)
+    unfinished = locate_unfinished(run)
     old = (unfinished / CHECKPOINT_FILE).read_bytes()
     with pytest.raises(RuntimeError):
         train("forgetful", tensors, run, None, stop_after(2, RuntimeError), resume=True)
@@ -215,7 +215,7 @@ def interrupted(tensors, tmp_path):
     with pytest.raises(TrainingInterruptedError):
         train("forgetful", tensors, tmp_path / "models" / "run", CONFIG, stop_after(5))
     run = tmp_path / "models" / "run"
-    return run, unfinished_folder(run) / CHECKPOINT_FILE
+    return run, locate_unfinished(run) / CHECKPOINT_FILE
 
 
 def test_an_interrupted_training_is_not_lost_unasked(interrupted, tensors):
