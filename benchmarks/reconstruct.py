@@ -23,9 +23,9 @@ import polars as pl
 from tracklake.pipeline.lake import load, scan
 from tracklake.pipeline.synthetic import ngsim
 from tracklake.pipeline.synthetic.noise import MAST, SMOOTH, add_noise
+from tracklake.pipeline.synthetic.noise_models import AUTOCORRELATED
 from tracklake.pipeline.synthetic.scenarios import FREEWAY, NGSIM_SOCRATA
 from tracklake.pipeline.synthetic.sumo import find_sumo, simulate
-from tracklake.pipeline.synthetic.tracker_errors import AUTOCORRELATED
 from tracklake.schemas import RECONSTRUCTED, RECONSTRUCTION_QUALITY
 
 ENTRIES, RECORDINGS = 10_000_000, 7

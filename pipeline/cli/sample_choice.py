@@ -83,7 +83,7 @@ def pick_samples(
     samples = folder.samples_of(part)
     keep = folder.sample_lateral[samples] == LATERAL_MANEUVERS.index("keep")
     normal = folder.sample_longitudinal[samples] == LONGITUDINAL_MANEUVERS.index("normal")
-    kinds: dict[str, Flags] = {"lane-change": ~keep, "lane-keep": keep & normal, "brake": ~normal}
+    kinds = {Pick.LANE_CHANGE: ~keep, Pick.LANE_KEEP: keep & normal, Pick.BRAKE: ~normal}
     found = samples[kinds[pick]] if pick in kinds else samples
     found = _prefer(found, folder.sample_future[found] == folder.protocol.horizon_ticks)
     if pick == Pick.LANE_CHANGE:

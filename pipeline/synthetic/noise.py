@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from tracklake.pipeline.synthetic.scenarios import Road
-from tracklake.pipeline.synthetic.sumo import compute_lanes
-from tracklake.pipeline.synthetic.tracker_errors import (
+from tracklake.pipeline.synthetic.noise_models import (
     AUTOCORRELATED,
     HANDOVER,
     QUANTISED,
     DriftLevel,
-    add_tracker_errors,
+    add_ngsim_noise,
     convolve_noise,
 )
+from tracklake.pipeline.synthetic.scenarios import Road
+from tracklake.pipeline.synthetic.sumo import compute_lanes
 from tracklake.schemas.arrays import Floats
 
 SMOOTH = "smooth"
@@ -76,7 +76,7 @@ def add_noise(
         on_ramp=pl.lit(road.ramp) & (pl.col("lane") == road.lanes + 2),
     )
     if set(models) - {SMOOTH}:
-        noisy = add_tracker_errors(noisy, tracks, road.rate_hz, noise.drift, models, random.spawn(1)[0])
+        noisy = add_ngsim_noise(noisy, tracks, road.rate_hz, noise.drift, models, random.spawn(1)[0])
     return noisy.with_columns(lane=compute_lanes(road)).drop("on_ramp")
 
 

@@ -198,7 +198,7 @@ def test_positions_jump_where_declared():
             assert before.filter((pl.col("frame") == frame) & (pl.col("x") > x)).is_empty()
 
 
-def test_lanes_flicker_where_declared_and_nobody_is_beside():
+def test_lanes_flicker_where_declared_and_no_vehicle_is_beside():
     before, done = damage(only(lane_flickers=2))
     assert [(defect.name, defect.value) for defect in done.defects] == [("lane_flicker", 2.0)] * 2
     assert (done.tracks["lane"] == 2).sum() == sum(defect.entries for defect in done.defects)

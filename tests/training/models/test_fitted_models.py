@@ -12,12 +12,11 @@ from tensor_tables import TINY, split_row
 from test_motion_models import draw_tracks, name_noise
 from tiny_network import write_tiny
 
-from tracklake.pipeline.cli.score_tables import describe_fit
 from tracklake.schemas.protocols import CSP
 from tracklake.schemas.run_config import StaleRunError
 from tracklake.training.data.tensor_folder import TensorFolder
 from tracklake.training.models import MODELS
-from tracklake.training.models.fitting import Fit, fit_model, search, sum_moments
+from tracklake.training.models.fitting import fit_model, search, sum_moments
 from tracklake.training.models.motion import DampedVelocity, KalmanConstantVelocity, count_velocity_ticks
 from tracklake.training.runs.forecasters import open_forecaster
 from tracklake.training.train import train
@@ -117,16 +116,6 @@ def test_vehicles_that_stand_still_are_predicted_all_the_same(name):
     assert said.density is None or (said.density.sigma_m > 0).all()
 
 
-def test_parameters_that_are_set_are_not_said_to_be_fitted():
-    fit = Fit(
-        "kalman-cv", 1200, {"measurement_lateral_m": 0.25, "acceleration_lateral_m2ps3": 2.0}, ["measurement_lateral_m"]
-    )
-    assert describe_fit(fit) == (
-        "kalman-cv: acceleration_lateral_m2ps3 = 2, fitted on 1,200 samples of `train`; measurement_lateral_m = 0.25, "
-        "set, not fitted"
-    )
-
-
 def test_a_value_at_the_bound_of_the_search_is_marked():
     """Vehicles with one speed and no noise at all: the least noise that was searched is the best."""
     tracks = np.zeros((9, CSP.history_ticks + CSP.horizon_ticks, 2), dtype=np.float32)
@@ -138,8 +127,8 @@ def test_a_value_at_the_bound_of_the_search_is_marked():
         "acceleration_longitudinal_m2ps3",
         "measurement_longitudinal_m",
     ]
-    assert "measurement_longitudinal_m = 0.001 (bound of the search)," in describe_fit(fit)
-    assert "measurement_lateral_m = 0.2, set, not fitted" in describe_fit(fit)
+    assert fit.parameters["measurement_longitudinal_m"] == pytest.approx(0.001)
+    assert (fit.parameters["measurement_lateral_m"], list(fit.given)) == (0.2, ["measurement_lateral_m"])
     assert fit.to_dict()["at_bounds"] == fit.at_bounds
 
 
@@ -176,8 +165,8 @@ def test_only_the_training_part_is_fitted_on(tmp_path):
         open_forecaster("run", moved, tmp_path, frozenset({"val"}))
 
 
-def test_without_a_training_part_the_defaults_hold_and_that_is_said(tmp_path):
+def test_without_a_training_part_the_defaults_hold(tmp_path):
     folder = TensorFolder.open(write_tiny(tmp_path / "tensors", split_row("b", "eval"), subsets="b"))
     fit = open_forecaster("damped-velocity", folder, tmp_path, frozenset({"eval"})).fit
-    assert describe_fit(fit) == "damped-velocity: decay_s = 1, not fitted: `train` has no samples"
+    assert (fit.samples, fit.parameters) == (0, {"decay_s": 1.0})
     assert TINY.name == folder.protocol.name

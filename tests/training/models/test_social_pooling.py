@@ -230,7 +230,7 @@ def test_number_of_weights(name):
 
 @pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("name", ["cs-lstm", "cs-lstm-m"])
-def test_nobody_to_predict_and_nobody_around(name, fast):
+def test_no_samples_and_no_neighbors(name, fast):
     model = build(name)
     model.fast = fast
     for neighbors in ([], [0], [0, 0]):

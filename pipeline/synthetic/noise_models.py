@@ -1,4 +1,4 @@
-"""Errors of NGSIM's kind: drift, jumps between cameras, stop-and-go in steps, and speeds that contradict positions.
+"""Noise models of NGSIM's kind: drift, jumps between cameras, steps in slow traffic, speeds that contradict positions.
 
 Punzo, Borzacchiello and Ciuffo (2011), Montanino and Punzo (2015) and Coifman and Li (2017) judge NGSIM's tracks and
 find positions, speeds and accelerations that contradict each other and no vehicle's motion. The published rows of
@@ -42,7 +42,7 @@ class DriftLevel:
     across_m: float
 
 
-def add_tracker_errors(
+def add_ngsim_noise(
     noisy: pl.DataFrame,
     true: pl.DataFrame,
     rate_hz: float,
